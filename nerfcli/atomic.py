@@ -1,0 +1,91 @@
+"""Files and folders that appear whole or not at all.
+
+Everything is written under a hidden name beside its destination and renamed when complete, so that a killed
+command or a full disk leaves nothing behind that a later one would take for a result.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from errno import EDQUOT, ENOSPC
+from pathlib import Path
+from typing import Any
+
+from nerfcli.errors import UserError
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path with the suffix of `path`; renamed to `path` on success, removed on any exception.
+
+    Raises:
+        UserError: the folder cannot be made or written, or the disk is full.
+    """
+    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    with _write_errors_told(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield partial
+            os.replace(partial, path)
+        finally:
+            with suppress(OSError):  # the error that brought us here says more
+                partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """A temporary folder that takes the place of `path` on success and is removed on any exception.
+
+    A folder that stands at `path` is replaced only in the last step; asking the user comes before.
+
+    Raises:
+        UserError: as for `atomic_path`.
+    """
+    partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
+    old = path.with_name(f".{path.name}.old-{os.getpid()}")
+    with _write_errors_told(path):
+        try:
+            partial.mkdir(parents=True)
+            yield partial
+            if path.exists():
+                os.replace(path, old)
+            try:
+                os.replace(partial, path)
+            except OSError:
+                if old.exists():
+                    os.replace(old, path)
+                raise
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write `content` as indented JSON, atomically. NaN and infinity are refused: JSON has no word for them."""
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    with atomic_path(path) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
+def cannot_write(path: Path, error: OSError) -> UserError:
+    """The two-line error for a result that could not be written."""
+    reason = error.strerror or str(error)
+    return UserError(
+        f"cannot write {path}: {reason}",
+        "choose a writable place with -o, or free space on the disk, and run the same command again",
+    )
+
+
+@contextmanager
+def _write_errors_told(path: Path) -> Iterator[None]:
+    """Tell the user about errors of writing `path`; errors of reading something else meanwhile pass through."""
+    try:
+        yield
+    except OSError as error:
+        names = [str(name) for name in (error.filename, error.filename2) if name is not None]
+        about_destination = any(Path(name).is_relative_to(path.parent) or path.is_relative_to(name) for name in names)
+        if about_destination or not names or error.errno in (ENOSPC, EDQUOT):
+            raise cannot_write(path, error) from error
+        raise

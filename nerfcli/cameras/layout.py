@@ -1,0 +1,122 @@
+"""How the cameras of a capture stand: where they look, which way is up, whether they surround something.
+
+Letters: a camera has centre c and unit viewing direction d.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+
+# Below this angle between the axes of typical cameras, the place where they meet is not known from the axes.
+_PARALLEL_RAD = np.radians(3.0)
+
+# The mean of viewing directions is shorter than this where they point all around; it is 0.64 for half a circle.
+_ALL_AROUND = 0.4
+
+_DEPTH_PER_SPREAD = 5.0
+
+# A capture goes around something if no gap between neighbouring directions of view is wider than this.
+_WIDEST_GAP_RAD = np.radians(150.0)
+
+
+def centres_of(frames: Sequence[Frame]) -> np.ndarray:
+    """Camera centres, (frames, 3)."""
+    return np.stack([frame.centre for frame in frames])
+
+
+def views_of(frames: Sequence[Frame]) -> np.ndarray:
+    """Viewing directions (the optical axes), (frames, 3), unit."""
+    return np.stack([frame.world_from_cam[:3, 2] for frame in frames])
+
+
+def focus_point(frames: Sequence[Frame], *, depth_hint: float | None = None) -> np.ndarray:
+    """The point that the cameras look at, (3,): the one nearest to their optical axes.
+
+    It minimises the sum of its distances to the axes (not of their squares, so that a few cameras that look elsewhere
+    do not move it), by iteratively reweighted least squares. There is no such point where the axes are parallel, or
+    where they meet behind most cameras. Then it is the mean centre of cameras that look all around, and else lies
+    `depth_hint` in front of the mean camera: without a hint 5 times as far as the cameras are spread, since people who
+    photograph a scene from the front step aside by a fraction of its depth.
+
+    Raises:
+        ValueError: no frame.
+    """
+    if not frames:
+        raise ValueError("focus_point needs at least one frame")
+    centres, views = centres_of(frames), views_of(frames)
+    across = np.eye(3) - views[:, :, None] * views[:, None, :]  # (frames, 3, 3), projects onto the plane across d
+    weights = np.ones(len(frames))
+    spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
+    # The smallest eigenvalue is the mean squared sine between the axes and their common direction.
+    if np.linalg.eigvalsh(across.mean(axis=0))[0] > np.sin(_PARALLEL_RAD) ** 2:
+        point = centres.mean(axis=0)
+        for _ in range(30):
+            normal = np.einsum("n,nij->ij", weights, across)
+            point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, across, centres))
+            distances = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=1)
+            weights = 1.0 / np.maximum(distances, 1e-6 * spread + 1e-300)
+            weights /= weights.sum()
+        depths = np.einsum("ni,ni->n", point - centres, views)
+        if np.mean(depths > 0) > 0.5:
+            return point
+    if np.linalg.norm(views.mean(axis=0)) < _ALL_AROUND:
+        return centres.mean(axis=0)
+    if depth_hint is None:
+        depth_hint = _DEPTH_PER_SPREAD * spread if spread > 0 else 1.0
+    return centres.mean(axis=0) + depth_hint * mean_direction(views)
+
+
+def up_direction(frames: Sequence[Frame]) -> np.ndarray:
+    """Which way is up in the world, (3,), unit.
+
+    People hold a camera level but tilt it: the horizontal axes of the pictures lie in the ground plane whatever the
+    tilt, so where those span a plane clearly, up is its normal. Where they do not (all cameras look the same way),
+    or where the normal is far from the mean of the pictures' own up, up is that mean.
+    """
+    mean_up = mean_direction(-np.stack([frame.world_from_cam[:3, 1] for frame in frames]))
+    right = np.stack([frame.world_from_cam[:3, 0] for frame in frames])
+    eigenvalues, eigenvectors = np.linalg.eigh(right.T @ right / len(frames))
+    normal = eigenvectors[:, 0] * np.sign(eigenvectors[:, 0] @ mean_up)
+    level = eigenvalues[1] > 0.03 and eigenvalues[0] < 0.1 * eigenvalues[1]  # 0.03: the axes fan out by 10 degrees
+    return normal if level and normal @ mean_up > np.cos(np.radians(60)) else mean_up
+
+
+def surrounds(frames: Sequence[Frame], up: np.ndarray) -> bool:
+    """Whether the cameras look at something from all sides: no gap of 150 degrees between their headings."""
+    east, north = horizontal_axes(up)
+    views = views_of(frames)
+    heading = np.stack([views @ east, views @ north], axis=-1)
+    level = np.linalg.norm(heading, axis=1) > 0.1  # straight down there is no heading
+    if level.sum() < 3:
+        return False
+    angles = np.sort(np.arctan2(heading[level, 1], heading[level, 0]))
+    gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
+    return bool(gaps.max() < _WIDEST_GAP_RAD)
+
+
+def horizontal_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (3,) perpendicular to `up` and to each other; the three are right-handed with `up` last."""
+    east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    east /= np.linalg.norm(east)
+    return east, np.cross(up, east)
+
+
+def mean_direction(directions: np.ndarray) -> np.ndarray:
+    """The normalised mean (3,) of unit vectors (N, 3), without those that are more than 60 degrees off it.
+
+    They are the photos taken with the camera on its side. Where the vectors cancel out it is the first of them.
+    """
+    kept = np.ones(len(directions), dtype=bool)
+    mean = directions[0]
+    for _ in range(3):
+        total = directions[kept].sum(axis=0)
+        length = np.linalg.norm(total)
+        if length < 1e-9 * len(directions):
+            return mean
+        mean = total / length
+        kept = directions @ mean > 0.5
+        if not kept.any():
+            return mean
+    return mean

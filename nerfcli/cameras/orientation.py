@@ -1,0 +1,108 @@
+"""Cameras of photos that carry an EXIF orientation, and of photos that were resized.
+
+COLMAP and the programs built on it read pixels as they are stored and ignore the EXIF orientation (so does pycolmap
+4.2.1); nerfcli shows photos upright. So a camera that refers to the stored pixels is turned together with its picture,
+about its optical axis.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.errors import UserError
+
+# Tells of an image file: width and height as it is shown, EXIF orientation applied, and that orientation (1 if none).
+Measure = Callable[[Path], tuple[int, int, int]]
+
+# The turn of the picture, upright from stored, as a rotation of (x right, y down): EXIF 3 half a turn, 6 a quarter
+# clockwise, 8 a quarter counter-clockwise. Source: Exif 2.32, tag 0x0112.
+_TURNS = {
+    1: np.array([[1.0, 0.0], [0.0, 1.0]]),
+    3: np.array([[-1.0, 0.0], [0.0, -1.0]]),
+    6: np.array([[0.0, -1.0], [1.0, 0.0]]),
+    8: np.array([[0.0, 1.0], [-1.0, 0.0]]),
+}
+
+# Pairs of parameters that are the x and y parts of a vector in the picture and turn with it: the principal point is
+# handled apart, tangential distortion is p2 in x and p1 in y (OpenCV's order), thin prisms are one vector per power.
+_VECTORS = {
+    "OPENCV": (("p2", "p1"),),
+    "FULL_OPENCV": (("p2", "p1"),),
+    "THIN_PRISM_FISHEYE": (("p2", "p1"), ("sx1", "sy1")),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (("p0", "p1"), ("s0", "s2"), ("s1", "s3")),
+}
+
+
+def stored_size(path: Path, measure: Measure) -> tuple[int, int]:
+    """Width and height of an image file before its EXIF orientation is applied."""
+    width, height, orientation = measure(path)
+    return (height, width) if orientation >= 5 else (width, height)
+
+
+def fit_to_picture(
+    camera: Camera, world_from_cam: np.ndarray, *, path: Path, measure: Measure
+) -> tuple[Camera, np.ndarray]:
+    """Camera and pose for the upright picture on disk.
+
+    The calibration is taken to be for the stored pixels, or for the upright ones where its shape fits those better, and
+    may be for another size of the same picture.
+
+    Raises:
+        UserError: neither shape fits, or the EXIF orientation mirrors the picture; both sizes are named.
+    """
+    width, height, orientation = measure(path)
+    if orientation not in _TURNS:
+        raise UserError(
+            f"{path}: EXIF orientation {orientation} mirrors the photo, which no camera can do",
+            "write the photo upright without the tag and find the poses again",
+        )
+    stored = stored_size(path, measure)
+    if stored != (width, height) and _shape_error(camera, stored) > _shape_error(camera, (width, height)):
+        orientation, stored = 1, (width, height)
+    try:
+        resized = camera.resized(*stored)
+    except UserError as error:
+        raise UserError(f"{path}: {error.message}", error.hint) from error
+    return turned(resized, world_from_cam, orientation=orientation)
+
+
+def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> tuple[Camera, np.ndarray]:
+    """Camera and pose of the upright picture, given those of the stored one.
+
+    Args:
+        camera: of the stored pixels.
+        world_from_cam: (4, 4) of the camera of the stored pixels.
+        orientation: EXIF: 1, 3, 6 or 8.
+
+    Raises:
+        UserError: a spherical picture, which cannot be turned.
+    """
+    if orientation == 1:
+        return camera, world_from_cam
+    if camera.is_spherical:
+        raise UserError(
+            f"a spherical picture with EXIF orientation {orientation}",
+            "write the panorama upright without the tag",
+        )
+    turn = _TURNS[orientation]
+    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    middle = np.array([camera.width, camera.height]) / 2
+    width, height = (camera.height, camera.width) if orientation in (6, 8) else (camera.width, camera.height)
+    values["cx"], values["cy"] = (
+        turn @ (np.array([values["cx"], values["cy"]]) - middle) + np.array([width, height]) / 2
+    )
+    if "fx" in values and orientation in (6, 8):
+        values["fx"], values["fy"] = values["fy"], values["fx"]
+    for x_name, y_name in _VECTORS.get(camera.model, ()):
+        values[x_name], values[y_name] = turn @ (values[x_name], values[y_name])
+    upright = Camera(camera.model, width, height, tuple(float(value) for value in values.values()))
+    stored_from_upright = np.eye(4)
+    stored_from_upright[:2, :2] = turn.T
+    return upright, world_from_cam @ stored_from_upright
+
+
+def _shape_error(camera: Camera, size: tuple[int, int]) -> float:
+    """How many pixels a size is off the camera's aspect."""
+    return abs(camera.height * size[0] / camera.width - size[1])

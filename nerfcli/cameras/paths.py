@@ -1,0 +1,236 @@
+"""Camera paths for renders and videos: an orbit, a spiral, and a flight through the frames.
+
+All move at a constant speed and have the first frame's picture size and focal length, without its distortion.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline, Slerp
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import (
+    centres_of,
+    focus_point,
+    horizontal_axes,
+    mean_direction,
+    surrounds,
+    up_direction,
+    views_of,
+)
+from nerfcli.errors import UserError
+
+__all__ = ["focus_point", "interpolate", "orbit", "spiral"]
+
+# Samples of a curve from which its arc length is measured; the speed is constant to about 1e-5.
+_CURVE_SAMPLES = 8192
+
+# How much of the cameras' spread a path uses where they stand on one side: beyond its rim nothing was seen.
+_INSIDE = 0.8
+
+
+def orbit(
+    frames: Sequence[Frame], *, count: int, depth_hint: float | None = None, up: np.ndarray | None = None
+) -> tuple[Frame, ...]:
+    """A closed path around the focus point, looking at it.
+
+    Where the cameras surround the focus: once around, at their mean elevation, on an ellipse fitted to their distances.
+    Where they stand on one side: a small ellipse within the angles from which they look at the focus.
+
+    Args:
+        frames: the capture's frames, at least one.
+        count: number of views; the last one is followed by the first.
+        depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
+        up: (3,) what is up in the world; the cameras' own up if None.
+
+    Raises:
+        ValueError: no frame, or count below 1.
+        UserError: all cameras stand in one place.
+    """
+    _check(frames, count)
+    focus = focus_point(frames, depth_hint=depth_hint)
+    up = up_direction(frames) if up is None else np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    offsets = centres_of(frames) - focus
+    distances = np.linalg.norm(offsets, axis=1)
+    offsets, distances = offsets[distances > 0], distances[distances > 0]
+    if len(offsets) == 0:
+        raise UserError(
+            "all cameras stand in one place and look around: there is nothing to orbit",
+            "choose the path through the frames (interpolate)",
+        )
+    if surrounds(frames, up):
+        curve = _ring(offsets, distances, up)
+    else:
+        curve = _sway(offsets, distances, up)
+    centres = focus + _equal_steps(curve, count, closed=True)
+    return _looking_at(frames, centres, focus, up=up, name="orbit")
+
+
+def spiral(
+    frames: Sequence[Frame], *, count: int, turns: int = 2, depth_hint: float | None = None
+) -> tuple[Frame, ...]:
+    """A closed spiral about the mean camera, in the box that the cameras fill, looking at a point as deep as the focus.
+
+    For cameras that surround the scene, where the mean camera would stand amid it, the quarter of them
+    nearest to the middle one is used.
+
+    Args:
+        frames: the capture's frames, at least one.
+        count: number of views; the last one is followed by the first.
+        turns: how often it goes around.
+        depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
+
+    Raises:
+        ValueError: no frame, or count below 1.
+
+    Source: the render path of Fyusion/LLFF and of bmild/nerf, load_llff.py.
+    """
+    _check(frames, count)
+    up = up_direction(frames)
+    focus = focus_point(frames, depth_hint=depth_hint)
+    near_frames = frames
+    if surrounds(frames, up):
+        distances = np.linalg.norm(centres_of(frames) - frames[len(frames) // 2].centre, axis=1)
+        nearest = np.argsort(distances, kind="stable")[: max(4, len(frames) // 4)]
+        near_frames = [frames[index] for index in nearest]
+    centres = centres_of(near_frames)
+    middle = centres.mean(axis=0)
+    axes = rigid.look_at(middle, middle + mean_direction(views_of(near_frames)), up)[:3, :3]
+    local = (centres - middle) @ axes
+    # The spiral goes as far to both sides: the narrower one counts.
+    radii = _INSIDE * np.minimum(local.max(axis=0), -local.min(axis=0)).clip(min=0.0)
+
+    def curve(t: np.ndarray) -> np.ndarray:
+        angle = 2 * np.pi * turns * t
+        return np.stack([np.cos(angle), np.sin(angle), np.sin(2 * np.pi * t)], axis=-1) * radii
+
+    path = middle + _equal_steps(curve, count, closed=True) @ axes.T
+    depth = max(float((focus - middle) @ axes[:, 2]), 2.0 * float(np.linalg.norm(radii))) or 1.0
+    return _looking_at(frames, path, middle + depth * axes[:, 2], up=up, name="spiral")
+
+
+def interpolate(frames: Sequence[Frame], *, count: int) -> tuple[Frame, ...]:
+    """A smooth flight through the frames in their order, from the first to the last, at constant speed.
+
+    Centres follow a cubic spline over centripetal lengths (which does not overshoot between near frames), rotations a
+    spline of the same smoothness. Where the camera turns almost on the spot, turning takes its time too.
+
+    Raises:
+        ValueError: no frame, or count below 1.
+    """
+    _check(frames, count)
+    frames = _without_repeats(frames)
+    if len(frames) == 1:
+        return tuple(_path_frame(frames[0], frames[0].world_from_cam, f"flight_{i:04d}") for i in range(count))
+    centres = centres_of(frames)
+    rotations = Rotation.from_matrix(np.stack([frame.world_from_cam[:3, :3] for frame in frames]))
+    moved = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    angles = (rotations[:-1].inv() * rotations[1:]).magnitude()
+    # What a radian counts beside lengths: a quarter of what moving counts on the whole path.
+    per_radian = 0.25 * moved.sum() / max(angles.sum(), 1e-12) if moved.sum() > 0 else 1.0
+    knots = np.concatenate([[0.0], np.cumsum(np.sqrt(np.maximum(moved, per_radian * angles)))])
+    position = CubicSpline(knots, centres, bc_type="natural")
+    rotation = RotationSpline(knots, rotations) if len(frames) > 2 else Slerp(knots, rotations)
+
+    t = np.linspace(0.0, knots[-1], _CURVE_SAMPLES + 1)
+    along = rotation(t)
+    steps = np.maximum(
+        np.linalg.norm(np.diff(position(t), axis=0), axis=1),
+        per_radian * (along[:-1].inv() * along[1:]).magnitude(),
+    )
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    at = np.interp(np.linspace(0.0, length[-1], count), length, t)
+    poses = rigid.from_parts(rotation(at).as_matrix(), position(at))
+    return tuple(_path_frame(frames[0], pose, f"flight_{i:04d}") for i, pose in enumerate(poses))
+
+
+def _check(frames: Sequence[Frame], count: int) -> None:
+    if not frames or count < 1:
+        raise ValueError(f"a path needs a frame and a view, got {len(frames)} frames and count {count}")
+
+
+def _ring(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Once around at the mean elevation; the distance follows an ellipse over the azimuth."""
+    east, north = horizontal_axes(up)
+    elevation = float(np.mean(np.arcsin(np.clip(offsets @ up / distances, -1.0, 1.0))))
+    azimuth = np.arctan2(offsets @ north, offsets @ east)
+    inverse_square = _ellipse(azimuth, distances)
+
+    def curve(t: np.ndarray) -> np.ndarray:
+        angle = 2 * np.pi * t
+        distance = inverse_square(angle) ** -0.5
+        ground = np.cos(angle)[:, None] * east + np.sin(angle)[:, None] * north
+        return distance[:, None] * (np.cos(elevation) * ground + np.sin(elevation) * up)
+
+    return curve
+
+
+def _ellipse(azimuth: np.ndarray, distances: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """1 / distance^2 over the azimuth, of the centred ellipse that fits best, or of the circle with the mean distance.
+
+    In polar form a centred ellipse is 1 / r^2 = a + b cos 2 phi + c sin 2 phi, linear in a, b and c. Few cameras, or
+    ones that stand at all distances, do not make an ellipse: beyond axes of 2 : 1 the circle is taken.
+    """
+    mean = float(np.mean(distances))
+    columns = np.stack([np.ones_like(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth)], axis=-1)
+    a, b, c = np.linalg.lstsq(columns, (mean / distances) ** 2, rcond=None)[0]
+    eccentric = np.hypot(b, c)
+    if len(azimuth) < 8 or a <= 0 or (a + eccentric) > 4 * (a - eccentric) or not 0.5 < a < 2:
+        a, b, c = 1.0, 0.0, 0.0
+    return lambda angle: (a + b * np.cos(2 * angle) + c * np.sin(2 * angle)) / mean**2
+
+
+def _sway(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """A small ellipse in azimuth and elevation about the focus, at the mean distance, within the cameras' angles."""
+    towards = mean_direction(offsets / distances[:, None])
+    # Azimuth and elevation are about `up`, unless the cameras look down so steeply that it is no axis.
+    pole = up if abs(towards @ up) < 0.9 else np.cross(towards, horizontal_axes(towards)[0])
+    front = towards - (towards @ pole) * pole
+    front /= np.linalg.norm(front)
+    side = np.cross(pole, front)
+    azimuth = np.arctan2(offsets @ side, offsets @ front)
+    elevation = np.arcsin(np.clip(offsets @ pole / distances, -1.0, 1.0))
+    (a_low, a_high), (e_low, e_high) = (np.percentile(angle, [5, 95]) for angle in (azimuth, elevation))
+    distance = float(np.mean(distances))
+
+    def curve(t: np.ndarray) -> np.ndarray:
+        a = (a_low + a_high) / 2 + _INSIDE * (a_high - a_low) / 2 * np.cos(2 * np.pi * t)
+        e = (e_low + e_high) / 2 + _INSIDE * (e_high - e_low) / 2 * np.sin(2 * np.pi * t)
+        ground = np.cos(a)[:, None] * front + np.sin(a)[:, None] * side
+        return distance * (np.cos(e)[:, None] * ground + np.sin(e)[:, None] * pole)
+
+    return curve
+
+
+def _equal_steps(curve: Callable[[np.ndarray], np.ndarray], count: int, *, closed: bool) -> np.ndarray:
+    """`count` points (count, 3) at equal arc lengths along a curve over [0, 1]; a closed one leaves out its end."""
+    t = np.linspace(0.0, 1.0, _CURVE_SAMPLES + 1)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(t), axis=0), axis=1))])
+    if length[-1] == 0:
+        return curve(np.zeros(count))
+    at = np.linspace(0.0, length[-1], count, endpoint=not closed)
+    return curve(np.interp(at, length, t))
+
+
+def _looking_at(
+    frames: Sequence[Frame], centres: np.ndarray, focus: np.ndarray, *, up: np.ndarray, name: str
+) -> tuple[Frame, ...]:
+    return tuple(
+        _path_frame(frames[0], rigid.look_at(centre, focus, up), f"{name}_{index:04d}")
+        for index, centre in enumerate(centres)
+    )
+
+
+def _path_frame(like: Frame, world_from_cam: np.ndarray, name: str) -> Frame:
+    return Frame(name, like.camera.undistorted(), world_from_cam)
+
+
+def _without_repeats(frames: Sequence[Frame]) -> list[Frame]:
+    """The frames without those that repeat the pose before them: a spline needs its knots apart."""
+    kept = [frames[0]]
+    for frame in frames[1:]:
+        if np.abs(frame.world_from_cam - kept[-1].world_from_cam).max() > 1e-9:
+            kept.append(frame)
+    return kept

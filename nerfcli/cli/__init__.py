@@ -1,0 +1,45 @@
+"""The command line: one file per command; each parses, calls one library function and prints what was written."""
+
+import typer
+
+from nerfcli import __version__
+from nerfcli.cli import evaluate, info, poses, render, run, train
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,  # plain text: half the start-up time, and readable in a pipe
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+for _module in (poses, train, evaluate, render, run, info):
+    _name = _module.__name__.rsplit(".", 1)[-1]
+    app.command(_name)(getattr(_module, _name))
+
+
+@app.callback(invoke_without_command=True)
+def main_options(version: bool = typer.Option(False, "--version", help="Show the version and exit.")) -> None:
+    """From a folder of photos to a radiance field that people can trust: poses, novel views, depth maps, videos.
+
+    \b
+    Everything in one go:
+      nerfcli run photos/
+    Step by step:
+      nerfcli poses photos/                        -> photos-scene/
+      nerfcli train photos-scene/ --budget 2m      -> photos-scene-run/
+      nerfcli evaluate photos-scene-run/           -> photos-scene-run/metrics.json
+      nerfcli render photos-scene-run/ --cameras orbit --depth conditional --video
+    Many captures:
+      ls -d captures/*/ | nerfcli poses - | nerfcli train - --budget 2m | nerfcli render -
+
+    Exit codes: 0 done; 1 a bug; 2 wrong usage; 3 bad input; 4 too few photos registered; 5 numbers became
+    non-finite; 6 out of memory; 7 a quality gate not met; 130 interrupted.
+    """
+    if version:
+        typer.echo(f"nerfcli {__version__}")
+        raise typer.Exit
+
+
+def main() -> None:
+    """The console script."""
+    app()

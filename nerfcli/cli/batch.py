@@ -1,0 +1,65 @@
+"""One input, or as many as come on standard input."""
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import typer
+
+from nerfcli.cli.console import report_error
+from nerfcli.errors import UserError
+
+STDIN = "-"
+
+
+def for_each_input(source: str, work: Callable[[Path, bool], None]) -> None:
+    """Call `work(path, one_of_many)` for the path, or for each line of standard input as it comes.
+
+    A path that fails is reported and the others go on; the exit code is then that of the first failure.
+
+    Args:
+        source: a path, or "-".
+        work: does the whole command for one input.
+
+    Raises:
+        UserError: the only input failed, or standard input held no path.
+    """
+    if source != STDIN:
+        work(Path(source), False)
+        return
+    first_failure: UserError | None = None
+    count = 0
+    for path in _stdin_paths():
+        count += 1
+        try:
+            work(path, True)
+        except UserError as error:
+            report_error(error, about=str(path))
+            first_failure = first_failure or error
+    if count == 0:
+        raise UserError(
+            "no path came on standard input", "give one path per line, e.g. ls -d captures/*/ | nerfcli poses -"
+        )
+    if first_failure is not None:
+        raise typer.Exit(first_failure.exit_code)
+
+
+def _stdin_paths() -> Iterator[Path]:
+    """Lines of standard input as paths, each as soon as it is complete; empty lines are passed over."""
+    while line := sys.stdin.readline():
+        if text := line.rstrip("\r\n"):
+            yield Path(text)
+
+
+def result_path(source: Path, *, suffix: str, output: Path | None, one_of_many: bool) -> Path:
+    """Where the result of `source` goes.
+
+    Beside the source with `suffix` added to its name; at `output` where that is given; inside `output` where there
+    are many sources.
+    """
+    if source.name in ("", ".."):  # "." and ".." have a name only once they are resolved
+        source = source.resolve()
+    name = source.name + suffix
+    if output is None:
+        return source.with_name(name)
+    return output / name if one_of_many else output

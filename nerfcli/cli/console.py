@@ -1,0 +1,135 @@
+"""What a command says: results on stdout, everything else on stderr, errors in two lines with their exit code."""
+
+import functools
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import typer
+
+from nerfcli.errors import INTERRUPTED, OUT_OF_MEMORY, UserError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# Without a terminal, progress is a plain line at most this often.
+PLAIN_LINE_SECONDS = 10.0
+
+
+class Console:
+    """The command's voice.
+
+    Args:
+        quiet: no notes and no progress; warnings and errors stay.
+        json_lines: results as JSON Lines instead of paths.
+    """
+
+    def __init__(self, *, quiet: bool, json_lines: bool):
+        self.quiet = quiet
+        self.json_lines = json_lines
+
+    def result(self, path: Path, content: dict[str, Any] | None = None) -> None:
+        """One result on stdout: its path, or with --json a line with the path and more."""
+        line = json.dumps({"path": str(path), **(content or {})}) if self.json_lines else str(path)
+        print(line, flush=True)  # noqa: T201 - the one place that writes results
+
+    def note(self, text: str) -> None:
+        """A line for the user to know."""
+        if not self.quiet:
+            _stderr(text)
+
+    def warn(self, text: str) -> None:
+        """A line for the user to mind."""
+        _stderr(f"Warning: {text}")
+
+    @contextmanager
+    def progress(self, title: str) -> Iterator[Callable[[float, str], None]]:
+        """A bar on a terminal, a plain line now and then elsewhere.
+
+        Yields:
+            update(share in [0, 1], detail): to be called as often as one likes.
+        """
+        if self.quiet:
+            yield lambda share, detail: None
+        elif sys.stderr.isatty():
+            yield from _bar(title)
+        else:
+            yield from _plain_lines(title)
+
+
+def _bar(title: str) -> Iterator[Callable[[float, str], None]]:
+    from rich.console import Console as RichConsole
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f} %"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[detail]}"),
+    )
+    with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=1.0, detail="")
+        yield lambda share, detail: bar.update(task, completed=share, detail=detail)
+
+
+def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
+    last = time.monotonic()
+
+    def update(share: float, detail: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= PLAIN_LINE_SECONDS:
+            last = time.monotonic()
+            _stderr(f"{title}: {100 * share:.0f} % {detail}".rstrip())
+
+    yield update
+
+
+def _stderr(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)  # noqa: T201 - the one place that writes to the user
+
+
+def report_error(error: UserError, about: str | None = None) -> None:
+    """The two lines of an error, with what it is about in front where several things are worked on."""
+    _stderr(f"Error: {about + ': ' if about else ''}{error.message}")
+    _stderr(f"Hint:  {error.hint}")
+
+
+def command(function: Callable[P, R]) -> Callable[P, R]:
+    """Turn what a command raises into two lines and an exit code; bugs keep their traceback."""
+
+    @functools.wraps(function)
+    def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return function(*args, **kwargs)
+        except UserError as error:
+            report_error(error)
+            raise typer.Exit(error.exit_code) from error
+        except KeyboardInterrupt as error:
+            _stderr("Interrupted; what was complete is kept.")
+            raise typer.Exit(INTERRUPTED) from error
+        except BrokenPipeError as error:
+            # Whoever read our results has gone: end quietly, and let Python not complain while closing stdout.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from error
+        except (MemoryError, RuntimeError) as error:
+            if not _is_out_of_memory(error):
+                raise
+            report_error(
+                UserError("out of memory", "try --downscale 4, smaller pictures (--max-size), or fewer photos")
+            )
+            raise typer.Exit(OUT_OF_MEMORY) from error
+
+    return guarded
+
+
+def _is_out_of_memory(error: BaseException) -> bool:
+    """Torch says it in a RuntimeError's text on the CPU, and in a subclass of RuntimeError on a GPU."""
+    text = str(error).lower()
+    return isinstance(error, MemoryError) or "not enough memory" in text or "out of memory" in text

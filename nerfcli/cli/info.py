@@ -1,0 +1,96 @@
+"""nerfcli info: what a folder is, and what is in it."""
+
+import json as json_module
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from nerfcli.cli.batch import for_each_input
+from nerfcli.cli.console import Console, command
+from nerfcli.cli.options import Json
+
+
+@command
+def info(
+    path: Annotated[str, typer.Argument(help="A scene or a run, or - for paths on standard input.")],
+    json: Json = False,
+) -> None:
+    """Say what a scene or a run holds: cameras, photos, missing files, split, unit; settings, time, numbers.
+
+    \b
+    Examples:
+      nerfcli info photos-scene
+      nerfcli info photos-scene-run --json
+    """
+    console = Console(quiet=True, json_lines=True)
+
+    def work(folder: Path, one_of_many: bool) -> None:
+        content = describe(folder)
+        if json:
+            console.result(folder, content)
+        else:
+            typer.echo("\n".join([str(folder), *(f"  {key}: {_text(value)}" for key, value in content.items())]))
+
+    for_each_input(path, work)
+
+
+def describe(folder: Path) -> dict[str, Any]:
+    """The facts of a run where there is one, else of a scene."""
+    from nerfcli.train.run_folder import CONFIG
+
+    return _describe_run(folder) if (folder / CONFIG).exists() else _describe_scene(folder)
+
+
+def _describe_scene(folder: Path) -> dict[str, Any]:
+    from nerfcli import scene as scenes
+
+    scene = scenes.load(folder)
+    cameras = {frame.camera for frame in scene.frames}
+    return {
+        "kind": scene.kind,
+        "photos": len(scene.frames),
+        "held_out": len(scene.test_frames),
+        "missing": len(scene.missing),
+        "cameras": [f"{c.model} {c.width}x{c.height} focal {c.focal_px:.1f} px" for c in list(cameras)[:5]],
+        "camera_count": len(cameras),
+        "points": len(scene.points),
+        "unit": scene.unit,
+        "fingerprint": scenes.fingerprint(scene),
+    }
+
+
+def _describe_run(folder: Path) -> dict[str, Any]:
+    from nerfcli.evaluate.protocol import METRICS
+    from nerfcli.field.cost import field_bytes
+    from nerfcli.render.model import load_model
+    from nerfcli.train.run_folder import FIELD, read_cameras, read_config, read_log
+
+    config = read_config(folder)
+    cameras = read_cameras(folder)
+    log = read_log(folder)
+    content: dict[str, Any] = {
+        "kind": "run",
+        "scene": config.get("scene"),
+        "photos": len(cameras["train"]),
+        "held_out": len(cameras["test"]),
+        "unit": config.get("unit"),
+        "settings": config.get("settings"),
+        "versions": config.get("versions"),
+    }
+    if log:
+        content |= {key: log[-1].get(key) for key in ("step", "seconds", "loss", "samples_per_second")}
+    if (folder / FIELD).exists():
+        model = load_model(folder / FIELD, "cpu")
+        content |= {
+            "field_bytes": field_bytes(model.field),
+            "occupied_share": round(model.occupied.float().mean().item(), 4),
+            "unbounded": model.field.settings.unbounded,
+        }
+    if (folder / METRICS).exists():
+        content["metrics"] = json_module.loads((folder / METRICS).read_text(encoding="utf-8"))["mean"]
+    return content
+
+
+def _text(value: Any) -> str:
+    return json_module.dumps(value, ensure_ascii=False) if isinstance(value, dict | list) else str(value)

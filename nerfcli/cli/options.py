@@ -1,0 +1,64 @@
+"""Options that mean the same in every command, and the readers of their values."""
+
+import os
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nerfcli.errors import UserError
+
+Output = Annotated[
+    Path | None,
+    typer.Option(
+        "--output", "-o", help="Where the result goes; with several inputs, the folder that holds the results."
+    ),
+]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
+Threads = Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)]
+Json = Annotated[bool, typer.Option("--json", help="Results as JSON Lines on stdout instead of paths.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No notes and no progress; warnings and errors stay.")]
+
+_SECONDS_PER_UNIT = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+def seconds_from_text(text: str) -> float:
+    """90s, 5m, 1.5h or plain seconds.
+
+    Raises:
+        typer.BadParameter: anything else, or nothing left to spend.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
+    seconds = float(match[1]) * _SECONDS_PER_UNIT[match[2] or "s"] if match else 0.0
+    if not seconds > 0:
+        raise typer.BadParameter(f"{text!r} is not a time; write 90s, 5m or 1h")
+    return seconds
+
+
+def thread_count(threads: int) -> int:
+    """The number of CPU threads to use: as asked, or the processors this process may run on."""
+    if threads:
+        return threads
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def device_name(device: str) -> str:
+    """The torch device for --device.
+
+    Raises:
+        UserError: CUDA is asked for and not there, or the name is unknown.
+    """
+    import torch
+
+    if device not in ("auto", "cpu", "cuda"):
+        raise UserError(f"unknown device {device!r}", "choose --device auto, cpu or cuda", exit_code=2)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("--device cuda: torch sees no CUDA device", "use --device cpu, or install torch with CUDA")
+    if device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    return device

@@ -1,0 +1,93 @@
+"""nerfcli poses: from photos to a scene."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.console import Console, command
+from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Seed, Threads, thread_count
+from nerfcli.errors import UserError
+
+if TYPE_CHECKING:
+    from nerfcli.poses.structure_from_motion import PoseSettings
+
+NAMES_SHOWN = 8
+
+
+@command
+def poses(
+    photos: Annotated[str, typer.Argument(help="A folder of photos, or - for folders on standard input.")],
+    output: Output = None,
+    max_size: Annotated[int, typer.Option(help="Longer side for feature extraction, pixels.", min=100)] = 1600,
+    max_features: Annotated[int, typer.Option(help="SIFT features per photo.", min=100)] = 4096,
+    camera_model: Annotated[str, typer.Option(help="auto, or a COLMAP model such as SIMPLE_RADIAL, OPENCV.")] = "auto",
+    min_registered: Annotated[float, typer.Option(help="Share of photos that must register.", min=0, max=1)] = 0.5,
+    seed: Seed = 0,
+    threads: Threads = 0,
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Estimate camera poses and intrinsics (structure from motion with pycolmap).
+
+    Writes PHOTOS-scene/ with a COLMAP model, scene.json and poses_report.json. The photos are neither copied nor
+    changed. Photos that do not register are listed with the reason.
+
+    \b
+    Examples:
+      nerfcli poses photos/kitchen
+      nerfcli poses photos/kitchen -o kitchen --max-size 1000 --max-features 2048
+      ls -d captures/*/ | nerfcli poses - -o scenes/
+    """
+    from nerfcli.poses.structure_from_motion import PoseSettings
+
+    console = Console(quiet=quiet, json_lines=json)
+    settings = PoseSettings(
+        max_image_size=max_size,
+        max_features=max_features,
+        seed=seed,
+        threads=thread_count(threads),
+        camera_model=camera_model,
+        min_registered=min_registered,
+    )
+
+    def work(folder: Path, one_of_many: bool) -> None:
+        scene = result_path(folder, suffix="-scene", output=output, one_of_many=one_of_many)
+        estimate_scene(folder, scene, settings=settings, overwrite=overwrite, console=console)
+        console.result(scene)
+
+    for_each_input(photos, work)
+
+
+def estimate_scene(folder: Path, scene: Path, *, settings: "PoseSettings", overwrite: bool, console: Console) -> None:
+    """Estimate one scene, or keep the one that was made from the same photos with the same settings.
+
+    Raises:
+        UserError: see `estimate_poses`; or something else stands at `scene`.
+    """
+    from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
+
+    if scene.exists() and not overwrite:
+        if is_same_scene(scene, folder, settings):
+            console.note(f"{scene} is kept: it was made from these photos; --overwrite makes it again")
+            return
+        raise UserError(f"{scene} exists", "add --overwrite to replace it, or choose another place with -o")
+    with console.progress(f"poses {folder.name}") as update:
+        report = estimate_poses(
+            folder,
+            scene,
+            settings=settings,
+            notify=console.note,
+            progress=lambda stage, done, total: update(done / max(total, 1), stage),
+        )
+    left_out = [image for image in report.images if not image.registered]
+    for image in left_out[:NAMES_SHOWN]:
+        console.warn(f"{image.name} was not registered: {image.reason}")
+    if len(left_out) > NAMES_SHOWN:
+        console.warn(f"{len(left_out) - NAMES_SHOWN} more are listed in {scene / 'poses_report.json'}")
+    console.note(
+        f"{scene}: {report.registered} of {report.total} photos registered in {report.seconds['total']:.0f} s, "
+        f"mean reprojection error {report.mean_reprojection_error_px:.2f} px"
+    )

@@ -1,0 +1,226 @@
+"""nerfcli render: pictures, depth maps and videos of a run."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nerfcli.cli.batch import for_each_input
+from nerfcli.cli.console import Console, command
+from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
+from nerfcli.errors import UserError
+
+if TYPE_CHECKING:
+    from nerfcli.cameras.camera import Camera
+    from nerfcli.cameras.frame import Frame
+    from nerfcli.export import ExportSettings
+
+PATHS = ("orbit", "spiral", "interpolate")
+
+
+@command
+def render(
+    run: Annotated[str, typer.Argument(help="The folder that train wrote, or - for runs on standard input.")],
+    cameras: Annotated[
+        str, typer.Option(help="test, train, orbit, spiral, interpolate, or a scene or transforms.json to see from.")
+    ] = "test",
+    outputs: Annotated[str, typer.Option(help="Some of rgb,depth,opacity.")] = "rgb,depth,opacity",
+    depth: Annotated[
+        str, typer.Option(help="Which depth: conditional, moment, background, max-weight or median.")
+    ] = "conditional",
+    depth_axis: Annotated[str, typer.Option(help="ray: along the ray; z: along the optical axis.")] = "z",
+    opacity_floor: Annotated[float, typer.Option(help="Less opaque pixels have no depth (NaN).", min=0, max=1)] = 0.5,
+    background_distance: Annotated[
+        float | None, typer.Option(help="What --depth background counts for light that passes, scene units.", min=0)
+    ] = None,
+    npy: Annotated[bool, typer.Option("--npy", help="Depth as .npy beside the TIFF.")] = False,
+    video: Annotated[bool, typer.Option("--video", help="An MP4 of each output.")] = False,
+    frames: Annotated[int, typer.Option(help="Frames of orbit, spiral and interpolate.", min=2)] = 60,
+    fps: Annotated[float, typer.Option(help="Frames per second of the video.", min=1, max=240)] = 24,
+    max_size: Annotated[
+        int | None, typer.Option(help="Longer side of the pictures at most, pixels.  [default: as trained]", min=8)
+    ] = None,
+    output: Output = None,
+    device: Device = "auto",
+    threads: Threads = 0,
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Render a trained run: colours, depth maps that say what they mean, opacity, videos.
+
+    \b
+    The five depths of a ray, exact inside each interval:
+      conditional  mean distance of where light ends, given that it ends     (NaN below --opacity-floor)
+      moment       the same, not divided by the opacity
+      background   mean distance with what passes counted at --background-distance
+      max-weight   the interval that stops most light
+      median       where half of the light has ended                        (NaN if less than half ends)
+    Depth files are float32 TIFF; convention, axis, unit, opacity floor and invalid value are in each file.
+    Writes RUN/renders/CAMERAS/.
+
+    \b
+    Examples:
+      nerfcli render photos-scene-run --cameras test --outputs rgb,depth --depth median --depth-axis ray
+      nerfcli render photos-scene-run --cameras orbit --frames 120 --video
+      nerfcli render photos-scene-run --cameras other/transforms.json -o other-views
+    """
+    from nerfcli.export import OUTPUTS, ExportSettings
+    from nerfcli.render.depth import CONVENTIONS
+    from nerfcli.render.pictures import DepthRequest
+
+    chosen = tuple(dict.fromkeys(outputs.split(",")))
+    if unknown := [name for name in chosen if name not in OUTPUTS]:
+        raise typer.BadParameter(f"{unknown[0]!r}; choose some of {','.join(OUTPUTS)}", param_hint="--outputs")
+    if depth not in CONVENTIONS:
+        raise typer.BadParameter(f"{depth!r}; choose one of {', '.join(CONVENTIONS)}", param_hint="--depth")
+    if depth_axis not in ("ray", "z"):
+        raise typer.BadParameter(f"{depth_axis!r}; choose ray or z", param_hint="--depth-axis")
+    console = Console(quiet=quiet, json_lines=json)
+    request = DepthRequest(
+        convention=depth, axis=depth_axis, opacity_floor=opacity_floor, background_distance=background_distance
+    )
+    settings = ExportSettings(outputs=chosen, depth=request, npy=npy, video=video, fps=fps)
+
+    def work(folder: Path, one_of_many: bool) -> None:
+        target = folder / "renders" / folder_name(cameras, settings)
+        if output is not None:
+            target = output / folder.name if one_of_many else output
+        written = render_run(
+            folder,
+            target,
+            cameras=cameras,
+            count=frames,
+            max_size=max_size,
+            settings=settings,
+            device=device_name(device),
+            threads=thread_count(threads),
+            overwrite=overwrite,
+            console=console,
+        )
+        for path in written:
+            console.result(path)
+
+    for_each_input(run, work)
+
+
+def folder_name(cameras: str, settings: "ExportSettings") -> str:
+    """The folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
+    name = cameras if cameras in ("test", "train", *PATHS) else Path(cameras).absolute().stem
+    return f"{name}-{settings.depth.convention}-{settings.depth.axis}" if "depth" in settings.outputs else name
+
+
+def render_run(
+    run: Path,
+    target: Path,
+    *,
+    cameras: str,
+    count: int,
+    max_size: int | None,
+    settings: "ExportSettings",
+    device: str,
+    threads: int,
+    overwrite: bool,
+    console: Console,
+) -> list[Path]:
+    """Render into `target`, or keep what stands there if it is the same.
+
+    Returns:
+        The paths to show: videos, or the folders of the outputs.
+
+    Raises:
+        UserError: no such run, no such cameras, or other files stand at `target`.
+    """
+    import hashlib
+    import json as json_module
+    from dataclasses import replace
+
+    import torch
+
+    from nerfcli.export import DESCRIPTION, export_frames
+    from nerfcli.render.model import load_model
+    from nerfcli.train.run_folder import FIELD
+
+    torch.set_num_threads(threads)
+    model = load_model(run / FIELD, device)
+    if settings.depth.convention == "background" and settings.depth.background_distance is None:
+        farthest = model.marching.far / model.training_from_scene.scale
+        settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
+    views = chosen_frames(run, cameras, count=count, max_size=max_size)
+    provenance: dict[str, Any] = {
+        "cameras": cameras,
+        "run": run.name,
+        "field_sha256": hashlib.sha256((run / FIELD).read_bytes()).hexdigest(),
+    }
+    if target.exists() and not overwrite:
+        same = False
+        if (target / DESCRIPTION).exists():
+            made = json_module.loads((target / DESCRIPTION).read_text(encoding="utf-8"))
+            wanted = {"settings": settings.to_json(), **provenance}
+            same = all(made.get(key) == value for key, value in wanted.items()) and len(made["frames"]) == len(views)
+        if not same:
+            raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another place with -o")
+        console.note(f"{target} is kept: it was rendered with these settings; --overwrite renders again")
+        return [target / (f"{name}.mp4" if settings.video else name) for name in settings.outputs]
+
+    total = sum(frame.camera.width * frame.camera.height for frame in views)
+    done = 0
+    with console.progress(f"render {cameras}") as update:
+
+        def on_rays(rays: int) -> None:
+            nonlocal done
+            done += rays
+            update(done / total, f"{len(views)} frames")
+
+        return export_frames(model, views, target, settings, provenance=provenance, on_rays=on_rays)
+
+
+def chosen_frames(run: Path, cameras: str, *, count: int, max_size: int | None) -> "list[Frame]":
+    """The frames that --cameras names, at the size of the training or within `max_size`."""
+    from dataclasses import replace
+
+    from nerfcli.cameras import paths
+    from nerfcli.train.photos import downscaled_camera
+    from nerfcli.train.run_folder import read_cameras, read_config
+
+    sets = read_cameras(run)
+    factor = read_config(run)["settings"]["downscale"]
+    if cameras in ("test", "train"):
+        chosen = list(sets[cameras])
+        if not chosen:
+            raise UserError(f"{run} has no {cameras} cameras", "choose --cameras train, orbit, spiral or interpolate")
+    elif cameras in PATHS:
+        chosen = list(
+            {"orbit": paths.orbit, "spiral": paths.spiral, "interpolate": paths.interpolate}[cameras](
+                sets["train"], count=count
+            )
+        )
+    else:
+        chosen = list(frames_of_file(Path(cameras)))
+        factor = 1
+    chosen = [replace(frame, camera=downscaled_camera(frame.camera, factor)) for frame in chosen]
+    if max_size is None:
+        return chosen
+    return [replace(frame, camera=_within(frame.camera, max_size)) for frame in chosen]
+
+
+def frames_of_file(path: Path) -> "tuple[Frame, ...]":
+    """The cameras of a transforms.json, or of any scene folder."""
+    from nerfcli import scene as scenes
+    from nerfcli.cameras.transforms import read_camera_path
+
+    if path.is_dir():
+        return scenes.load(path).frames
+    if not path.exists():
+        raise UserError(
+            f"no cameras called {path}",
+            f"choose test, train, {', '.join(PATHS)}, a scene folder, or a transforms.json",
+        )
+    return read_camera_path(path)
+
+
+def _within(camera: "Camera", max_size: int) -> "Camera":
+    """The camera of the picture made smaller, if need be, until its longer side fits."""
+    from nerfcli.train.photos import downscaled_camera
+
+    return downscaled_camera(camera, max(1.0, max(camera.width, camera.height) / max_size))

@@ -1,0 +1,95 @@
+"""nerfcli run: from photos to poses, field, numbers, depth maps and a video."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.console import Console, command
+from nerfcli.cli.options import (
+    Device,
+    Json,
+    Output,
+    Overwrite,
+    Quiet,
+    Seed,
+    Threads,
+    device_name,
+    seconds_from_text,
+    thread_count,
+)
+
+
+@command
+def run(
+    photos: Annotated[str, typer.Argument(help="A folder of photos, or - for folders on standard input.")],
+    output: Output = None,
+    budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
+    frames: Annotated[int, typer.Option(help="Frames of the orbit video.", min=2)] = 60,
+    max_size: Annotated[
+        int | None, typer.Option(help="Longer side of the video at most, pixels.  [default: as trained]", min=8)
+    ] = None,
+    device: Device = "auto",
+    seed: Seed = 0,
+    threads: Threads = 0,
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Do everything: poses, train, evaluate, renders of the held-out views, and an orbit video.
+
+    Writes PHOTOS-scene/ and PHOTOS-scene-run/ beside the photos, or scene/ and run/ inside --output. Stages that are
+    complete are kept, so an interrupted run goes on where it stopped.
+
+    \b
+    Examples:
+      nerfcli run photos/kitchen
+      nerfcli run photos/kitchen -o kitchen --budget 5m
+    """
+    from nerfcli.cli.evaluate import evaluate_run
+    from nerfcli.cli.poses import estimate_scene
+    from nerfcli.cli.render import folder_name, render_run
+    from nerfcli.cli.train import train_scene
+    from nerfcli.export import OUTPUTS, ExportSettings
+    from nerfcli.poses.structure_from_motion import PoseSettings
+    from nerfcli.render.pictures import DepthRequest
+    from nerfcli.train.settings import TrainSettings
+
+    console = Console(quiet=quiet, json_lines=json)
+    cores, torch_device = thread_count(threads), device_name(device)
+    pose_settings = PoseSettings(seed=seed, threads=cores)
+    train_settings = TrainSettings(
+        budget_seconds=seconds_from_text(budget), seed=seed, device=torch_device, threads=cores
+    )
+    depth = DepthRequest(convention="conditional", axis="z")
+
+    def work(folder: Path, one_of_many: bool) -> None:
+        scene = result_path(folder, suffix="-scene", output=output, one_of_many=one_of_many)
+        field = result_path(scene, suffix="-run", output=None, one_of_many=False)
+        if output is not None:
+            scene, field = scene / "scene", scene / "run"
+        estimate_scene(folder, scene, settings=pose_settings, overwrite=overwrite, console=console)
+        train_scene(scene, field, settings=train_settings, resume=False, overwrite=overwrite, console=console)
+        metrics, numbers = evaluate_run(field, device=torch_device, threads=cores, overwrite=overwrite, console=console)
+        console.result(scene)
+        console.result(field)
+        console.result(metrics, numbers)
+        for cameras, video in (("test", False), ("orbit", True)):
+            settings = ExportSettings(outputs=OUTPUTS[: 2 if video else 3], depth=depth, npy=False, video=video, fps=24)
+            written = render_run(
+                field,
+                field / "renders" / folder_name(cameras, settings),
+                cameras=cameras,
+                count=frames,
+                max_size=max_size if video else None,
+                settings=settings,
+                device=torch_device,
+                threads=cores,
+                overwrite=overwrite,
+                console=console,
+            )
+            for path in written:
+                console.result(path)
+
+    for_each_input(photos, work)

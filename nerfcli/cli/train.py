@@ -1,0 +1,130 @@
+"""nerfcli train: from a scene to a field."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.console import Console, command
+from nerfcli.cli.options import (
+    Device,
+    Json,
+    Output,
+    Overwrite,
+    Quiet,
+    Seed,
+    Threads,
+    device_name,
+    seconds_from_text,
+    thread_count,
+)
+from nerfcli.errors import UserError
+
+if TYPE_CHECKING:
+    from nerfcli.train.settings import TrainSettings
+
+DEFAULT_BUDGET = "2m"
+NAMES_SHOWN = 8
+
+
+@command
+def train(
+    scene: Annotated[str, typer.Argument(help="A scene folder, or - for scenes on standard input.")],
+    output: Output = None,
+    budget: Annotated[
+        str | None, typer.Option(help="Training time: 90s, 5m, 1h.  [default: 2m, or none with --steps]")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Optimiser steps in all; repeatable bit for bit.", min=1)] = None,
+    downscale: Annotated[str, typer.Option(help="Average photos over squares: auto, 1, 2, 4 or 8.")] = "auto",
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint to the new total.")] = False,
+    device: Device = "auto",
+    seed: Seed = 0,
+    threads: Threads = 0,
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Fit a radiance field to a scene.
+
+    SCENE is what `nerfcli poses` wrote, a COLMAP project, or a folder with transforms.json (nerfstudio, instant-ngp),
+    transforms_train.json (Blender) or poses_bounds.npy (LLFF). Every 8th photo is held out. Writes SCENE-run/.
+    Ctrl-C saves a checkpoint; --resume goes on from it.
+
+    \b
+    Examples:
+      nerfcli train photos-scene --budget 90s
+      nerfcli train photos-scene --budget 5m --resume
+      nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
+    """
+    from nerfcli.train.settings import TrainSettings
+
+    if downscale not in ("auto", "1", "2", "4", "8"):
+        raise typer.BadParameter(f"{downscale!r}; choose auto, 1, 2, 4 or 8", param_hint="--downscale")
+    if budget is None and steps is None:
+        budget = DEFAULT_BUDGET
+    console = Console(quiet=quiet, json_lines=json)
+    settings = TrainSettings(
+        budget_seconds=None if budget is None else seconds_from_text(budget),
+        steps=steps,
+        downscale=None if downscale == "auto" else int(downscale),
+        seed=seed,
+        device=device_name(device),
+        threads=thread_count(threads),
+    )
+
+    def work(folder: Path, one_of_many: bool) -> None:
+        run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
+        train_scene(folder, run, settings=settings, resume=resume, overwrite=overwrite, console=console)
+        console.result(run)
+
+    for_each_input(scene, work)
+
+
+def train_scene(
+    folder: Path, run: Path, *, settings: "TrainSettings", resume: bool, overwrite: bool, console: Console
+) -> None:
+    """Train one scene, keep a run that is already what was asked for, or refuse to touch another one.
+
+    Raises:
+        UserError: see `nerfcli.train.loop.train`; or a different run stands at `run`.
+    """
+    from nerfcli import scene as scenes
+    from nerfcli.train.loop import Progress
+    from nerfcli.train.loop import train as fit
+    from nerfcli.train.run_folder import CONFIG, FIELD, is_complete, is_same_run
+
+    scene = scenes.load(folder)
+    if scene.missing:
+        listed = ", ".join(scene.missing[:NAMES_SHOWN])
+        more = f" and {len(scene.missing) - NAMES_SHOWN} more" if len(scene.missing) > NAMES_SHOWN else ""
+        console.warn(f"{len(scene.missing)} photos of {folder} are not there and are left out: {listed}{more}")
+    exists = (run / CONFIG).exists() or (run / FIELD).exists()
+    if resume and not (run / FIELD).exists():
+        raise UserError(f"nothing to resume in {run}", "leave --resume out to start, or give the run with -o")
+    if exists and not resume and not overwrite:
+        if is_same_run(run, scene, settings) and is_complete(run, settings):
+            console.note(f"{run} is kept: it was trained with these settings; --overwrite trains again")
+            return
+        raise UserError(
+            f"{run} exists", "add --resume to go on, --overwrite to replace it, or choose another place with -o"
+        )
+    if run.exists() and not exists and any(run.iterdir()):
+        raise UserError(f"{run} holds other files", "choose another place with -o")
+
+    with console.progress(f"train {folder.name}") as update:
+
+        def on_progress(progress: Progress) -> None:
+            detail = (
+                f"step {progress.step}  loss {progress.loss:.4f}  {progress.samples_per_second / 1e3:.0f} k samples/s"
+            )
+            if progress.heldout_psnr is not None:
+                detail += f"  held-out {progress.heldout_psnr:.2f} dB"
+            update(progress.share, detail)
+
+        try:
+            fit(scene, run, settings, resume=resume, notify=console.note, on_progress=on_progress)
+        except KeyboardInterrupt:
+            if (run / FIELD).exists():
+                console.note(f"checkpoint saved; go on with: nerfcli train {folder} -o {run} --resume")
+            raise

@@ -1,0 +1,24 @@
+"""What the user can mend: one exception, and the exit codes that scripts rely on."""
+
+BAD_INPUT = 3
+TOO_FEW_PHOTOS = 4
+NON_FINITE = 5
+OUT_OF_MEMORY = 6
+GATE_NOT_MET = 7
+INTERRUPTED = 130
+
+
+class UserError(Exception):
+    """A problem that the user can mend, told in two lines.
+
+    Args:
+        message: what is wrong, with the value and the file; no trailing full stop needed.
+        hint: what was expected and what to do about it.
+        exit_code: the process's exit status, one of the constants of this module.
+    """
+
+    def __init__(self, message: str, hint: str, exit_code: int = BAD_INPUT):
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+        self.exit_code = exit_code

@@ -1,0 +1,224 @@
+"""The definition of every hot operation, in plain torch: short, any dtype, any device, never optimised.
+
+Letters: rays R; samples N of all rays together, packed ray after ray; `offsets` (R + 1,) int64 with ray r owning
+samples offsets[r] up to offsets[r + 1]; table levels L, rows per level T, features per row F. A fast kernel in
+another module of this folder agrees with these functions in value and gradient.
+"""
+
+import torch
+from torch import Tensor
+
+HASH_PRIMES = (1, 2654435761, 805459861)
+
+
+def contract(points: Tensor) -> Tensor:
+    """All of space mapped into the ball of radius 2; the unit ball stays as it is.
+
+    contract(x) = x for |x| <= 1, else (2 - 1/|x|) x / |x|
+
+    Args:
+        points: (..., 3) finite; components up to the square root of the dtype's largest number.
+
+    Returns:
+        (..., 3) with norm below or at 2.
+
+    Differentiable everywhere, with the identity as its derivative at 0: norms below 1 are raised to 1 before the
+    division, so that no gradient passes through a root at 0.
+    Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 10.
+    """
+    norm = points.square().sum(-1, keepdim=True).clamp_min(1.0).sqrt()
+    return (2.0 - 1.0 / norm) / norm * points
+
+
+def grid_coordinates(points: Tensor, unbounded: bool) -> Tensor:
+    """Points of the training frame as coordinates of the unit cube that holds the field's grids.
+
+    Bounded scenes live in [-1, 1]^3; unbounded ones are contracted into the ball of radius 2 first.
+
+    Args:
+        points: (..., 3) training frame.
+        unbounded: whether the scene goes on beyond the central ball.
+
+    Returns:
+        (..., 3); inside [0, 1] for every point of an unbounded scene.
+    """
+    if unbounded:
+        return contract(points) / 4.0 + 0.5
+    return points / 2.0 + 0.5
+
+
+def corner_rows(cells: Tensor, resolution: int, rows: int) -> Tensor:
+    """The table row of each grid vertex: its place in the dense grid where that fits, else its spatial hash.
+
+    hash(i, j, k) = (i * 1 xor j * 2654435761 xor k * 805459861) mod rows, in unsigned 32-bit arithmetic.
+
+    Args:
+        cells: (..., 3) int64 vertex indices, 0 .. resolution.
+        resolution: cells per axis; the level has (resolution + 1)^3 vertices.
+        rows: rows of the table, a power of two.
+
+    Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, eq. 4.
+    """
+    side = resolution + 1
+    if side**3 <= rows:
+        return (cells[..., 2] * side + cells[..., 1]) * side + cells[..., 0]
+    mixed = cells[..., 0] * HASH_PRIMES[0]
+    for axis in (1, 2):
+        mixed = mixed ^ (cells[..., axis] * HASH_PRIMES[axis])
+    return mixed & (rows - 1)  # the low bits are the same in 32 and in 64 bits
+
+
+def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+    """Trilinear interpolation in a multiresolution hash table.
+
+    Args:
+        points: (N, 3) in [0, 1]; values outside are clamped.
+        table: (L, T, F), T a power of two.
+        resolutions: cells per axis of each of the L levels.
+
+    Returns:
+        (N, L * F), level after level.
+
+    Raises:
+        ValueError: the table does not have one level per resolution, or T is not a power of two.
+
+    Differentiable in the table only: the gradient with respect to points is that of the piecewise trilinear
+    function, which jumps at cell borders, and is left to autograd.
+    Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, section 3.
+    """
+    levels, rows, _ = table.shape
+    if levels != len(resolutions):
+        raise ValueError(f"table must have {len(resolutions)} levels, got shape {tuple(table.shape)}")
+    if rows & (rows - 1):
+        raise ValueError(f"rows must be a power of two, got {rows}")
+    corners = torch.tensor([[i >> axis & 1 for axis in range(3)] for i in range(8)], device=points.device)
+    encoded = []
+    for level, resolution in enumerate(resolutions):
+        scaled = points.clamp(0.0, 1.0) * resolution
+        cell = scaled.detach().floor().clamp_max(resolution - 1)  # the far border belongs to the last cell
+        inside = (scaled - cell)[:, None, :]  # (N, 1, 3)
+        weights = torch.where(corners == 1, inside, 1.0 - inside).prod(-1)  # (N, 8)
+        index = corner_rows(cell.long()[:, None, :] + corners, resolution, rows)  # (N, 8)
+        encoded.append((table[level][index] * weights[..., None]).sum(1))
+    return torch.cat(encoded, dim=-1)
+
+
+def march(
+    origins: Tensor,
+    directions: Tensor,
+    edges: Tensor,
+    *,
+    jitter: Tensor,
+    occupied: Tensor,
+    unbounded: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cut rays into intervals and keep those whose midpoint lies in an occupied cell.
+
+    Ray r is cut at edges[k] + jitter[r] * (edges[k + 1] - edges[k]).
+
+    Args:
+        origins, directions: (R, 3), unit directions, training frame.
+        edges: (S + 2,) increasing distances, shared by the rays, for S intervals.
+        jitter: (R,) in [0, 1).
+        occupied: (G, G, G) bool over the unit cube of `grid_coordinates`, indexed [z, y, x].
+        unbounded: see `grid_coordinates`; outside the cube of a bounded scene nothing is occupied.
+
+    Returns:
+        starts (N,), ends (N,), offsets (R + 1,).
+    """
+    cuts = edges[:-1] + jitter[:, None] * (edges[1:] - edges[:-1])  # (R, S + 1)
+    starts, ends = cuts[:, :-1], cuts[:, 1:]
+    middles = origins[:, None, :] + directions[:, None, :] * ((starts + ends) / 2)[..., None]  # (R, S, 3)
+    coordinates = grid_coordinates(middles, unbounded)
+    side = occupied.shape[0]
+    inside = ((coordinates >= 0) & (coordinates <= 1)).all(-1)
+    x, y, z = (coordinates.clamp(0, 1) * side).long().clamp_max(side - 1).unbind(-1)
+    kept = inside & occupied[z, y, x]
+    offsets = torch.zeros(len(origins) + 1, dtype=torch.int64, device=origins.device)
+    offsets[1:] = kept.sum(1).cumsum(0)
+    return starts[kept], ends[kept], offsets
+
+
+def ray_indices(offsets: Tensor) -> Tensor:
+    """The ray of each packed sample, (N,) int64."""
+    counts = offsets.diff()
+    return torch.repeat_interleave(torch.arange(len(counts), device=offsets.device), counts)
+
+
+def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
+    """Optical depth between the ray's origin and the near end of each interval.
+
+    tau_i = sum_{j < i} density_j * length_j over the samples of the same ray.
+
+    The sums are shifted and then accumulated, ray by ray: the shorter way (accumulate, then subtract the interval's
+    own part) loses all digits when a later interval is much denser.
+
+    Args:
+        density: (N,) >= 0, finite, in 1 / unit of length.
+        lengths: (N,) >= 0.
+        offsets: (R + 1,).
+
+    Returns:
+        (N,), 0 at the first sample of each ray. Differentiable in density and lengths.
+    """
+    rays = ray_indices(offsets)
+    place = torch.arange(len(density), device=density.device) - offsets[rays]
+    longest = int(offsets.diff().max()) if len(offsets) > 1 else 0
+    rows = density.new_zeros(len(offsets) - 1, longest + 1)
+    rows = rows.index_put((rays, place + 1), density * lengths)
+    return rows.cumsum(1)[rays, place]
+
+
+def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """The share of light that ends in each interval, and the share that passes them all.
+
+    alpha_i = 1 - exp(-density_i * length_i),  T_i = exp(-tau_i),  weight_i = T_i * alpha_i
+
+    Args:
+        density: (N,) >= 0, finite.
+        lengths: (N,) >= 0.
+        offsets: (R + 1,).
+
+    Returns:
+        weights (N,), transmittance (R,) behind the last interval; per ray they sum to 1.
+
+    Differentiable in density and lengths. alpha by expm1: 1 - exp loses every digit below 1e-7 in float32.
+    Source: Max 1995, Optical models for direct volume rendering; Mildenhall et al. 2020, arXiv:2003.08934, eq. 3.
+    """
+    before = optical_depth_before(density, lengths, offsets)
+    depth = density * lengths
+    weights = torch.exp(-before) * -torch.expm1(-depth)
+    total = torch.zeros(len(offsets) - 1, dtype=density.dtype, device=density.device)
+    total = total.index_add(0, ray_indices(offsets), depth)
+    return weights, torch.exp(-total)
+
+
+def sum_along_rays(values: Tensor, offsets: Tensor) -> Tensor:
+    """Sums of the samples of each ray: (N, ...) to (R, ...). Differentiable."""
+    total = torch.zeros((len(offsets) - 1, *values.shape[1:]), dtype=values.dtype, device=values.device)
+    return total.index_add(0, ray_indices(offsets), values)
+
+
+def composite(
+    density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Colour of rays through an emitting, absorbing medium in front of a background.
+
+    colour = sum_i weight_i * rgb_i + T * background; see `interval_weights`.
+
+    Args:
+        density: (N,) >= 0, finite.
+        rgb: (N, 3).
+        lengths: (N,) >= 0.
+        offsets: (R + 1,).
+        background: (R, 3) or (3,).
+
+    Returns:
+        colour (R, 3), transmittance (R,), weights (N,). A ray without samples has the background's colour and T = 1.
+
+    Differentiable in density, rgb, lengths and background.
+    Source: Mildenhall et al. 2020, NeRF, arXiv:2003.08934, eq. 3.
+    """
+    weights, transmittance = interval_weights(density, lengths, offsets)
+    colour = sum_along_rays(weights[:, None] * rgb, offsets)
+    return colour + transmittance[:, None] * background, transmittance, weights

@@ -1,0 +1,1 @@
+"""Pixels on disk: photos and pictures (`images`), depth maps that say what they mean (`depth`), `video`."""

@@ -1,0 +1,344 @@
+"""Photos and rendered pictures: what a folder holds, 8-bit sRGB pixels, EXIF, exact downscaling, PNG.
+
+The EXIF orientation is applied once, here, so that sizes, pixels and cameras all mean the upright picture.
+"""
+
+import io
+import math
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from numbers import Rational
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
+from PIL.PngImagePlugin import PngInfo
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"})
+
+# Pillow takes more than 179 megapixels for an attack; phones make photos of 200. Now it refuses from 537 on.
+Image.MAX_IMAGE_PIXELS = 2**28
+
+_UPRIGHT_FROM_STORED = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+# What Pillow's decoders raise on files that are damaged; it promises no common base class.
+_DAMAGED = (
+    *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError),
+    *(struct.error, zlib.error, Image.DecompressionBombError),
+)
+_FORMATS = "JPEG, PNG, TIFF, WebP or BMP"
+_SRGB = ImageCms.createProfile("sRGB")
+# Two colour spaces that agree within this many of 255 levels on a grid of colours are the same one.
+_SAME_COLOUR_LEVELS = 2
+
+
+@dataclass(frozen=True)
+class Exif:
+    """What the camera wrote beside the pixels; None where it wrote nothing, or nothing that makes sense.
+
+    focal_35mm is the equivalent focal length on 36 x 24 mm film. orientation is 1...8, 1 where absent.
+    width and height are those of the upright picture. gps is (latitude_deg, longitude_deg, altitude in metres
+    or None), north and east positive.
+    """
+
+    make: str | None
+    model: str | None
+    lens: str | None
+    focal_mm: float | None
+    focal_35mm: float | None
+    orientation: int
+    width: int
+    height: int
+    exposure_seconds: float | None
+    iso: float | None
+    gps: tuple[float, float, float | None] | None
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The picture files of a folder itself, sorted by name; hidden files and subfolders are left out.
+
+    Raises:
+        UserError: the folder is not there or cannot be listed.
+    """
+    try:
+        files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise UserError(f"cannot list the photos in {folder}: {reason}", "give a folder of photos") from error
+    return sorted((p for p in files if not p.name.startswith(".") and p.is_file()), key=lambda p: p.name)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of the upright picture, from the header alone.
+
+    Raises:
+        UserError: see `read_image`; damage behind the header is not seen.
+    """
+    with _opened(path) as image:
+        return _upright_size(image)
+
+
+def read_image(path: Path) -> np.ndarray:
+    """A picture as upright 8-bit sRGB, whatever the file holds.
+
+    Grey, palette, CMYK and 16-bit pixels (the high byte is kept) are brought to 8-bit RGB. Colours in another
+    embedded profile than sRGB are converted; a profile that cannot be used is ignored.
+
+    Returns:
+        uint8, writable: (height, width, 3) RGB, or (height, width, 4) RGBA with straight alpha if the file
+        has transparency.
+
+    Raises:
+        UserError: the file is missing, empty, cut short, damaged, no picture, or has float or 32-bit pixels.
+    """
+    with _opened(path) as image:
+        image.load()
+        # Asked after loading: Pillow itself turns TIFF files upright while it loads them, and then says 1.
+        orientation = _orientation(image)
+        srgb = _to_srgb(image, path)
+        if orientation != 1:
+            srgb = srgb.transpose(_UPRIGHT_FROM_STORED[orientation])
+        return np.array(srgb)
+
+
+def read_downscaled(path: Path, factor: float) -> np.ndarray:
+    """`read_image`, then `downscale`; the pixels at full size are freed before it returns.
+
+    Raises:
+        UserError: see `read_image`.
+        ValueError: factor < 1.
+    """
+    return downscale(read_image(path), factor)
+
+
+def downscale(image: np.ndarray, factor: float) -> np.ndarray:
+    """A smaller picture; each pixel is the mean of the area that it covers, fractions of pixels included.
+
+    Colours are averaged with alpha as their weight, so that what transparent pixels hide does not bleed in;
+    where alpha is 0 all over, the colour is 0. A picture whose size stays the same is copied as it is.
+
+    Args:
+        image: uint8 (height, width), (height, width, 3) or (height, width, 4) with straight alpha.
+        factor: >= 1; the sizes are divided by it and rounded, to 1 pixel at least.
+
+    Raises:
+        ValueError: factor < 1, or not an 8-bit picture.
+    """
+    if not factor >= 1:
+        raise ValueError(f"factor must be at least 1, got {factor}")
+    _check_pixels(image)
+    height, width = image.shape[:2]
+    size = (max(1, round(width / factor)), max(1, round(height / factor)))
+    if size == (width, height):
+        return image.copy()
+    if image.ndim == 2 or image.shape[2] == 3:
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    premultiplied = image.astype(np.float32)
+    premultiplied[..., :3] *= premultiplied[..., 3:] / 255
+    small = cv2.resize(premultiplied, size, interpolation=cv2.INTER_AREA)
+    alpha = small[..., 3:]
+    small[..., :3] *= np.divide(255, alpha, out=np.zeros_like(alpha), where=alpha > 0)
+    return np.rint(small).clip(0, 255).astype(np.uint8)
+
+
+def read_exif(path: Path) -> Exif:
+    """The EXIF entries that matter for cameras. Odd or damaged entries read as absent.
+
+    Raises:
+        UserError: see `read_image`; damage behind the header is not seen.
+    """
+    with _opened(path) as image:
+        width, height = _upright_size(image)
+        main = _ifd(image, None)
+        camera = _ifd(image, ExifTags.IFD.Exif)
+        gps = _ifd(image, ExifTags.IFD.GPSInfo)
+        orientation = _orientation(image)
+    return Exif(
+        make=_text(main.get(ExifTags.Base.Make)),
+        model=_text(main.get(ExifTags.Base.Model)),
+        lens=_text(camera.get(ExifTags.Base.LensModel)),
+        focal_mm=_positive(camera.get(ExifTags.Base.FocalLength)),
+        focal_35mm=_positive(camera.get(ExifTags.Base.FocalLengthIn35mmFilm)),
+        orientation=orientation,
+        width=width,
+        height=height,
+        exposure_seconds=_positive(camera.get(ExifTags.Base.ExposureTime)),
+        iso=_positive(camera.get(ExifTags.Base.ISOSpeedRatings)),
+        gps=_position(gps),
+    )
+
+
+def write_png(path: Path, image: np.ndarray, *, metadata: dict[str, str] | None = None) -> None:
+    """Write a picture as PNG, atomically, with `metadata` as its text chunks (any Unicode; keys in Latin-1).
+
+    Args:
+        path: the folder is made if need be.
+        image: uint8 (height, width), (height, width, 3) or (height, width, 4) with straight alpha.
+        metadata: what the picture is, by keyword.
+
+    Raises:
+        UserError: the file cannot be written.
+        ValueError: not an 8-bit picture.
+    """
+    _check_pixels(image)
+    chunks = PngInfo()
+    for key, value in (metadata or {}).items():
+        chunks.add_text(key, value)
+    with atomic_path(path) as partial:
+        Image.fromarray(image).save(partial, format="PNG", pnginfo=chunks)
+
+
+def _check_pixels(image: np.ndarray) -> None:
+    if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] in (3, 4))):
+        raise ValueError(f"image must be uint8 (H, W[, 3|4]), got {image.dtype} {image.shape}")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """The file as a lazy Pillow image; what goes wrong with the file inside the block becomes a UserError."""
+    try:
+        if path.stat().st_size == 0:
+            raise UserError(f"{path} is empty (0 bytes)", "copy the photo once more, or remove the file")
+        with warnings.catch_warnings():
+            # Pillow warns about odd metadata and palettes; none of it changes the pixels.
+            warnings.filterwarnings("ignore", module=r"PIL\.")
+            with Image.open(path) as image:
+                yield image
+    except UnidentifiedImageError as error:
+        raise UserError(
+            f"{path} is not a picture that can be read",
+            f"expected {_FORMATS}; convert it (HEIC and raw files too), or remove it from the folder",
+        ) from error
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise UserError(f"cannot read {path}: {error.strerror}", f"expected a {_FORMATS} file") from error
+    except _DAMAGED as error:
+        raise UserError(
+            f"{path} is damaged or cut short: {error}",
+            "copy the photo once more, or remove it from the folder",
+        ) from error
+
+
+def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
+    """A loaded image in mode RGB or RGBA, in the sRGB colour space."""
+    profile = image.info.get("icc_profile")
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    # A 16-bit PNG is "I" in older releases of Pillow.
+    if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
+        # The high byte, as Pillow does it for 16-bit colour; exact for 8-bit pixels that were widened to 16.
+        image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    if image.mode in ("I", "F"):
+        kind = "integer" if image.mode == "I" else "float"
+        raise UserError(
+            f"{path} has 32-bit {kind} pixels, whose white is not known",
+            "save it with 8 or 16 bits per channel",
+        )
+    if mode == "RGBA" or image.mode not in ("RGB", "L", "CMYK"):
+        image = image.convert(mode)
+    if profile:
+        image = _from_profile(image, profile)
+    return image.convert(mode)
+
+
+def _from_profile(image: Image.Image, profile: bytes) -> Image.Image:
+    """`image` (L, RGB, RGBA or CMYK) in sRGB; unchanged if the profile is sRGB already or cannot be used."""
+    output_mode = image.mode if image.mode in ("RGB", "RGBA") else "RGB"
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        transform = ImageCms.buildTransform(source, _SRGB, image.mode, output_mode)
+        # Names of profiles tell little ("c2" is sRGB, "sRGB-elle-V2-g10" is linear): compare colours instead.
+        if image.mode == output_mode:
+            levels = np.arange(0, 256, 17, dtype=np.uint8)
+            grid = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(1, -1, 3)
+            probe = Image.fromarray(grid).convert(image.mode)
+            changed = np.asarray(ImageCms.applyTransform(probe, transform)).astype(int) - np.asarray(probe)
+            if np.abs(changed).max() <= _SAME_COLOUR_LEVELS:
+                return image
+        converted = ImageCms.applyTransform(image, transform)
+    except (ImageCms.PyCMSError, OSError, ValueError):
+        return image
+    assert converted is not None  # None is what Pillow returns for transforms in place
+    return converted
+
+
+def _upright_size(image: Image.Image) -> tuple[int, int]:
+    # Pillow swaps the size of a TIFF when it opens it, although the tag still says how it is stored.
+    width, height = image.size
+    return (height, width) if image.format != "TIFF" and _orientation(image) >= 5 else (width, height)
+
+
+def _orientation(image: Image.Image) -> int:
+    value = _ifd(image, None).get(ExifTags.Base.Orientation)
+    return value if isinstance(value, int) and value in _UPRIGHT_FROM_STORED else 1
+
+
+def _ifd(image: Image.Image, which: int | None) -> dict[int, Any]:
+    """One directory of EXIF entries, the main one for None; empty if it cannot be parsed."""
+    try:
+        exif = image.getexif()
+        return dict(exif) if which is None else dict(exif.get_ifd(which))
+    except _DAMAGED:
+        return {}
+
+
+def _text(value: Any) -> str | None:
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", errors="replace")
+    return (value.replace("\0", " ").strip() or None) if isinstance(value, str) else None
+
+
+def _number(value: Any) -> float | None:
+    """A finite number from a rational, or from the first of several."""
+    if isinstance(value, tuple) and value:
+        return _number(value[0])
+    if not isinstance(value, (int, float, Rational)):
+        return None
+    try:
+        number = float(value)
+    except ArithmeticError:  # over 0, or too large
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value: Any) -> float | None:
+    number = _number(value)
+    return number if number is not None and number > 0 else None
+
+
+def _position(gps: dict[int, Any]) -> tuple[float, float, float | None] | None:
+    latitude = _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef), limit=90)
+    longitude = _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef), limit=180)
+    if latitude is None or longitude is None:
+        return None
+    altitude = _number(gps.get(ExifTags.GPS.GPSAltitude))
+    if altitude is not None and gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01"):
+        altitude = -altitude  # below the sea
+    return latitude, longitude, altitude
+
+
+def _degrees(value: Any, hemisphere: Any, *, limit: float) -> float | None:
+    """Degrees from (degrees, minutes, seconds) and the letter of the hemisphere."""
+    if not isinstance(value, tuple) or len(value) != 3:
+        return None
+    parts = [_number(part) for part in value]
+    if None in parts:
+        return None
+    magnitude = sum(part / unit for part, unit in zip(parts, (1, 60, 3600), strict=True) if part is not None)
+    if not 0 <= magnitude <= limit:
+        return None
+    return -magnitude if _text(hemisphere) in ("S", "W") else magnitude

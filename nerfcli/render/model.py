@@ -1,0 +1,94 @@
+"""A trained field with everything that is needed to look at it: the frame it lives in, where it is empty, the steps."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.errors import UserError
+from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.render.sampling import step_edges
+
+FORMAT = "nerfcli field 1"
+
+
+@dataclass(frozen=True)
+class Marching:
+    """Where rays are cut, in units of the training frame; see `sampling.step_edges`."""
+
+    near: float
+    far: float
+    shortest_step: float
+    growth: float
+
+    def edges(self) -> Tensor:
+        """(S + 2,) distances."""
+        return step_edges(self.near, self.far, shortest_step=self.shortest_step, growth=self.growth)
+
+
+@dataclass(frozen=True)
+class Model:
+    """What `train` leaves and `render` takes.
+
+    Args:
+        field: the radiance field, on points of the training frame.
+        occupied: (G, G, G) bool over the field's unit cube.
+        marching: the steps along rays.
+        background: (3,) sRGB behind everything, for pictures without alpha.
+        training_from_scene: the invertible normalisation.
+        unit: unit of length of the scene's own frame, "arbitrary" or "metre".
+    """
+
+    field: HashField
+    occupied: Tensor
+    marching: Marching
+    background: tuple[float, float, float]
+    training_from_scene: Similarity
+    unit: str
+
+    @property
+    def device(self) -> torch.device:
+        return self.occupied.device
+
+
+def save_model(path: Path, model: Model) -> None:
+    """Write the model to one file."""
+    description: dict[str, Any] = {
+        "format": FORMAT,
+        "field": model.field.settings.to_json(),
+        "marching": vars(model.marching),
+        "background": list(model.background),
+        "training_from_scene": model.training_from_scene.to_json(),
+        "unit": model.unit,
+    }
+    save_tensors(path, {**model.field.state_dict(), "occupied": model.occupied}, description)
+
+
+def load_model(path: Path, device: str) -> Model:
+    """Read what `save_model` wrote.
+
+    Raises:
+        UserError: the file is missing or is not a field of this version.
+    """
+    tensors, description = load_tensors(path, device)
+    if description.get("format") != FORMAT:
+        raise UserError(
+            f"{path} holds {description.get('format')!r}, expected {FORMAT!r}",
+            "train again with this version of nerfcli",
+        )
+    occupied = tensors.pop("occupied")
+    field = HashField(HashFieldSettings(**description["field"])).to(device)
+    field.load_state_dict(tensors)
+    red, green, blue = description["background"]
+    return Model(
+        field=field,
+        occupied=occupied,
+        marching=Marching(**description["marching"]),
+        background=(red, green, blue),
+        training_from_scene=Similarity.from_json(description["training_from_scene"]),
+        unit=description["unit"],
+    )

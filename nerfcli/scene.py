@@ -1,0 +1,295 @@
+"""A scene: the photos of a capture with their cameras, read from whichever format its folder is in.
+
+`load` finds the format; `save` writes nerfcli's own scene.json beside a COLMAP model. The world frame of a scene is the
+one of its files: it is never rotated, moved or scaled here.
+"""
+
+import hashlib
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.atomic import write_json
+from nerfcli.cameras.colmap import is_model, read_colmap, read_model
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.llff import IMAGE_FOLDERS, read_llff
+from nerfcli.cameras.transforms import read_blender, read_json_object, read_transforms
+from nerfcli.errors import UserError
+from nerfcli.media.images import image_size, list_images, read_exif
+
+SCENE_FILE = "scene.json"
+SCENE_VERSION = 1
+MODEL_FOLDER = "sparse/0"
+UNITS = ("arbitrary", "metre")
+
+# Every how many photos, in the order of their names, one is held out.
+HELD_OUT_EVERY = 8
+
+_MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The photos of a capture with cameras and poses.
+
+    Args:
+        root: the folder that was loaded.
+        kind: "nerfcli", "colmap", "transforms", "blender" or "llff".
+        frames: all views whose photo is on disk.
+        test_names: names of the held-out frames.
+        points: (N, 3) points of the surface in the world frame, float64; N is 0 where the format has none.
+        missing: names of images that the capture lists and that are not on disk.
+        unit: of length: "arbitrary" or "metre".
+        depth_bounds: (frames, 2) nearest and farthest z per frame, in scene units, where the format has them.
+    """
+
+    root: Path
+    kind: str
+    frames: tuple[Frame, ...]
+    test_names: frozenset[str]
+    points: np.ndarray
+    missing: tuple[str, ...]
+    unit: str = "arbitrary"
+    depth_bounds: np.ndarray | None = None
+
+    @property
+    def train_frames(self) -> tuple[Frame, ...]:
+        """The frames to learn from, in order."""
+        return tuple(frame for frame in self.frames if frame.name not in self.test_names)
+
+    @property
+    def test_frames(self) -> tuple[Frame, ...]:
+        """The held-out frames, in order."""
+        return tuple(frame for frame in self.frames if frame.name in self.test_names)
+
+
+def load(path: Path) -> Scene:
+    """The scene in a folder, whatever its format; a scene.json or transforms.json itself may be named too.
+
+    Raises:
+        UserError: there is no scene, or its files are malformed or do not fit the photos.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise UserError(f"there is no {path}", "give the folder of a scene")
+    if path.is_file():
+        if path.suffix.lower() != ".json":
+            raise UserError(f"{path} is a file, not a scene", "give the folder of a scene, or its transforms.json")
+        if path.name != SCENE_FILE:
+            return _scene(path.parent, read_transforms(path, _measure))
+        path = path.parent
+    if (path / SCENE_FILE).is_file():
+        return _load_own(path)
+    for name in _MODEL_FOLDERS:
+        if is_model(path / name):
+            model_dir = path / name
+            return _scene(path, read_colmap(model_dir, _image_folder(path, model_dir), _measure))
+    if (path / "transforms.json").is_file():
+        return _scene(path, read_transforms(path / "transforms.json", _measure))
+    if (path / "transforms_train.json").is_file():
+        return _scene(path, read_blender(path, _measure))
+    if (path / "poses_bounds.npy").is_file():
+        return _scene(path, read_llff(path, _measure, list_images))
+    raise _no_scene(path)
+
+
+def save(
+    scene_dir: Path,
+    *,
+    image_folder: Path,
+    provenance: dict[str, Any],
+    unit: str = "arbitrary",
+    unit_source: str | None = None,
+    masks: Path | None = None,
+) -> None:
+    """Write scene.json beside the COLMAP model in scene_dir/sparse/0, and fix the held-out split.
+
+    Args:
+        scene_dir: holds sparse/0, whose cameras refer to upright photos (EXIF orientation applied).
+        image_folder: the photos; stored relative to the scene folder, so that the two can move together.
+        provenance: plain values: versions, command, settings.
+        unit: "arbitrary" or "metre"; unit_source says how a metre is known.
+        masks: a folder with a mask for each photo that has one, under the photo's name or with .png after it.
+
+    Raises:
+        UserError: the model is not readable or scene.json cannot be written.
+    """
+    if unit not in UNITS:
+        raise ValueError(f"unit must be one of {UNITS}, got {unit!r}")
+    model = read_model(scene_dir / MODEL_FOLDER)
+    points = model.points
+    content = {
+        "version": SCENE_VERSION,
+        "image_folder": _relative(image_folder, scene_dir),
+        "model": MODEL_FOLDER,
+        "split": {"test": sorted(default_split([image.name for image in model.images]))},
+        "masks": None if masks is None else _relative(masks, scene_dir),
+        "unit": unit,
+        "unit_source": unit_source,
+        "frame_from_world": None,
+        "bounds": {
+            "points_min": points.min(axis=0).tolist() if len(points) else None,
+            "points_max": points.max(axis=0).tolist() if len(points) else None,
+        },
+        "provenance": provenance,
+    }
+    write_json(scene_dir / SCENE_FILE, content)
+
+
+def default_split(names: Iterable[str]) -> frozenset[str]:
+    """The held-out names: sorted, every 8th, from the first on."""
+    return frozenset(sorted(names)[::HELD_OUT_EVERY])
+
+
+def fingerprint(scene: Scene) -> str:
+    """SHA-256 over names, cameras, poses and split: the same on every machine that reads the same capture.
+
+    Numbers enter with nine digits after the point (positions after division by the power of ten that bounds them), so
+    that the last bits, in which linear algebra libraries differ, do not.
+    """
+    reach = max((float(np.abs(frame.centre).max()) for frame in scene.frames), default=0.0)
+    size = 10.0 ** math.ceil(math.log10(reach)) if reach > 0 else 1.0
+    digest = hashlib.sha256()
+    for frame in sorted(scene.frames, key=lambda frame: frame.name):
+        pose = np.concatenate([frame.world_from_cam[:3, :3].ravel(), frame.centre / size])
+        camera = frame.camera
+        line = [
+            *(frame.name, "test" if frame.name in scene.test_names else "train"),
+            *(camera.model, str(camera.width), str(camera.height), f"{size:.0e}"),
+            *(f"{value:.9e}" for value in camera.params),
+            *(f"{value:.9f}" for value in np.round(pose, 9) + 0.0),  # + 0.0 turns -0 into 0
+        ]
+        digest.update(("\t".join(line) + "\n").encode())
+    return digest.hexdigest()
+
+
+def _scene(root: Path, capture: Capture) -> Scene:
+    """The scene of a capture in a foreign format, with its own split where it fixes one."""
+    splits = {frame.split for frame in capture.frames}
+    frames = capture.frames
+    if "test" in splits or "val" in splits:
+        held_out = "test" if "test" in splits else "val"
+        test_names = frozenset(frame.name for frame in frames if frame.split == held_out)
+        # Views that the capture keeps for another purpose are neither learned from nor measured on.
+        kept = [index for index, frame in enumerate(frames) if frame.split in ("train", held_out)]
+    else:
+        test_names = default_split(frame.name for frame in frames)
+        kept = list(range(len(frames)))
+    bounds = None if capture.depth_bounds is None else capture.depth_bounds[kept]
+    return Scene(
+        root=root,
+        kind=capture.kind,
+        frames=tuple(frames[index] for index in kept),
+        test_names=test_names,
+        points=capture.points,
+        missing=capture.missing,
+        depth_bounds=bounds,
+    )
+
+
+def _load_own(root: Path) -> Scene:
+    """The scene that `save` described."""
+    path = root / SCENE_FILE
+    content = read_json_object(path)
+    if content.get("version") != SCENE_VERSION:
+        raise UserError(
+            f"{path}: version {content.get('version')!r} is not known, only {SCENE_VERSION}",
+            "update nerfcli, or find the poses again with nerfcli poses",
+        )
+    image_folder = _text(content, "image_folder", path)
+    model_dir = root / _text(content, "model", path)
+    unit = _text(content, "unit", path)
+    if unit not in UNITS:
+        raise UserError(f"{path}: unit is {unit!r}", f"expected {' or '.join(UNITS)}")
+    images = root.resolve() / image_folder
+    if not images.is_dir():
+        raise UserError(
+            f"{path}: the photos should be in {os.path.normpath(images)}, which is not there",
+            "put the photos back, or set image_folder to where they are now",
+        )
+    capture = read_colmap(model_dir, Path(os.path.normpath(images)), _measure_upright)
+    frames = capture.frames
+    if content.get("masks") is not None:
+        masks = Path(os.path.normpath(root.resolve() / _text(content, "masks", path)))
+        frames = tuple(replace(frame, mask=_mask_of(frame.name, masks)) for frame in frames)
+    return Scene(
+        root=root,
+        kind="nerfcli",
+        frames=frames,
+        test_names=_listed_test_names(content, path) & {frame.name for frame in frames},
+        points=capture.points,
+        missing=capture.missing,
+        unit=unit,
+    )
+
+
+def _text(content: dict[str, Any], key: str, path: Path) -> str:
+    value = content.get(key)
+    if not isinstance(value, str) or not value:
+        raise UserError(f"{path}: {key} is {value!r}", "expected text; nerfcli poses writes this file")
+    return value
+
+
+def _listed_test_names(content: dict[str, Any], path: Path) -> frozenset[str]:
+    split = content.get("split")
+    names = split.get("test") if isinstance(split, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise UserError(f"{path}: split.test is no list of image names", 'expected "split": {"test": ["a.jpg", ...]}')
+    return frozenset(names)
+
+
+def _mask_of(name: str, masks: Path) -> Path | None:
+    """The mask of a photo: masks/photo.jpg.png as COLMAP names it, masks/photo.png, or masks/photo.jpg."""
+    candidates = (masks / f"{name}.png", (masks / name).with_suffix(".png"), masks / name)
+    return next((mask for mask in candidates if mask.is_file()), None)
+
+
+def _measure(path: Path) -> tuple[int, int, int]:
+    exif = read_exif(path)
+    return exif.width, exif.height, exif.orientation
+
+
+def _measure_upright(path: Path) -> tuple[int, int, int]:
+    """For models whose cameras refer to the upright photos, as those of nerfcli poses do: nothing is left to turn."""
+    return (*image_size(path), 1)
+
+
+def _image_folder(root: Path, model_dir: Path) -> Path:
+    """Where the photos of a COLMAP project are: beside the model, or beside the folders that it stands in."""
+    homes = [root, model_dir, *model_dir.resolve().parents[:3]]
+    for home in dict.fromkeys(homes):
+        for name in IMAGE_FOLDERS:
+            if (home / name).is_dir():
+                return home / name
+    raise UserError(
+        f"{root} holds a COLMAP model, but no photos: there is no folder images/",
+        "put the photos that the model was made from into images/ beside it",
+    )
+
+
+def _relative(path: Path, start: Path) -> str:
+    """A path as seen from a folder, with forward slashes; absolute where there is none (another drive)."""
+    try:
+        return Path(os.path.relpath(path.resolve(), start.resolve())).as_posix()
+    except ValueError:
+        return path.resolve().as_posix()
+
+
+def _no_scene(path: Path) -> UserError:
+    looked_for = (
+        f"{SCENE_FILE}, {', '.join(name for name in _MODEL_FOLDERS[:-1])} (COLMAP), "
+        "transforms.json, transforms_train.json, poses_bounds.npy"
+    )
+    for folder in (path, path / "images"):
+        photos = len(list_images(folder)) if folder.is_dir() else 0
+        if photos:
+            return UserError(
+                f"{folder} holds {photos} photos, but no poses; looked for {looked_for}",
+                f"run: nerfcli poses {folder}",
+            )
+    return UserError(f"{path} is no scene; looked for {looked_for}", "give the folder of a scene, or one of photos")

@@ -1,0 +1,205 @@
+"""The training of a scene from photos to checkpoint, within a budget of time or steps."""
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerfcli.atomic import cannot_write, write_json
+from nerfcli.errors import UserError
+from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.scene import Scene
+from nerfcli.train.fitting import Fitting
+from nerfcli.train.heldout import HeldoutPixels
+from nerfcli.train.normalisation import training_frame
+from nerfcli.train.photos import PixelPool, load_photos
+from nerfcli.train.run_folder import CONFIG, FIELD, LOG, STATE, append_log, describe_run, write_cameras
+from nerfcli.train.settings import TrainSettings, automatic_downscale
+
+CHECKPOINT_SECONDS = 30.0
+HELDOUT_SHARES = (0.25, 0.5, 0.75, 1.0)
+# Photos without alpha fill the frame; what the field lets through is black, and little does.
+OPAQUE_BACKGROUND = (0.0, 0.0, 0.0)
+ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training stands: share of the budget, steps, training seconds, loss, speed, last held-out PSNR."""
+
+    share: float
+    step: int
+    seconds: float
+    loss: float
+    samples_per_second: float
+    heldout_psnr: float | None
+
+
+@dataclass
+class _Totals:
+    """What accumulates over the whole training, resumed parts included."""
+
+    seconds: float = 0.0
+    samples: int = 0
+    rays: int = 0
+
+
+def train(
+    scene: Scene,
+    run: Path,
+    settings: TrainSettings,
+    *,
+    resume: bool,
+    notify: Callable[[str], None],
+    on_progress: Callable[[Progress], None],
+) -> None:
+    """Fit a field to the scene's training photos and write the run folder.
+
+    Args:
+        scene: photos, cameras and split.
+        run: the folder to write; must not hold a run unless `resume`.
+        settings: budget, resolution, seed, device.
+        resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0.
+        notify: takes lines for the user.
+        on_progress: called after every step.
+
+    Raises:
+        UserError: unreadable photos, numbers that became non-finite, nothing to resume, an unwritable folder.
+        KeyboardInterrupt: passed on after a checkpoint has been written.
+    """
+    torch.set_num_threads(settings.threads)
+    if not scene.train_frames:
+        raise UserError(f"{scene.root} has no training photo", "every 8th photo is held out; at least 2 are needed")
+    first = scene.train_frames[0].camera
+    factor = settings.downscale or automatic_downscale(first.width, first.height)
+    photos = load_photos(scene.train_frames, factor=factor, threads=settings.threads)
+    test_photos = load_photos(scene.test_frames, factor=factor, threads=settings.threads)
+    unbounded = not all(photo.pixels.shape[-1] == 4 for photo in photos)
+    similarity, marching = training_frame(scene, unbounded=unbounded)
+    device = torch.device(settings.device)
+    pool = PixelPool(photos, similarity, device)
+    heldout = HeldoutPixels(test_photos, similarity, device) if test_photos else None
+    notify(
+        f"{len(photos)} photos to train on, {len(test_photos)} held out, "
+        f"{photos[0].frame.camera.width}x{photos[0].frame.camera.height} (1/{factor}), "
+        f"{'unbounded' if unbounded else 'bounded'} scene, {settings.device}, {settings.threads} threads"
+    )
+
+    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings)
+    totals = _Totals()
+    if resume:
+        totals = _restore(fitting, run)
+        notify(f"resumed at step {fitting.step}, {totals.seconds:.1f} s")
+    else:
+        try:
+            run.mkdir(parents=True, exist_ok=True)
+            (run / LOG).unlink(missing_ok=True)
+        except OSError as error:
+            raise cannot_write(run, error) from error
+    write_json(run / CONFIG, describe_run(scene, settings, factor))
+    write_cameras(run, scene.train_frames, scene.test_frames)
+    background = ALPHA_BACKGROUND if pool.has_alpha else OPAQUE_BACKGROUND
+
+    def model() -> Model:
+        return Model(fitting.field, fitting.occupied, marching, background, similarity, scene.unit)
+
+    def checkpoint() -> None:
+        save_model(run / FIELD, model())
+        tensors, description = fitting.state()
+        save_tensors(run / STATE, tensors, {**description, "totals": vars(totals)})
+
+    try:
+        _run(
+            fitting,
+            totals,
+            model=model,
+            run=run,
+            heldout=heldout,
+            on_progress=on_progress,
+            checkpoint=checkpoint,
+        )
+    except KeyboardInterrupt:
+        checkpoint()
+        raise
+    checkpoint()
+
+
+def _run(
+    fitting: Fitting,
+    totals: _Totals,
+    *,
+    model: Callable[[], Model],
+    run: Path,
+    heldout: HeldoutPixels | None,
+    on_progress: Callable[[Progress], None],
+    checkpoint: Callable[[], None],
+) -> None:
+    """Step until the budget is used up; the clock stands still during checks and checkpoints."""
+    settings = fitting.settings
+    last_saved = totals.seconds
+    psnr: float | None = None
+    logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
+    checks = [share for share in HELDOUT_SHARES if share > _share(settings, fitting.step, totals.seconds)]
+    while (share := _share(settings, fitting.step, totals.seconds)) < 1.0:
+        began = time.perf_counter()
+        result = fitting.advance(share)
+        totals.seconds += time.perf_counter() - began
+        totals.samples += result.samples
+        totals.rays += result.rays
+        speed = (totals.samples - logged_samples) / max(totals.seconds - logged_seconds, 1e-9)
+        share = _share(settings, fitting.step, totals.seconds)
+        on_progress(Progress(share, fitting.step, totals.seconds, result.loss, speed, psnr))
+        checked = bool(checks) and share >= checks[0]
+        if checked:
+            checks = [later for later in checks if later > share]
+            psnr = heldout.psnr(model()) if heldout is not None else None
+        if checked or totals.seconds - logged_seconds >= 1.0:
+            rays_speed = (totals.rays - logged_rays) / max(totals.seconds - logged_seconds, 1e-9)
+            entry: dict[str, Any] = {
+                "step": fitting.step,
+                "seconds": round(totals.seconds, 3),
+                "loss": result.loss,
+                "samples": totals.samples,
+                "samples_per_second": round(speed),
+                "rays_per_second": round(rays_speed),
+                "peak_memory_bytes": peak_memory_bytes(),
+            }
+            append_log(run, entry | ({"heldout_psnr": psnr} if checked and psnr is not None else {}))
+            logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
+        if totals.seconds - last_saved >= CHECKPOINT_SECONDS:
+            checkpoint()
+            last_saved = totals.seconds
+
+
+def _share(settings: TrainSettings, step: int, seconds: float) -> float:
+    """How much of the budget is used: the larger of the shares of time and of steps."""
+    by_time = seconds / settings.budget_seconds if settings.budget_seconds else 0.0
+    by_steps = step / settings.steps if settings.steps else 0.0
+    return min(1.0, max(by_time, by_steps))
+
+
+def _restore(fitting: Fitting, run: Path) -> _Totals:
+    """Bring `fitting` to the run's last checkpoint."""
+    device = fitting.settings.device
+    model = load_model(run / FIELD, device)
+    if model.field.settings != fitting.field.settings:
+        raise UserError(
+            f"{run} was trained with another field ({model.field.settings})",
+            "train into a new folder with -o, or again with --overwrite",
+        )
+    fitting.field.load_state_dict(model.field.state_dict())
+    tensors, description = load_tensors(run / STATE, device)
+    fitting.restore(tensors, description)
+    return _Totals(**description["totals"])
+
+
+def peak_memory_bytes() -> int:
+    """The largest resident size this process has had."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere else

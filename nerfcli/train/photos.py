@@ -1,0 +1,130 @@
+"""The photos in memory, and random pixels with their rays."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.errors import UserError
+from nerfcli.media.images import downscale, read_image
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photo as it is trained on.
+
+    Args:
+        frame: with the camera of the downscaled picture.
+        pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
+        used: (H, W) bool, False where a mask says to ignore the pixel; None for all.
+    """
+
+    frame: Frame
+    pixels: np.ndarray
+    used: np.ndarray | None
+
+
+def load_photos(frames: Sequence[Frame], *, factor: int, threads: int) -> list[Photo]:
+    """Read, orient and downscale the photos of `frames`, in parallel, in order.
+
+    Raises:
+        UserError: a photo cannot be read, or has another size than its camera.
+    """
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        return list(pool.map(lambda frame: _load_photo(frame, factor), frames))
+
+
+def _load_photo(frame: Frame, factor: int) -> Photo:
+    if frame.image is None:
+        raise UserError(f"{frame.name} has no photo", "this camera can be rendered, but not trained on or evaluated")
+    pixels = read_image(frame.image)
+    height, width = pixels.shape[:2]
+    if (width, height) != (frame.camera.width, frame.camera.height):
+        raise UserError(
+            f"{frame.image} is {width}x{height}, its camera says {frame.camera.width}x{frame.camera.height}",
+            "put the photo back that the poses were made from, or run nerfcli poses again",
+        )
+    used = None
+    if frame.mask is not None:
+        mask = read_image(frame.mask)
+        if mask.shape[:2] != (height, width):
+            raise UserError(
+                f"{frame.mask} is {mask.shape[1]}x{mask.shape[0]}, its photo is {width}x{height}",
+                "a mask has the size of its photo; pixels that are black in it are ignored",
+            )
+        # A pixel of the small picture counts only where all that it averages counts.
+        used = downscale(mask[..., :3], factor).min(-1) == 255
+    return Photo(replace(frame, camera=downscaled_camera(frame.camera, factor)), downscale(pixels, factor), used)
+
+
+def downscaled_camera(camera: Camera, factor: float) -> Camera:
+    """The camera of a picture that `media.images.downscale` made smaller."""
+    return camera.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
+
+
+class PixelPool:
+    """All usable pixels of some photos, and the ray of each, in the training frame.
+
+    Bearings are kept once per camera, not per photo: photos that share intrinsics share them.
+    """
+
+    def __init__(self, photos: Sequence[Photo], training_from_scene: Similarity, device: torch.device):
+        channels = {photo.pixels.shape[-1] for photo in photos}
+        pixels = [photo.pixels if len(channels) == 1 else _with_alpha(photo.pixels) for photo in photos]
+        self.colours = torch.from_numpy(np.concatenate([p.reshape(-1, p.shape[-1]) for p in pixels])).to(device)
+        counts = [len(p.reshape(-1, p.shape[-1])) for p in pixels]
+        self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
+        poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
+        self.poses = torch.tensor(np.array(poses), dtype=torch.float32, device=device)
+
+        first_bearing: dict[Camera, int] = {}
+        bearings, valid = [], []
+        for photo in photos:
+            camera = photo.frame.camera
+            if camera not in first_bearing:
+                first_bearing[camera] = sum(map(len, bearings))
+                rays, good = camera.pixel_bearings()
+                bearings.append(rays.astype(np.float32))
+                valid.append(good)
+        self.bearings = torch.from_numpy(np.concatenate(bearings)).to(device)
+        self.first_bearing = torch.tensor([first_bearing[p.frame.camera] for p in photos], device=device)
+
+        good_rays = dict(zip(first_bearing, valid, strict=True))
+        usable = [
+            good_rays[photo.frame.camera] if photo.used is None else good_rays[photo.frame.camera] & photo.used.ravel()
+            for photo in photos
+        ]
+        self.usable = torch.from_numpy(np.flatnonzero(np.concatenate(usable))).to(device)
+        if len(self.usable) == 0:
+            raise UserError("no pixel is left to train on", "check that the masks are white where pixels count")
+
+    @property
+    def has_alpha(self) -> bool:
+        return self.colours.shape[-1] == 4
+
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+        """`count` random pixels, with replacement.
+
+        Returns:
+            origins (count, 3), unit directions (count, 3), colours (count, 3 or 4) float32 in [0, 1].
+        """
+        device = self.colours.device
+        chosen = self.usable[torch.randint(len(self.usable), (count,), generator=generator, device=device)]
+        photo = torch.searchsorted(self.first_pixel, chosen, right=True) - 1
+        bearing = self.bearings[self.first_bearing[photo] + chosen - self.first_pixel[photo]]
+        pose = self.poses[photo]
+        directions = (pose[:, :3, :3] @ bearing[..., None])[..., 0]
+        return pose[:, :3, 3], directions, self.colours[chosen].float() / 255.0
+
+
+def _with_alpha(pixels: np.ndarray) -> np.ndarray:
+    """RGBA: opaque where the photo has no alpha."""
+    if pixels.shape[-1] == 4:
+        return pixels
+    return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=-1)

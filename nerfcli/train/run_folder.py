@@ -1,0 +1,158 @@
+"""The folder that training writes: settings, cameras, log, weights, and the state to go on from."""
+
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli import __version__
+from nerfcli.atomic import cannot_write, write_json
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+from nerfcli.scene import Scene, fingerprint
+from nerfcli.train.settings import TrainSettings
+
+CONFIG = "config.json"
+CAMERAS = "cameras.json"
+FIELD = "field.safetensors"
+STATE = "state.safetensors"
+LOG = "log.jsonl"
+
+
+def describe_run(scene: Scene, settings: TrainSettings, factor: int) -> dict[str, Any]:
+    """What RUN/config.json holds: enough to know what was done, and to tell whether it is the same again."""
+    return {
+        "scene": str(scene.root),
+        "scene_kind": scene.kind,
+        "unit": scene.unit,
+        "scene_fingerprint": fingerprint(scene),
+        "split_sha256": hashlib.sha256("\n".join(sorted(scene.test_names)).encode()).hexdigest(),
+        "missing_photos": list(scene.missing),
+        "settings": {**settings.to_json(), "downscale": factor},
+        "versions": {
+            "nerfcli": __version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("torch", "numpy")},
+        },
+    }
+
+
+def write_cameras(run: Path, train: Sequence[Frame], test: Sequence[Frame]) -> None:
+    """The frames of both sets, full-size cameras and poses in the scene's frame.
+
+    Rendering needs nothing else of the scene; evaluation finds the photos through it.
+    """
+    content = {
+        "train": [_frame_to_json(f, run) for f in train],
+        "test": [_frame_to_json(f, run) for f in test],
+    }
+    write_json(run / CAMERAS, content)
+
+
+def read_cameras(run: Path) -> dict[str, tuple[Frame, ...]]:
+    """The frames of "train" and "test".
+
+    Raises:
+        UserError: the folder is not one that `train` wrote.
+    """
+    path = run / CAMERAS
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {name: tuple(_frame_from_json(entry, run) for entry in content[name]) for name in ("train", "test")}
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{run} is not a run: it has no {CAMERAS}", "give the folder that nerfcli train wrote"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} cannot be read: {error}", "train again with --overwrite") from error
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """RUN/config.json.
+
+    Raises:
+        UserError: it is missing or not JSON.
+    """
+    try:
+        return json.loads((run / CONFIG).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{run} is not a run: it has no {CONFIG}", "give the folder that nerfcli train wrote"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise UserError(f"{run / CONFIG} cannot be read: {error}", "train again with --overwrite") from error
+
+
+def append_log(run: Path, entry: dict[str, Any]) -> None:
+    """One line of RUN/log.jsonl, whole."""
+    try:
+        with (run / LOG).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry, allow_nan=False) + "\n")
+    except OSError as error:
+        raise cannot_write(run / LOG, error) from error
+
+
+def read_log(run: Path) -> list[dict[str, Any]]:
+    """The entries of RUN/log.jsonl; a last line that a kill cut short is left out."""
+    try:
+        lines = (run / LOG).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return []
+    entries = []
+    for line in lines:
+        try:
+            entries.append(json.loads(line))
+        except ValueError:
+            break
+    return entries
+
+
+def _frame_to_json(frame: Frame, run: Path) -> dict[str, Any]:
+    return {
+        "name": frame.name,
+        "camera": frame.camera.to_json(),
+        "world_from_cam": frame.world_from_cam.tolist(),
+        # Relative, so that scene and run can be moved together.
+        "image": None if frame.image is None else os.path.relpath(frame.image, run),
+        "mask": None if frame.mask is None else os.path.relpath(frame.mask, run),
+    }
+
+
+def _frame_from_json(entry: dict[str, Any], run: Path) -> Frame:
+    return Frame(
+        name=entry["name"],
+        camera=Camera.from_json(entry["camera"]),
+        world_from_cam=np.array(entry["world_from_cam"], dtype=np.float64),
+        image=None if entry["image"] is None else run / entry["image"],
+        mask=None if entry["mask"] is None else run / entry["mask"],
+    )
+
+
+def is_same_run(run: Path, scene: Scene, settings: TrainSettings) -> bool:
+    """Whether `run` was trained from this scene with these settings; threads and device aside, an automatic downscale
+    counting as whatever was chosen."""
+    config = read_config(run)
+    wanted = {key: value for key, value in settings.to_json().items() if key not in ("device", "threads")}
+    if settings.downscale is None:
+        del wanted["downscale"]
+    trained = config.get("settings", {})
+    return config.get("scene_fingerprint") == fingerprint(scene) and all(
+        trained.get(key) == value for key, value in wanted.items()
+    )
+
+
+def is_complete(run: Path, settings: TrainSettings) -> bool:
+    """Whether training reached the budget: by the last line of its log, and its field is there."""
+    log = read_log(run)
+    if not log or not (run / FIELD).exists():
+        return False
+    by_time = settings.budget_seconds is not None and log[-1]["seconds"] >= settings.budget_seconds
+    by_steps = settings.steps is not None and log[-1]["step"] >= settings.steps
+    return by_time or by_steps

@@ -1,0 +1,60 @@
+"""Everything a training depends on, besides the scene."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from nerfcli.errors import UserError
+
+DOWNSCALES = (1, 2, 4, 8)
+# `--downscale auto` takes the largest pictures whose longer side is within this many pixels.
+AUTO_LONGER_SIDE_PX = 800
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """How long and how to train.
+
+    Args:
+        budget_seconds: training time to spend, without loading and held-out checks; None for no limit.
+        steps: optimiser steps in all, those before a resume included; None for no limit.
+        downscale: photos are averaged over squares of this many pixels; None for automatic.
+        seed: of everything random.
+        device: a torch device name.
+        threads: CPU threads.
+        samples_per_step: field samples that one step aims at; the number of rays follows.
+        learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
+        warmup_steps: steps over which the learning rate rises from 0.
+
+    Raises:
+        UserError: neither or a non-positive limit, or an unknown downscale.
+    """
+
+    budget_seconds: float | None = 120.0
+    steps: int | None = None
+    downscale: int | None = None
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 1
+    samples_per_step: int = 2**14
+    learning_rate: float = 1e-2
+    final_learning_rate: float = 1e-3
+    warmup_steps: int = 50
+
+    def __post_init__(self) -> None:
+        if self.budget_seconds is None and self.steps is None:
+            raise UserError("training without an end", "give --budget, --steps, or both")
+        if (self.budget_seconds or 1) <= 0 or (self.steps or 1) <= 0:
+            raise UserError("the training budget is not positive", "give for example --budget 2m or --steps 2000")
+        if self.downscale not in (None, *DOWNSCALES):
+            raise UserError(f"downscale {self.downscale} is not possible", "choose auto, 1, 2, 4 or 8")
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def automatic_downscale(width: int, height: int) -> int:
+    """The smallest downscale that brings the longer side to `AUTO_LONGER_SIDE_PX` or below."""
+    for factor in DOWNSCALES:
+        if max(width, height) / factor <= AUTO_LONGER_SIDE_PX:
+            return factor
+    return DOWNSCALES[-1]

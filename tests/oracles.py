@@ -1,0 +1,60 @@
+"""Slow, obvious float64 answers that the tests hold the program against."""
+
+import math
+
+import numpy as np
+
+
+def march_through_slabs(density, lengths, rgb, background):
+    """One ray by a double loop: weights, transmittance behind, colour."""
+    weights = []
+    for i in range(len(density)):
+        before = math.exp(-sum(density[j] * lengths[j] for j in range(i)))
+        weights.append(before * -math.expm1(-density[i] * lengths[i]))
+    transmittance = math.exp(-sum(d * length for d, length in zip(density, lengths, strict=True)))
+    colour = np.asarray(background, dtype=np.float64) * transmittance
+    for weight, value in zip(weights, rgb, strict=True):
+        colour = colour + weight * np.asarray(value, dtype=np.float64)
+    return np.array(weights), transmittance, colour
+
+
+def quadrature_of_end_density(density, starts, ends, steps=20000):
+    """Integrals of p(t) and t p(t), p = T sigma, of a piecewise constant density, by the midpoint rule."""
+    mass, first = 0.0, 0.0
+    depth = 0.0
+    for s, t0, t1 in zip(density, starts, ends, strict=True):
+        h = (t1 - t0) / steps
+        t = t0 + (np.arange(steps) + 0.5) * h
+        p = s * np.exp(-(depth + s * (t - t0)))
+        mass += p.sum() * h
+        first += (t * p).sum() * h
+        depth += s * (t1 - t0)
+    return mass, first
+
+
+def trilinear_hash(point, table, resolutions, primes=(1, 2654435761, 805459861)):
+    """One point through the hash grid with Python integers."""
+    out = []
+    rows = table.shape[1]
+    for level, resolution in enumerate(resolutions):
+        scaled = [min(max(float(c), 0.0), 1.0) * resolution for c in point]
+        cell = [min(math.floor(s), resolution - 1) for s in scaled]
+        total = np.zeros(table.shape[2])
+        for corner in range(8):
+            bits = [corner >> axis & 1 for axis in range(3)]
+            weight = 1.0
+            vertex = []
+            for axis in range(3):
+                inside = scaled[axis] - cell[axis]
+                weight *= inside if bits[axis] else 1.0 - inside
+                vertex.append(cell[axis] + bits[axis])
+            if (resolution + 1) ** 3 <= rows:
+                row = (vertex[2] * (resolution + 1) + vertex[1]) * (resolution + 1) + vertex[0]
+            else:
+                row = 0
+                for v, prime in zip(vertex, primes, strict=True):
+                    row ^= (v * prime) % 2**32
+                row %= rows
+            total = total + weight * table[level, row]
+        out.append(total)
+    return np.concatenate(out)

@@ -1,0 +1,112 @@
+"""nerfcli.atomic: files and folders appear whole or not at all."""
+
+import json
+import math
+
+import pytest
+
+from nerfcli.atomic import atomic_folder, atomic_path, write_json
+from nerfcli.errors import BAD_INPUT, UserError
+
+
+def names(folder) -> list[str]:
+    return sorted(p.name for p in folder.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.json", "with space ä.tar.gz"])
+def test_a_file_appears_when_the_block_ends(tmp_path, name):
+    path = tmp_path / "deep" / "folder" / name
+    with atomic_path(path) as partial:
+        assert partial.parent == path.parent
+        assert partial.suffix == path.suffix
+        assert partial.name.startswith(".")
+        partial.write_text("new")
+        assert not path.exists()
+    assert path.read_text() == "new"
+    assert names(path.parent) == [name]
+
+
+@pytest.mark.parametrize("problem", [ValueError("ours"), KeyboardInterrupt(), UserError("wrong", "mend it")])
+def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path, problem):
+    def interrupted():
+        with atomic_path(path) as partial:
+            partial.write_text("half")
+            raise problem
+
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(type(problem)) as caught:
+        interrupted()
+    assert caught.value is problem
+    assert path.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_an_exception_before_anything_is_written(tmp_path):
+    with pytest.raises(ZeroDivisionError), atomic_path(tmp_path / "a.txt"):
+        _ = 1 / 0
+    assert names(tmp_path) == []
+
+
+def test_a_folder_in_the_place_of_the_file_is_told(tmp_path):
+    path = tmp_path / "folder"
+    path.mkdir()
+    with pytest.raises(UserError, match=r"folder: Is a directory") as caught, atomic_path(path) as partial:
+        partial.write_text("new")
+    assert caught.value.exit_code == BAD_INPUT
+    assert names(tmp_path) == ["folder"]
+
+
+@pytest.mark.parametrize("context", [atomic_path, atomic_folder])
+def test_a_file_in_the_place_of_the_parent_folder_is_told(tmp_path, context):
+    (tmp_path / "file").write_text("I am no folder")
+    with pytest.raises(UserError, match=r"cannot write .*result: "), context(tmp_path / "file" / "result"):
+        pass
+    assert names(tmp_path) == ["file"]
+
+
+def test_a_block_that_writes_nothing_is_an_error(tmp_path):
+    path = tmp_path / "a.txt"
+    with pytest.raises(UserError, match=r"cannot write .*a\.txt: No such file"), atomic_path(path):
+        pass
+    assert names(tmp_path) == []
+
+
+def test_a_folder_appears_when_the_block_ends_and_replaces_the_old_one(tmp_path):
+    path = tmp_path / "deep" / "run ä"
+    for content in ("first", "second"):
+        with atomic_folder(path) as partial:
+            assert partial.parent == path.parent
+            (partial / f"{content}.txt").write_text(content)
+            assert not (path / f"{content}.txt").exists()
+        assert names(path) == [f"{content}.txt"]
+        assert names(path.parent) == ["run ä"]
+
+
+@pytest.mark.parametrize("problem", [ValueError("ours"), KeyboardInterrupt()])
+def test_an_exception_leaves_the_old_folder_and_nothing_else(tmp_path, problem):
+    def interrupted():
+        with atomic_folder(path) as partial:
+            (partial / "half.txt").write_text("half")
+            raise problem
+
+    path = tmp_path / "run"
+    path.mkdir()
+    (path / "old.txt").write_text("old")
+    with pytest.raises(type(problem)) as caught:
+        interrupted()
+    assert caught.value is problem
+    assert names(tmp_path) == ["run"]
+    assert names(path) == ["old.txt"]
+
+
+def test_json_is_written_whole_and_without_nan(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"name": "Küche", "values": [1, 0.1, None]})
+    assert json.loads(path.read_text(encoding="utf-8")) == {"name": "Küche", "values": [1, 0.1, None]}
+    assert "Küche" in path.read_text(encoding="utf-8")
+    for number in (math.nan, math.inf):
+        with pytest.raises(ValueError, match="JSON compliant"):
+            write_json(path, {"value": number})
+    assert json.loads(path.read_text(encoding="utf-8"))["values"] == [1, 0.1, None]
+    assert names(tmp_path) == ["a.json"]

@@ -1,0 +1,437 @@
+"""nerfcli.media.images: orientation, colour, damage, exact downscaling, EXIF, PNG."""
+
+import io
+import math
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import ExifTags, Image, ImageCms, ImageOps
+from PIL.TiffImagePlugin import IFDRational
+
+from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.media.images import (
+    downscale,
+    image_size,
+    list_images,
+    read_downscaled,
+    read_exif,
+    read_image,
+    write_png,
+)
+
+# Linear red, green, blue to XYZ (D50), Bradford-adapted, a column each: IEC 61966-2-1 and SMPTE EG 432-1.
+SRGB = ((0.43607, 0.22250, 0.01393), (0.38506, 0.71688, 0.09710), (0.14308, 0.06062, 0.71417))
+P3 = ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407))
+
+
+def linear_from_srgb(value: np.ndarray) -> np.ndarray:
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(value: np.ndarray) -> np.ndarray:
+    return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
+
+
+Curve = Callable[[np.ndarray], np.ndarray]
+
+
+def noise(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def exif_with(entries: Mapping[Any, Any], ifds: Mapping[Any, Mapping[Any, Any]] | None = None) -> Image.Exif:
+    exif = Image.Exif()
+    exif.update(entries)
+    for which, content in (ifds or {}).items():
+        exif.get_ifd(which).update(content)
+    return exif
+
+
+def icc_profile(columns: tuple, curve: Curve) -> bytes:
+    """An ICC v2 matrix profile, built by hand: header, tags, one curve of 1024 values for all channels."""
+
+    def s15(number: float) -> bytes:
+        return round(number * 65536).to_bytes(4, "big", signed=True)
+
+    xyz = [b"XYZ \0\0\0\0" + b"".join(s15(part) for part in c) for c in ((0.9642, 1.0, 0.8249), *columns)]
+    values = np.rint(65535 * curve(np.linspace(0, 1, 1024))).astype(">u2").tobytes()
+    table_curve = b"curv\0\0\0\0" + (1024).to_bytes(4, "big") + values
+    description = b"desc\0\0\0\0" + (5).to_bytes(4, "big") + b"test\0" + bytes(79)
+    tags = [
+        *((b"desc", description), (b"cprt", b"text\0\0\0\0none\0\0\0\0")),
+        *zip((b"wtpt", b"rXYZ", b"gXYZ", b"bXYZ"), xyz, strict=True),
+        *((name, table_curve) for name in (b"rTRC", b"gTRC", b"bTRC")),
+    ]
+    table, body = len(tags).to_bytes(4, "big"), b""
+    start = 128 + 4 + 12 * len(tags)
+    for name, data in tags:
+        table += name + (start + len(body)).to_bytes(4, "big") + len(data).to_bytes(4, "big")
+        body += data
+    size = (start + len(body)).to_bytes(4, "big")
+    header = size + bytes(4) + b"\x02\x40\0\0mntrRGB XYZ " + bytes(12) + b"acsp" + bytes(28) + s15(0.9642)
+    return (header + s15(1.0) + s15(0.8249)).ljust(128, b"\0") + table + body
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(
+    ("suffix", "options"),
+    [
+        (".png", {}),
+        (".jpg", {"quality": 95}),
+        (".webp", {"lossless": True}),
+        (".tif", {}),
+        (".tif", {"compression": "tiff_lzw"}),
+    ],
+)
+def test_every_orientation_is_applied_once_as_pillow_does(tmp_path, orientation, suffix, options):
+    path = tmp_path / f"photo{suffix}"
+    exif = exif_with({ExifTags.Base.Orientation: orientation})
+    Image.fromarray(noise(5, 7, 3)).save(path, exif=exif, **options)
+    with Image.open(path) as stored:
+        expected = np.asarray(ImageOps.exif_transpose(stored))
+    picture = read_image(path)
+    np.testing.assert_array_equal(picture, expected)
+    assert image_size(path) == (picture.shape[1], picture.shape[0]) == ((7, 5) if orientation < 5 else (5, 7))
+    found = read_exif(path)
+    assert (found.orientation, found.width, found.height) == (orientation, *image_size(path))
+
+
+def test_orientation_6_by_hand(tmp_path):
+    """The camera was turned: the first stored column, read upwards, is the top row."""
+    path, stored = tmp_path / "photo.png", noise(2, 3, 3)
+    Image.fromarray(stored).save(path, exif=exif_with({ExifTags.Base.Orientation: 6}))
+    np.testing.assert_array_equal(read_image(path)[0], stored[::-1, 0])
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 65535])
+def test_an_orientation_out_of_range_reads_as_upright(tmp_path, orientation):
+    path, stored = tmp_path / "photo.png", noise(2, 3, 3)
+    Image.fromarray(stored).save(path, exif=exif_with({ExifTags.Base.Orientation: orientation}))
+    np.testing.assert_array_equal(read_image(path), stored)
+    assert read_exif(path).orientation == 1
+
+
+@pytest.mark.parametrize("name", ["with space.png", "Küche 北.png", "UPPER.PNG", "a:b%d.png"])
+@pytest.mark.parametrize("shape", [(4, 5), (4, 5, 3), (4, 5, 4), (1, 1, 3)])
+def test_png_round_trip_is_bit_exact_with_its_metadata(tmp_path, name, shape):
+    path, pixels = tmp_path / "new folder" / name, noise(*shape)
+    metadata = {"convention": "conditional", "scene": "Küche 北", "empty": ""}
+    write_png(path, pixels, metadata=metadata)
+    expected = np.repeat(pixels[..., None], 3, axis=2) if len(shape) == 2 else pixels
+    picture = read_image(path)
+    np.testing.assert_array_equal(picture, expected)
+    assert picture.flags.writeable
+    assert picture.dtype == np.uint8
+    with Image.open(path) as image:
+        assert image.info == metadata
+    assert [p.name for p in path.parent.iterdir()] == [name]
+
+
+def test_write_png_refuses_what_is_no_8_bit_picture(tmp_path):
+    for wrong in (np.zeros((4, 5, 3)), np.zeros((4, 5, 2), np.uint8), np.zeros(4, np.uint8)):
+        with pytest.raises(ValueError, match=r"image must be uint8 \(H, W\[, 3\|4\]\), got"):
+            write_png(tmp_path / "a.png", wrong)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_grey_pixels_of_16_bits_keep_their_high_byte(tmp_path, suffix):
+    path = tmp_path / f"grey{suffix}"
+    wide = np.array([[0, 255, 256, 257], [32768, 65279, 65280, 65535]], dtype=np.uint16)
+    Image.fromarray(wide).save(path)
+    np.testing.assert_array_equal(read_image(path), np.repeat((wide >> 8)[..., None], 3, axis=2))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_colours_of_16_bits_that_were_8_come_back_exactly(tmp_path, suffix):
+    cv2 = pytest.importorskip("cv2")
+    path, pixels = tmp_path / f"colour{suffix}", noise(6, 5, 3)
+    cv2.imwrite(str(path), pixels[..., ::-1].astype(np.uint16) * 257)
+    np.testing.assert_array_equal(read_image(path), pixels)
+
+
+def test_palette_one_bit_and_grey_with_alpha(tmp_path):
+    palette = Image.fromarray(noise(5, 4)).convert("P")
+    palette.putpalette(noise(768).tolist())
+    colours = np.asarray(palette.convert("RGB"))
+    palette.save(tmp_path / "palette.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "palette.png"), colours)
+
+    alphas = noise(256, seed=1)
+    palette.save(tmp_path / "alpha.png", transparency=alphas.tobytes())
+    expected = np.dstack([colours, alphas[np.asarray(palette)]])
+    np.testing.assert_array_equal(read_image(tmp_path / "alpha.png"), expected)
+
+    bits = noise(5, 4) > 127
+    Image.fromarray(bits).save(tmp_path / "bits.png")
+    expected = np.repeat(255 * bits[..., None], 3, axis=2)
+    np.testing.assert_array_equal(read_image(tmp_path / "bits.png"), expected)
+
+    grey_alpha = noise(5, 4, 2)
+    Image.fromarray(grey_alpha, mode="LA").save(tmp_path / "la.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "la.png"), grey_alpha[..., [0, 0, 0, 1]])
+
+
+def test_cmyk_becomes_rgb(tmp_path):
+    path = tmp_path / "print.tif"
+    inks = np.array([[[0, 0, 0, 0], [255, 0, 0, 0], [0, 0, 0, 255]]], np.uint8)
+    Image.fromarray(inks, mode="CMYK").save(path)
+    np.testing.assert_array_equal(read_image(path), [[[255, 255, 255], [0, 255, 255], [0, 0, 0]]])
+
+
+@pytest.mark.parametrize(("dtype", "kind"), [(np.float32, "float"), (np.int32, "integer")])
+def test_pixels_without_a_known_white_are_refused(tmp_path, dtype, kind):
+    path = tmp_path / "depth.tif"
+    Image.fromarray(np.ones((3, 4), dtype)).save(path)
+    with pytest.raises(UserError, match=rf"depth\.tif has 32-bit {kind} pixels, whose white is not known"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(("columns", "curve"), [(P3, linear_from_srgb), (SRGB, lambda value: value)])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_colours_of_another_profile_are_converted_as_by_the_formula(tmp_path, columns, curve, channels):
+    """Display P3, and linear sRGB, against the same in float64; alpha stays."""
+    path, pixels = tmp_path / "other.png", noise(9, 8, channels)
+    Image.fromarray(pixels).save(path, icc_profile=icc_profile(columns, curve))
+    picture = read_image(path)
+    linear = curve(pixels[..., :3] / 255) @ np.array(columns) @ np.linalg.inv(SRGB)
+    expected = 255 * srgb_from_linear(linear.clip(0, 1))
+    assert np.abs(picture[..., :3] - expected).max() < 1.5  # the colour engine works in 8 to 16 bits
+    assert np.abs(picture[..., :3].astype(int) - pixels[..., :3]).max() > 20
+    np.testing.assert_array_equal(picture[..., 3:], pixels[..., 3:])
+
+
+def test_srgb_and_broken_and_foreign_profiles_leave_the_pixels_alone(tmp_path):
+    """The second sRGB is a table, as cameras write it: converting would change colours by one level."""
+    pixels = noise(99, 80, 3)
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    lab = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+    for name, profile in {
+        "srgb": srgb,
+        "table": icc_profile(SRGB, linear_from_srgb),
+        "broken": srgb[:200],
+        "lab": lab,
+        "text": b"no profile",
+    }.items():
+        path = tmp_path / f"{name}.png"
+        Image.fromarray(pixels).save(path, icc_profile=profile)
+        np.testing.assert_array_equal(read_image(path), pixels, err_msg=name)
+
+
+def jpeg_bytes() -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(noise(64, 64, 3)).save(buffer, "JPEG")
+    return buffer.getvalue()
+
+
+def test_unreadable_files_are_told_by_name(tmp_path):
+    jpeg = jpeg_bytes()
+    png = io.BytesIO()
+    Image.fromarray(noise(64, 64, 3)).save(png, "PNG")
+    tiff = io.BytesIO()
+    Image.fromarray(noise(64, 64, 3)).save(tiff, "TIFF")
+    webp = io.BytesIO()
+    Image.fromarray(noise(64, 64, 3)).save(webp, "WEBP")
+    contents = {
+        "zero.jpg": (b"", "is empty \\(0 bytes\\)"),
+        "text.jpg": (b"this is no photo\n" * 20, "is not a picture that can be read"),
+        "head.png": (png.getvalue()[:12], "is not a picture that can be read"),
+        "cut.jpg": (jpeg[: len(jpeg) // 2], "is damaged or cut short"),
+        "cut.png": (png.getvalue()[:3000], "is damaged or cut short"),
+        "cut.tif": (tiff.getvalue()[:3000], "is damaged or cut short|is not a picture"),
+        "cut.webp": (webp.getvalue()[:2000], "is damaged or cut short|is not a picture"),
+        "flipped.png": (png.getvalue()[:100] + b"\0" * 500 + png.getvalue()[600:], "is damaged or cut short"),
+        "größe 1.jpg": (b"\xff\xd8\xff\xe0", "is not a picture that can be read"),
+    }
+    for name, (content, message) in contents.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError, match=f"{name}.*({message})") as caught:
+            read_image(tmp_path / name)
+        assert caught.value.exit_code == BAD_INPUT
+        assert caught.value.hint
+    for reader in (read_image, image_size, read_exif):
+        with pytest.raises(UserError, match=r"cannot read .*missing\.jpg: No such file"):
+            reader(tmp_path / "missing.jpg")
+        with pytest.raises(UserError, match=f"cannot read {tmp_path}: Is a directory"):
+            reader(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_a_photo_with_any_byte_changed_is_read_or_refused(data, tmp_path_factory, kind):
+    """No damage to header or EXIF leads to another exception, or to a warning (an error in tests)."""
+    exif = exif_with(
+        {ExifTags.Base.Make: "Maker"}, {ExifTags.IFD.Exif: {ExifTags.Base.FocalLength: IFDRational(35, 2)}}
+    )
+    buffer = io.BytesIO()
+    Image.fromarray(noise(8, 8, 3)).save(buffer, kind, exif=exif)
+    content = bytearray(buffer.getvalue())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.getbasetemp() / "changed"
+    path.write_bytes(content)
+    for reader in (image_size, read_exif, read_image):
+        with suppress(UserError):
+            reader(path)
+
+
+def test_a_photo_of_200_megapixels_raises_no_alarm(tmp_path):
+    """The header of a small PNG, rewritten: Pillow's own limit would call it an attack."""
+    path = tmp_path / "large.png"
+    write_png(path, noise(2, 2, 3))
+    content = path.read_bytes()
+    header = b"IHDR" + struct.pack(">II", 16_320, 12_240) + content[24:29]
+    path.write_bytes(content[:12] + header + struct.pack(">I", zlib.crc32(header)) + content[33:])
+    assert image_size(path) == (16_320, 12_240)
+
+
+def test_list_images_is_sorted_and_takes_pictures_only(tmp_path):
+    names = ["b.JPG", "a 2.png", "a 10.png", "ä.jpeg", "c.tiff", "Z.webp"]
+    for name in (*names, ".hidden.jpg", "._b.JPG", "notes.txt", "photo.jpg.part"):
+        (tmp_path / name).touch()
+    (tmp_path / "folder.jpg").mkdir()
+    (tmp_path / "folder.jpg" / "inner.jpg").touch()
+    assert [p.name for p in list_images(tmp_path)] == sorted(names)
+    with pytest.raises(UserError, match=r"cannot list the photos in .*nothing: No such file"):
+        list_images(tmp_path / "nothing")
+    with pytest.raises(UserError, match=r"cannot list the photos in .*notes\.txt: Not a directory"):
+        list_images(tmp_path / "notes.txt")
+
+
+def downscaled_by_loops(image: np.ndarray, factor: float) -> np.ndarray:
+    """The definition, in float64: colours weighted by covered area and alpha, over the sum of the weights."""
+    height, width, channels = image.shape
+    out_height, out_width = max(1, round(height / factor)), max(1, round(width / factor))
+    result = np.zeros((out_height, out_width, channels))
+    for row in range(out_height):
+        for column in range(out_width):
+            top, bottom = row * height / out_height, (row + 1) * height / out_height
+            left, right = column * width / out_width, (column + 1) * width / out_width
+            area, weight, colour = 0.0, 0.0, np.zeros(3)
+            for y in range(math.floor(top), min(math.ceil(bottom), height)):
+                for x in range(math.floor(left), min(math.ceil(right), width)):
+                    covered = (min(bottom, y + 1) - max(top, y)) * (min(right, x + 1) - max(left, x))
+                    alpha = image[y, x, 3] / 255 if channels == 4 else 1.0
+                    area += covered
+                    weight += covered * alpha
+                    colour += covered * alpha * image[y, x, :3]
+            result[row, column, :3] = colour / weight if weight > 0 else 0
+            if channels == 4:
+                result[row, column, 3] = 255 * weight / area
+    return result
+
+
+@pytest.mark.parametrize("factor", [1.5, 2, 3, 4, 2.7, 100])
+@pytest.mark.parametrize("shape", [(12, 8, 3), (12, 8, 4), (13, 11, 3), (13, 11, 4), (1, 7, 4), (2, 2, 4)])
+def test_downscale_is_the_mean_over_areas_by_double_loop(factor, shape):
+    image = noise(*shape)
+    if shape[2] == 4:
+        image[: shape[0] // 2, : shape[1] // 2, 3] = 0  # a corner that is fully transparent
+        image[-1, :, 3] = 1  # and a row that nearly is
+    small, expected = downscale(image, factor), downscaled_by_loops(image, factor)
+    assert small.shape == expected.shape
+    assert small.dtype == np.uint8
+    assert np.abs(small - expected).max() <= 0.5 + 1e-4  # rounding, and float32 sums
+
+
+def test_downscale_keeps_hidden_colours_hidden():
+    image = np.zeros((2, 2, 4), np.uint8)
+    image[..., :3] = (0, 255, 0)
+    image[0, 0] = (200, 10, 30, 255)
+    np.testing.assert_array_equal(downscale(image, 2), [[[200, 10, 30, 64]]])
+
+
+def test_downscale_of_grey_masks():
+    mask = noise(6, 9)
+    expected = downscaled_by_loops(np.repeat(mask[..., None], 3, axis=2), 3)[..., 0]
+    assert np.abs(downscale(mask, 3) - expected).max() <= 0.5 + 1e-4
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_downscale_by_one_is_an_untouched_copy(channels):
+    image = noise(5, 4, channels)
+    same = downscale(image, 1)
+    np.testing.assert_array_equal(same, image)
+    assert not np.shares_memory(same, image)
+
+
+def test_downscale_refuses_to_enlarge():
+    for factor in (0.5, 0, -1, math.nan):
+        with pytest.raises(ValueError, match="factor must be at least 1"):
+            downscale(noise(6, 9), factor)
+
+
+def test_read_downscaled_is_reading_then_downscaling(tmp_path):
+    path = tmp_path / "photo.png"
+    Image.fromarray(noise(12, 31, 4)).save(path, exif=exif_with({ExifTags.Base.Orientation: 8}))
+    np.testing.assert_array_equal(read_downscaled(path, 2.5), downscale(read_image(path), 2.5))
+    assert read_downscaled(path, 2.5).shape == (12, 5, 4)
+
+
+def test_exif_of_a_phone(tmp_path):
+    path = tmp_path / "phone.jpg"
+    camera = {
+        ExifTags.Base.LensModel: "Lens 4 mm f/1.8",
+        ExifTags.Base.FocalLength: IFDRational(399, 100),
+        ExifTags.Base.FocalLengthIn35mmFilm: 28,
+        ExifTags.Base.ExposureTime: IFDRational(1, 120),
+        ExifTags.Base.ISOSpeedRatings: 40,
+    }
+    gps = {
+        ExifTags.GPS.GPSLatitudeRef: "S",
+        ExifTags.GPS.GPSLatitude: (IFDRational(33), IFDRational(30), IFDRational(36)),
+        ExifTags.GPS.GPSLongitudeRef: "E",
+        ExifTags.GPS.GPSLongitude: (IFDRational(151), IFDRational(15), IFDRational(0)),
+        ExifTags.GPS.GPSAltitudeRef: b"\x01",
+        ExifTags.GPS.GPSAltitude: IFDRational(25, 2),
+    }
+    entries = {ExifTags.Base.Make: "Maker\0", ExifTags.Base.Model: " Phone 7 ", ExifTags.Base.Orientation: 6}
+    exif = exif_with(entries, {ExifTags.IFD.Exif: camera, ExifTags.IFD.GPSInfo: gps})
+    Image.fromarray(noise(6, 8, 3)).save(path, exif=exif)
+    found = read_exif(path)
+    assert (found.make, found.model, found.lens) == ("Maker", "Phone 7", "Lens 4 mm f/1.8")
+    assert (found.focal_mm, found.focal_35mm, found.iso) == (3.99, 28, 40)
+    assert (found.exposure_seconds, found.orientation) == (1 / 120, 6)
+    assert (found.width, found.height) == (6, 8)
+    assert found.gps == pytest.approx((-33.51, 151.25, -12.5), abs=1e-12)
+
+
+def test_exif_that_is_absent_or_odd_reads_as_none(tmp_path):
+    path = tmp_path / "photo.jpg"
+    Image.fromarray(noise(6, 8, 3)).save(path)
+    nothing = read_exif(path)
+    assert (nothing.width, nothing.height, nothing.orientation) == (8, 6, 1)
+    wanted = ("make", "model", "lens", "focal_mm", "focal_35mm", "exposure_seconds", "iso", "gps")
+    assert [getattr(nothing, name) for name in wanted] == [None] * len(wanted)
+
+    camera = {
+        ExifTags.Base.FocalLength: IFDRational(0, 0),
+        ExifTags.Base.ExposureTime: IFDRational(1, 0),
+        ExifTags.Base.FocalLengthIn35mmFilm: 0,
+    }
+    nothing_over_nothing, too_far = (IFDRational(0, 0),) * 3, (IFDRational(200),) * 3
+    gps = {ExifTags.GPS.GPSLatitude: nothing_over_nothing, ExifTags.GPS.GPSLongitude: too_far}
+    exif = exif_with({ExifTags.Base.Make: "   "}, {ExifTags.IFD.Exif: camera, ExifTags.IFD.GPSInfo: gps})
+    Image.fromarray(noise(6, 8, 3)).save(path, exif=exif)
+    assert read_exif(path) == nothing
+    Image.fromarray(noise(6, 8, 3)).save(path, exif=b"Exif\0\0II*\0\xff\xff\xff\xff")
+    assert read_exif(path) == nothing
+    np.testing.assert_array_equal(read_image(path).shape, (6, 8, 3))
+
+
+def test_a_link_to_a_photo_counts_as_a_photo(tmp_path):
+    write_png(tmp_path / "outside" / "a.png", noise(3, 4, 3))
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "link.png").symlink_to(Path("..") / "outside" / "a.png")
+    (folder / "broken.png").symlink_to("nowhere.png")
+    assert [p.name for p in list_images(folder)] == ["link.png"]

@@ -1,0 +1,239 @@
+"""The plain-torch definitions against slow loops, closed forms, float64 and laws."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from conftest import TOLERANCE
+from hypothesis import given
+from hypothesis import strategies as st
+from oracles import march_through_slabs, trilinear_hash
+
+from nerfcli.field.contraction import training_points, uncontract
+from nerfcli.kernels import reference
+
+
+def random_rays(seed, counts, dtype=torch.float64):
+    g = torch.Generator().manual_seed(seed)
+    total = sum(counts)
+    density = torch.rand(total, generator=g, dtype=torch.float64).mul(6).sub(3).exp().to(dtype)
+    lengths = torch.rand(total, generator=g, dtype=torch.float64).to(dtype)
+    rgb = torch.rand(total, 3, generator=g, dtype=torch.float64).to(dtype)
+    offsets = torch.tensor([0, *np.cumsum(counts)])
+    return density, lengths, rgb, offsets
+
+
+@pytest.mark.parametrize("counts", [[5], [0, 3, 1, 0, 7], [0], [0, 0], [1, 123]])
+def test_composite_against_double_loop(counts):
+    density, lengths, rgb, offsets = random_rays(1, counts)
+    background = torch.rand(len(counts), 3, dtype=torch.float64)
+    colour, transmittance, weights = reference.composite(density, rgb, lengths, offsets=offsets, background=background)
+    for ray in range(len(counts)):
+        own = slice(int(offsets[ray]), int(offsets[ray + 1]))
+        expected = march_through_slabs(density[own].numpy(), lengths[own].numpy(), rgb[own].numpy(), background[ray])
+        np.testing.assert_allclose(weights[own], expected[0], rtol=1e-13)
+        np.testing.assert_allclose(transmittance[ray], expected[1], rtol=1e-13)
+        np.testing.assert_allclose(colour[ray], expected[2], rtol=1e-12)
+
+
+def test_no_rays_at_all():
+    empty = torch.zeros(0, dtype=torch.float64)
+    colour, transmittance, weights = reference.composite(
+        empty, empty.reshape(0, 3), empty, offsets=torch.zeros(1, dtype=torch.int64), background=torch.ones(3)
+    )
+    assert colour.shape == (0, 3)
+    assert transmittance.shape == weights.shape == (0,)
+
+
+@pytest.mark.parametrize("exponent", [-30, -10, 0, 10, 30])
+def test_weights_in_float32_across_magnitudes(exponent):
+    # The same function in float64; densities log-uniform over 1e-10 ... 1e10 around the exponent, in one ray.
+    g = torch.Generator().manual_seed(exponent + 100)
+    logs = torch.rand(20, 64, generator=g, dtype=torch.float64) * 20 - 10
+    density = (10.0 ** (logs * 0.5 + exponent * 0.1)).flatten()
+    lengths = torch.rand(len(density), generator=g, dtype=torch.float64)
+    density, lengths = density.float().double(), lengths.float().double()
+    offsets = torch.arange(0, len(density) + 1, 64)
+    exact, behind = reference.interval_weights(density, lengths, offsets)
+    rounded, behind32 = reference.interval_weights(density.float(), lengths.float(), offsets)
+    # exp(-tau) has the relative error of tau's absolute error: bounded by tau * eps, and tau stays below 90 here.
+    visible = exact > 1e-30
+    relative = ((rounded.double() - exact).abs() / exact)[visible]
+    assert relative.max() < 90 * 2e-7
+    torch.testing.assert_close(behind32.double(), behind, rtol=2e-5, atol=1e-30)
+
+
+def test_opacity_of_thin_fog_keeps_all_digits():
+    # 1 - exp(-x) in float32 is 19 % off at x = 1e-7; expm1 is not.
+    density = torch.tensor([1e-3, 1e-7, 1e-12, 1e-30])
+    weights, _ = reference.interval_weights(density, torch.ones(4), torch.arange(5))
+    torch.testing.assert_close(weights, torch.tensor([9.995001666e-4, 9.9999995e-8, 1e-12, 1e-30]), rtol=2e-7, atol=0)
+
+
+@given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 6), at=st.floats(0.01, 0.99))
+def test_splitting_an_interval_changes_nothing(seed, cut, at):
+    density, lengths, rgb, offsets = random_rays(seed, [7])
+    background = torch.ones(3, dtype=torch.float64)
+    whole, behind, _ = reference.composite(density, rgb, lengths, offsets=offsets, background=background)
+    parts = torch.cat(
+        [lengths[:cut], lengths[cut : cut + 1] * at, lengths[cut : cut + 1] * (1 - at), lengths[cut + 1 :]]
+    )
+    again = [torch.cat([x[: cut + 1], x[cut:]]) for x in (density, rgb)]
+    split, behind2, _ = reference.composite(*again, parts, offsets=torch.tensor([0, 8]), background=background)
+    torch.testing.assert_close(split, whole, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(behind2, behind, rtol=1e-12, atol=1e-14)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_weights_and_transmittance_sum_to_one(seed):
+    density, lengths, _, offsets = random_rays(seed, [3, 0, 17, 1], torch.float32)
+    weights, behind = reference.interval_weights(density * 10, lengths, offsets)
+    total = reference.sum_along_rays(weights, offsets) + behind
+    torch.testing.assert_close(total, torch.ones(4), rtol=0, atol=2e-6)
+
+
+def test_composite_gradcheck():
+    density, lengths, rgb, offsets = random_rays(3, [4, 0, 2])
+    background = torch.rand(3, 3, dtype=torch.float64)
+    inputs = [x.requires_grad_() for x in (density, rgb, lengths, background)]
+
+    def run(density, rgb, lengths, background):
+        return reference.composite(density, rgb, lengths, offsets=offsets, background=background)
+
+    assert torch.autograd.gradcheck(run, inputs)
+
+
+@pytest.mark.parametrize("density", [0.0, 1e-30, 1e30])
+def test_gradients_stay_bounded_at_the_extremes(density):
+    density = torch.full((4,), density, requires_grad=True)
+    lengths = torch.tensor([0.0, 1e-3, 0.5, 1.0], requires_grad=True)
+    rgb = torch.rand(4, 3, requires_grad=True)
+    colour, _, _ = reference.composite(density, rgb, lengths, offsets=torch.tensor([0, 4]), background=torch.zeros(3))
+    colour.sum().backward()
+    assert torch.isfinite(density.grad).all()
+    assert density.grad.abs().max() <= 3.0  # T * length * colour difference, three channels
+    assert torch.isfinite(rgb.grad).all()
+
+
+RESOLUTIONS = (4, 9, 40)
+ROWS = 512  # the first level fits densely (125), the others are hashed
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_hash_encode_against_python_integers(dtype):
+    g = torch.Generator().manual_seed(0)
+    table = torch.rand(3, ROWS, 4, generator=g, dtype=dtype)
+    points = torch.rand(40, 3, generator=g, dtype=dtype)
+    points[:4] = torch.tensor([[0, 0, 0], [1, 1, 1], [0.25, 0.5, 1], [-0.5, 2, 0.3]], dtype=dtype)
+    encoded = reference.hash_encode(points, table, RESOLUTIONS)
+    expected = np.array([trilinear_hash(p, table.double().numpy(), RESOLUTIONS) for p in points.double().numpy()])
+    # A float32 coordinate times 40 cells is off by 40 eps of a cell.
+    np.testing.assert_allclose(encoded.double().numpy(), expected, atol=40 * TOLERANCE[dtype])
+
+
+def test_hash_encode_of_a_constant_is_that_constant():
+    # The interpolation weights sum to one everywhere, borders and far outside included.
+    table = torch.full((3, ROWS, 2), 0.75, dtype=torch.float64)
+    points = torch.rand(100, 3, dtype=torch.float64) * 3 - 1
+    torch.testing.assert_close(
+        reference.hash_encode(points, table, RESOLUTIONS), torch.full((100, 6), 0.75, dtype=torch.float64)
+    )
+
+
+def test_hash_encode_at_vertices_is_the_table_row():
+    table = torch.rand(1, ROWS, 3, dtype=torch.float64)
+    points = torch.tensor([[1, 2, 3], [4, 4, 4], [0, 0, 0]]) / 4
+    encoded = reference.hash_encode(points.double(), table, (4,))
+    rows = [(3 * 5 + 2) * 5 + 1, (4 * 5 + 4) * 5 + 4, 0]
+    torch.testing.assert_close(encoded, table[0, rows])
+
+
+def test_hash_encode_gradcheck_in_the_table():
+    table = torch.rand(3, 64, 2, dtype=torch.float64, requires_grad=True)
+    points = torch.rand(5, 3, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda t: reference.hash_encode(points, t, (2, 5, 11)), table)
+
+
+def test_hash_encode_says_what_is_wrong():
+    with pytest.raises(ValueError, match="must have 2 levels"):
+        reference.hash_encode(torch.rand(1, 3), torch.rand(3, 64, 2), (2, 3))
+    with pytest.raises(ValueError, match="power of two, got 60"):
+        reference.hash_encode(torch.rand(1, 3), torch.rand(1, 60, 2), (2,))
+
+
+def test_contraction_leaves_the_unit_ball_and_bounds_the_rest():
+    g = torch.Generator().manual_seed(0)
+    inside = torch.nn.functional.normalize(torch.randn(50, 3, generator=g, dtype=torch.float64), dim=-1) * 0.999
+    assert torch.equal(reference.contract(inside), inside)
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=g, dtype=torch.float64), dim=-1)
+    for radius in (1.0, 2.0, 1e3, 1e10):
+        contracted = reference.contract(directions * radius)
+        torch.testing.assert_close(contracted, directions * (2 - 1 / radius), rtol=1e-12, atol=0)
+
+
+@given(seed=st.integers(0, 2**32 - 1), log_radius=st.floats(-6, 3))
+def test_contraction_round_trip(seed, log_radius):
+    g = torch.Generator().manual_seed(seed)
+    point = torch.nn.functional.normalize(torch.randn(1, 3, generator=g, dtype=torch.float64), dim=-1)
+    point = point * 10**log_radius
+    back = uncontract(reference.contract(point))
+    torch.testing.assert_close(back, point, rtol=1e-12 * max(1.0, 10**log_radius), atol=0)
+    for unbounded in (False, True):
+        again = training_points(reference.grid_coordinates(point, unbounded), unbounded)
+        torch.testing.assert_close(again, point, rtol=1e-11 * max(1.0, 10**log_radius), atol=1e-15)
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-20, 1.0, 1e10])
+def test_contraction_gradient_is_finite(radius):
+    point = torch.tensor([[radius, 0.0, 0.0]], requires_grad=True)
+    reference.contract(point).sum().backward()
+    assert torch.isfinite(point.grad).all()
+    assert point.grad.abs().max() <= 1.0
+
+
+def test_march_keeps_what_is_occupied():
+    # A ray along x through the cube [-1, 1]^3 with its last octant slab occupied: only intervals with x > 0.5.
+    occupied = torch.zeros(4, 4, 4, dtype=torch.bool)
+    occupied[:, :, 3] = True
+    edges = torch.linspace(0.0, 4.0, 42, dtype=torch.float64)
+    starts, ends, offsets = reference.march(
+        torch.tensor([[-1.5, 0.1, 0.1], [-1.5, 5.0, 0.0]], dtype=torch.float64),
+        torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(2, 3),
+        edges,
+        jitter=torch.tensor([0.25, 0.25], dtype=torch.float64),
+        occupied=occupied,
+        unbounded=False,
+    )
+    middles = (starts + ends) / 2 - 1.5
+    assert offsets.tolist() == [0, len(starts), len(starts)]  # the second ray misses the cube
+    assert ((middles >= 0.5) & (middles <= 1.0)).all()
+    cuts = edges[:-1] + 0.25 * (edges[1] - edges[0])
+    all_middles = (cuts[1:] + cuts[:-1]) / 2 - 1.5
+    assert len(starts) == ((all_middles >= 0.5) & (all_middles <= 1.0)).sum()
+    torch.testing.assert_close(starts[1:], ends[:-1])
+
+
+def test_march_with_everything_occupied_covers_the_ray():
+    edges = torch.tensor([0.1, 0.2, 0.4, 0.8, 1.6, 3.2], dtype=torch.float64)
+    starts, ends, offsets = reference.march(
+        torch.zeros(1, 3, dtype=torch.float64),
+        torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64),
+        edges,
+        jitter=torch.zeros(1, dtype=torch.float64),
+        occupied=torch.ones(2, 2, 2, dtype=torch.bool),
+        unbounded=True,
+    )
+    assert offsets.tolist() == [0, 4]
+    torch.testing.assert_close(starts, edges[:4])
+    torch.testing.assert_close(ends, edges[1:5])
+
+
+def test_optical_depth_does_not_lose_digits_behind_a_dense_interval():
+    # "cumsum minus self" gives 0 here in float32: 1e-3 drowns in 1e8.
+    density = torch.tensor([1e-3, 1e8, 1.0])
+    before = reference.optical_depth_before(density, torch.ones(3), torch.tensor([0, 3]))
+    assert before[0] == 0
+    assert before[1] == pytest.approx(1e-3, rel=1e-6)
+    assert before[2] == pytest.approx(1e8, rel=1e-6)
+    assert math.isfinite(before.sum())

@@ -1,0 +1,165 @@
+"""Numbers in closed form that every implementation must reproduce, in float64 and float32, each with its trap."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nerfcli import kernels
+from nerfcli.cameras.camera import Camera
+from nerfcli.field.cost import dense_grid_bytes, field_queries, parameter_bytes
+from nerfcli.field.encodings import fourier_features
+from nerfcli.render import depth, sampling, transmission
+
+DTYPES = [torch.float64, torch.float32]
+OFFSETS = torch.tensor([0, 3])
+
+
+def close(actual, expected, dtype):
+    torch.testing.assert_close(
+        torch.as_tensor(actual, dtype=dtype),
+        torch.as_tensor(expected, dtype=dtype),
+        rtol=8 * torch.finfo(dtype).eps,
+        atol=4 * torch.finfo(dtype).eps,
+    )
+
+
+@pytest.fixture(params=DTYPES, ids=["float64", "float32"])
+def dtype(request):
+    return request.param
+
+
+@pytest.fixture
+def slabs(dtype):
+    """Unit slabs of densities log 2, log 2, log 4; red, green, blue."""
+    density = torch.tensor([math.log(2), math.log(2), math.log(4)], dtype=dtype)
+    return density, torch.eye(3, dtype=dtype), torch.ones(3, dtype=dtype)
+
+
+def test_ray_of_a_pixel_has_unit_direction():
+    # K = diag(2, 2, 1), principal point 0, pixel (2, 0): (1, 0, 1) / sqrt 2; at distance sqrt 2 the point (1, 0, 1).
+    camera = Camera("PINHOLE", 4, 4, (2.0, 2.0, 0.0, 0.0))
+    directions, valid = camera.bearings(np.array([[2.0, 0.0]]))
+    assert valid.all()
+    np.testing.assert_allclose(directions[0], np.array([1, 0, 1]) / math.sqrt(2), atol=1e-15)
+    np.testing.assert_allclose(directions[0] * math.sqrt(2), [1, 0, 1], atol=1e-15)
+
+
+def test_slabs_weights_transmittance_and_colour(slabs, dtype):
+    density, rgb, lengths = slabs
+    colour, transmittance, weights = kernels.composite(
+        density, rgb, lengths, offsets=OFFSETS, background=torch.ones(3, dtype=dtype)
+    )
+    close(weights, [1 / 2, 1 / 4, 3 / 16], dtype)
+    close(transmittance, [1 / 16], dtype)
+    close(colour, [[9 / 16, 5 / 16, 4 / 16]], dtype)
+    close(weights.sum() + transmittance[0], 1.0, dtype)
+    entering = torch.exp(-kernels.optical_depth_before(density, lengths, OFFSETS))
+    close(entering, [1.0, 1 / 2, 1 / 4], dtype)
+    close(-torch.expm1(-density * lengths), [1 / 2, 1 / 2, 3 / 4], dtype)
+
+
+def test_weights_are_differences_of_transmittance(slabs, dtype):
+    density, _, lengths = slabs
+    weights, behind = kernels.interval_weights(density, lengths, OFFSETS)
+    at_edges = torch.cat([torch.exp(-kernels.optical_depth_before(density, lengths, OFFSETS)), behind])
+    close(weights, at_edges[:-1] - at_edges[1:], dtype)
+
+
+def test_depths_of_slabs_at_points(slabs, dtype):
+    # Depths 1, 2, 3 as given places: the conventions differ, and each is its own number.
+    density, _, lengths = slabs
+    weights, transmittance = kernels.interval_weights(density, lengths, OFFSETS)
+    places = torch.tensor([1.0, 2.0, 3.0], dtype=dtype)
+    close(depth.moment(weights, places, OFFSETS), [25 / 16], dtype)
+    close(weights.sum(), 15 / 16, dtype)
+    close(depth.conditional(weights, places, offsets=OFFSETS, opacity_floor=0.0), [5 / 3], dtype)
+    for far in (4.0, 100.0):
+        filled = depth.background_filled(
+            weights, places, offsets=OFFSETS, transmittance=transmittance, background_distance=far
+        )
+        close(filled, [25 / 16 + far / 16], dtype)
+    close(depth.max_weight(weights, places, offsets=OFFSETS, opacity_floor=0.0), [1.0], dtype)
+
+
+def test_median_of_slabs_is_inside_the_interval(slabs, dtype):
+    # T falls to 1/2 exactly at the end of the first slab, t = 1; with twice the density, half way through it.
+    density, _, lengths = slabs
+    starts = torch.tensor([0.0, 1.0, 2.0], dtype=dtype)
+    close(depth.median(density, starts, starts + lengths, offsets=OFFSETS), [1.0], dtype)
+    close(depth.median(2 * density, starts, starts + lengths, offsets=OFFSETS), [0.5], dtype)
+
+
+@pytest.mark.parametrize(("optical_depth", "length"), [(1e-12, 2.0), (0.1, 1.0), (1.0, 3.0), (30.0, 0.5), (1e6, 1.0)])
+def test_mean_place_inside_an_interval(optical_depth, length, dtype):
+    # t0 + 1/s - d/(exp(s d) - 1), with the limits d/2 and 1/s; the closed form by mpmath-free series at small s d.
+    s = optical_depth / length
+    if optical_depth < 1e-6:
+        expected = length * (0.5 - optical_depth / 12)
+    else:
+        expected = 1 / s - (length / math.expm1(optical_depth) if optical_depth < 700 else 0.0)
+    t0 = torch.tensor([5.0], dtype=dtype)
+    mean = depth.interval_means(torch.tensor([s], dtype=dtype), t0, t0 + length)
+    close(mean, [5.0 + expected], dtype)
+
+
+def test_gradients_of_the_slabs(slabs, dtype):
+    density, rgb, lengths = slabs
+    density.requires_grad_()
+    rgb.requires_grad_()
+    colour, _, weights = kernels.composite(
+        density, rgb, lengths, offsets=OFFSETS, background=torch.ones(3, dtype=dtype)
+    )
+    by_density = torch.stack([torch.autograd.grad(colour[0, c], density, retain_graph=True)[0] for c in range(3)])
+    # B_2 = (1/4, 1/4, 1) is all that is behind the second slab, background included.
+    close(by_density[:, 1], [-1 / 16, 3 / 16, -1 / 4], dtype)
+    by_red = torch.autograd.grad(colour[0, 0], rgb)[0]
+    close(by_red[:, 0], weights.detach(), dtype)
+
+
+def test_one_observation_is_consistent_with_many_fields(dtype):
+    # y = alpha c on black: alpha 1/2 with c 1/2 and alpha 1/4 with c 1 both give 1/4.
+    for density, grey in ((math.log(2), 0.5), (-math.log(3 / 4), 1.0)):
+        colour, _, _ = kernels.composite(
+            torch.tensor([density], dtype=dtype),
+            torch.full((1, 3), grey, dtype=dtype),
+            torch.ones(1, dtype=dtype),
+            offsets=torch.tensor([0, 1]),
+            background=torch.zeros(3, dtype=dtype),
+        )
+        close(colour, [[0.25] * 3], dtype)
+
+
+def test_fourier_features(dtype):
+    at_zero = fourier_features(torch.zeros(1, dtype=dtype), 3)
+    close(at_zero, [0, 1, 0, 1, 0, 1], dtype)
+    at_quarter = fourier_features(torch.full((1,), 0.25, dtype=dtype), 3)
+    close(at_quarter[:4], [math.sqrt(2) / 2, math.sqrt(2) / 2, 1, 0], dtype)
+    torch.testing.assert_close(
+        at_quarter[4:], torch.tensor([0, -1], dtype=dtype), rtol=0, atol=4 * torch.finfo(dtype).eps
+    )
+
+
+def test_inverse_cdf(dtype):
+    edges = torch.tensor([[0.0, 1.0, 2.0, 3.0]], dtype=dtype)
+    weights = torch.tensor([[0.5, 0.25, 0.25]], dtype=dtype)
+    close(sampling.inverse_cdf(edges, weights, uniform=torch.tensor([[0.7]], dtype=dtype)), [[1.8]], dtype)
+
+
+def test_storage_and_work():
+    assert parameter_bytes(1_000_000) == 4_000_000
+    assert 128**3 == 2_097_152
+    assert dense_grid_bytes(128, 1) == 8 * 2**20
+    assert dense_grid_bytes(128, 4) == 32 * 2**20
+    assert dense_grid_bytes(256, 1) == 8 * dense_grid_bytes(128, 1)
+    assert field_queries(256, 256, 64) == 4_194_304
+
+
+def test_transmission(dtype):
+    mu = torch.tensor([0.5, 0.25, 2.0], dtype=dtype)
+    lengths = torch.tensor([2.0, 4.0, 0.5], dtype=dtype)
+    integral = transmission.line_integral(mu, lengths, OFFSETS)
+    close(integral, [3.0], dtype)
+    close(transmission.transmitted(20000.0, integral), [20000.0 * math.exp(-3)], dtype)
+    close(-torch.log(transmission.transmitted(1.0, integral)), integral, dtype)
