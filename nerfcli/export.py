@@ -1,5 +1,6 @@
 """Rendered frames as files: PNG colours, float depth with its meaning, previews, videos."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
@@ -118,9 +119,15 @@ def effective_floor(request: DepthRequest) -> float:
 
 
 def file_names(frames: Sequence[Frame]) -> list[str]:
-    """File names without suffix: the frames' own, subfolders kept; the suffix stays where two would be the same."""
-    stems = [str(PurePosixPath(frame.name).with_suffix("")) for frame in frames]
-    return [stem if stems.count(stem) == 1 else frame.name for stem, frame in zip(stems, frames, strict=True)]
+    """File names without suffix: the frames' own, subfolders kept; the suffix stays where names would be the same.
+
+    A folder above the capture's ("../images") is called "up": nothing is written outside of the export.
+    """
+    names = ["/".join("up" if part == ".." else part for part in PurePosixPath(frame.name).parts) for frame in frames]
+    stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
+    taken = Counter([*stems, *names])
+    # A name without a suffix is its own stem, and counts twice.
+    return [stem if taken[stem] == 1 + (stem == name) else name for stem, name in zip(stems, names, strict=True)]
 
 
 def _export_frame(

@@ -86,6 +86,7 @@ def evaluate_run(
     write_json(path, metrics)
     console.note(
         f"{run}: PSNR {metrics['mean']['psnr']:.2f} dB, SSIM {metrics['mean']['ssim']:.3f} on {len(photos)} held-out "
-        f"photos; trained {metrics['training']['seconds']:.0f} s, {metrics['render']['seconds_per_image']:.2f} s a picture"
+        f"photos; trained {metrics['training']['seconds']:.0f} s, "
+        f"{metrics['render']['seconds_per_image']:.2f} s a picture"
     )
     return path, metrics

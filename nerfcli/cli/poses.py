@@ -41,8 +41,10 @@ def poses(
       nerfcli poses photos/kitchen -o kitchen --max-size 1000 --max-features 2048
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
-    from nerfcli.poses.structure_from_motion import PoseSettings
+    from nerfcli.poses.structure_from_motion import CAMERA_MODELS, PoseSettings
 
+    if camera_model not in CAMERA_MODELS:
+        raise typer.BadParameter(f"{camera_model!r}; choose {', '.join(CAMERA_MODELS)}", param_hint="--camera-model")
     console = Console(quiet=quiet, json_lines=json)
     settings = PoseSettings(
         max_image_size=max_size,

@@ -146,7 +146,9 @@ def render_run(
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
         farthest = model.marching.far / model.training_from_scene.scale
         settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
-    views = chosen_frames(run, cameras, count=count, max_size=max_size)
+    # The unit of the training frame is about the distance between the cameras and what they look at.
+    depth_hint = 1.0 / model.training_from_scene.scale
+    views = chosen_frames(run, cameras, count=count, max_size=max_size, depth_hint=depth_hint)
     provenance: dict[str, Any] = {
         "cameras": cameras,
         "run": run.name,
@@ -175,8 +177,11 @@ def render_run(
         return export_frames(model, views, target, settings, provenance=provenance, on_rays=on_rays)
 
 
-def chosen_frames(run: Path, cameras: str, *, count: int, max_size: int | None) -> "list[Frame]":
-    """The frames that --cameras names, at the size of the training or within `max_size`."""
+def chosen_frames(run: Path, cameras: str, *, count: int, max_size: int | None, depth_hint: float) -> "list[Frame]":
+    """The frames that --cameras names, at the size of the training or within `max_size`.
+
+    `depth_hint` is how far away the scene's middle is, for paths around it where the optical axes do not say.
+    """
     from dataclasses import replace
 
     from nerfcli.cameras import paths
@@ -189,12 +194,11 @@ def chosen_frames(run: Path, cameras: str, *, count: int, max_size: int | None) 
         chosen = list(sets[cameras])
         if not chosen:
             raise UserError(f"{run} has no {cameras} cameras", "choose --cameras train, orbit, spiral or interpolate")
+    elif cameras == "interpolate":
+        chosen = list(paths.interpolate(sets["train"], count=count))
     elif cameras in PATHS:
-        chosen = list(
-            {"orbit": paths.orbit, "spiral": paths.spiral, "interpolate": paths.interpolate}[cameras](
-                sets["train"], count=count
-            )
-        )
+        path = {"orbit": paths.orbit, "spiral": paths.spiral}[cameras]
+        chosen = list(path(sets["train"], count=count, depth_hint=depth_hint))
     else:
         chosen = list(frames_of_file(Path(cameras)))
         factor = 1

@@ -39,7 +39,7 @@ def ssim(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
     """
     smallest = min(picture.shape[:2])
     window = {"win_size": smallest - 1 + smallest % 2} if smallest < 11 else {}
-    _, similarity = structural_similarity(
+    similarity = structural_similarity(
         picture.astype(np.float64) / 255.0,
         photo.astype(np.float64) / 255.0,
         data_range=1.0,
@@ -49,5 +49,5 @@ def ssim(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
         use_sample_covariance=False,
         full=True,
         **window,
-    )
-    return float(similarity[used].mean())
+    )[1]
+    return float(np.asarray(similarity)[used].mean())

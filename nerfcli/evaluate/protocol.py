@@ -48,7 +48,7 @@ def evaluate_model(
         The keys "protocol", "mean", "images" and "render" of metrics.json.
 
     Raises:
-        UserError: nothing was held out.
+        UserError: nothing was held out, or a mask hides a whole photo.
     """
     if not held_out:
         raise UserError(
@@ -70,6 +70,10 @@ def evaluate_model(
         picture = render_picture(model, photo.frame, background=background, on_tile=on_tile)
         seconds.append(time.perf_counter() - began)
         used = picture.valid if photo.used is None else picture.valid & photo.used
+        if not used.any():
+            raise UserError(
+                f"no pixel of {photo.frame.name} is left to compare", "check that its mask is white where pixels count"
+            )
         rendered, truth = to_8_bit(picture.rgb), over_white(photo.pixels)
         images.append(
             {

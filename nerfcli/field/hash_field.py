@@ -8,10 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from nerfcli import kernels
-from nerfcli.field.activations import density_from_log
 from nerfcli.field.encodings import spherical_harmonics
 
-GEOMETRY_FEATURES = 15
+# Outputs of the density network, the logarithm of the density first; all of them go on to the colour network.
+GEOMETRY = 16
+HARMONICS = 16
 
 
 @dataclass(frozen=True)
@@ -45,44 +46,40 @@ class HashFieldSettings:
 
 
 class HashField(nn.Module):
-    """Density by position, colour by position and direction, on points of the training frame.
+    """Density by position, colour by position and direction, on coordinates of the unit cube.
 
-    The table starts near zero and the networks have no biases, so a fresh field is a thin grey fog of density 1:
-    thin enough that every sample of a ray gets a gradient.
+    Positions are those of `kernels.grid_coordinates`. The table starts near zero and the networks have no biases, so a
+    fresh field is a thin grey fog of density 1: thin enough that every sample of a ray gets a gradient.
     """
 
     def __init__(self, settings: HashFieldSettings):
         super().__init__()
         self.settings = settings
-        encoded = settings.levels * settings.features
-        self.table = nn.Parameter(
-            torch.empty(settings.levels, 2**settings.log2_rows, settings.features).uniform_(-1e-4, 1e-4)
-        )
-        self.density_network = nn.Sequential(
-            nn.Linear(encoded, settings.width, bias=False),
-            nn.ReLU(),
-            nn.Linear(settings.width, 1 + GEOMETRY_FEATURES, bias=False),
-        )
-        self.colour_network = nn.Sequential(
-            nn.Linear(GEOMETRY_FEATURES + 16, settings.width, bias=False),
-            nn.ReLU(),
-            nn.Linear(settings.width, settings.width, bias=False),
-            nn.ReLU(),
-            nn.Linear(settings.width, 3, bias=False),
-        )
+        width, encoded = settings.width, settings.levels * settings.features
+        shape = (settings.levels, 2**settings.log2_rows, settings.features)
+        self.table = nn.Parameter(torch.empty(shape).uniform_(-1e-4, 1e-4))
+        sizes = ((width, encoded), (GEOMETRY, width), (width, GEOMETRY + HARMONICS), (width, width), (3, width))
+        self.weights = nn.ParameterList([_uniform_weights(*size) for size in sizes])
 
-    def density(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Density (N,) in 1 / training unit, and the features (N, 15) that `colour` wants, at points (N, 3)."""
-        coordinates = kernels.grid_coordinates(points, self.settings.unbounded)
+    def density(self, coordinates: Tensor) -> Tensor:
+        """Density (N,) in 1 / training unit at coordinates (N, 3) of the unit cube."""
         encoded = kernels.hash_encode(coordinates, self.table, self.settings.resolutions)
-        out = self.density_network(encoded)
-        return density_from_log(out[:, 0]), out[:, 1:]
+        return kernels.density(encoded, tuple(self.weights))
 
-    def colour(self, features: Tensor, directions: Tensor) -> Tensor:
-        """sRGB colour (N, 3) in (0, 1) seen along unit `directions` (N, 3)."""
-        return torch.sigmoid(self.colour_network(torch.cat([features, spherical_harmonics(directions)], dim=-1)))
+    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """Density (N,) and sRGB colour (N, 3) at coordinates (N, 3), seen along `directions` (R, 3) of `rays` (N,)."""
+        encoded = kernels.hash_encode(coordinates, self.table, self.settings.resolutions)
+        return self.radiance_of_encoded(encoded, directions, rays)
 
-    def forward(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Density (N,) and colour (N, 3)."""
-        density, features = self.density(points)
-        return density, self.colour(features, directions)
+    def radiance_of_encoded(self, encoded: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+        """The same for positions that `kernels.hash_encode` has been asked about already, (N, L * F)."""
+        return kernels.radiance(encoded, spherical_harmonics(directions), rays, tuple(self.weights))
+
+
+def _uniform_weights(outputs: int, inputs: int) -> nn.Parameter:
+    """Weights that keep the variance of rectified inputs: uniform within sqrt(6 / inputs).
+
+    Source: He et al. 2015, arXiv:1502.01852, eq. 10.
+    """
+    bound = math.sqrt(6.0 / inputs)
+    return nn.Parameter(torch.empty(outputs, inputs).uniform_(-bound, bound))

@@ -1,46 +1,146 @@
 """The hot operations of the program behind one interface: `reference` defines them, faster modules agree with it.
 
-Contracts, shapes and sources stand with each operation in `reference`. A fast version is taken where its device, dtype
-and sizes fit; everything else, float64 and CUDA tensors among it, goes through the reference.
+Contracts, shapes and sources stand with each operation in `reference`. A fast version is taken where device, dtype,
+sizes and the wanted gradients fit; everything else, float64 and CUDA tensors among it, goes through the reference.
 """
 
 import functools
 import warnings
+from collections.abc import Callable
 from types import ModuleType
 
+import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
-from nerfcli.kernels.reference import (
-    composite,
-    contract,
-    grid_coordinates,
-    interval_weights,
-    march,
-    optical_depth_before,
-    ray_indices,
-    sum_along_rays,
-)
+from nerfcli.kernels.reference import contract, grid_coordinates, interval_weights, sum_along_rays
 
 __all__ = [
+    "adam_rows",
     "composite",
     "contract",
+    "density",
     "grid_coordinates",
     "hash_encode",
     "interval_weights",
     "march",
     "optical_depth_before",
+    "prepare",
+    "radiance",
     "ray_indices",
+    "sample_coordinates",
     "sum_along_rays",
 ]
 
 
-def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
-    """See `reference.hash_encode`. Gradients with respect to points come from the reference alone."""
+def march(
+    origins: Tensor, directions: Tensor, edges: Tensor, *, jitter: Tensor, occupied: Tensor, unbounded: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.march`."""
+    module = _module_for(origins, directions, edges, jitter)
+    return module.march(origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded)
+
+
+def ray_indices(offsets: Tensor) -> Tensor:
+    """See `reference.ray_indices`."""
+    numba_cpu = _numba_cpu() if offsets.device.type == "cpu" else None
+    return (numba_cpu or reference).ray_indices(offsets)
+
+
+def sample_coordinates(
+    origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, unbounded: bool
+) -> Tensor:
+    """See `reference.sample_coordinates`."""
+    module = _module_for(origins, directions, starts, ends, constant=(origins, directions, starts, ends))
+    return module.sample_coordinates(origins, directions, starts, ends, offsets=offsets, unbounded=unbounded)
+
+
+def hash_encode(
+    points: Tensor,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    *,
+    sink: Tensor | None = None,
+    known: Tensor | None = None,
+) -> Tensor:
+    """See `reference.hash_encode`.
+
+    Args:
+        sink: of the table's shape; the gradient with respect to the table is added to it, and autograd gets none: a
+            buffer of megabytes need not be made, filled and added at every step.
+        known: (N, L * F), the answer, where it has been computed before without gradients.
+    """
     numba_cpu = _numba_cpu()
     if numba_cpu is not None and numba_cpu.can_hash_encode(points, table, resolutions):
-        return numba_cpu.hash_encode(points, table, resolutions)
+        return numba_cpu.hash_encode(points, table, resolutions, sink, known)
+    if sink is not None and table.requires_grad and torch.is_grad_enabled():
+        leaf = table.detach().requires_grad_()
+        leaf.register_post_accumulate_grad_hook(lambda given: sink.add_(given.grad))
+        return reference.hash_encode(points, leaf, resolutions)
     return reference.hash_encode(points, table, resolutions)
+
+
+def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+    """See `reference.density`."""
+    numba_cpu = _numba_cpu()
+    needs_gradient = torch.is_grad_enabled() and (encoded.requires_grad or any(w.requires_grad for w in weights))
+    if numba_cpu is not None and not needs_gradient and numba_cpu.can_radiance(encoded, weights[:2]):
+        return numba_cpu.density(encoded, weights)
+    return reference.density(encoded, weights)
+
+
+def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """See `reference.radiance`."""
+    numba_cpu = _numba_cpu()
+    if numba_cpu is not None and not harmonics.requires_grad and numba_cpu.can_radiance(encoded, weights):
+        return numba_cpu.radiance(encoded, harmonics, rays, weights)
+    return reference.radiance(encoded, harmonics, rays, weights)
+
+
+def composite(
+    density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.composite`."""
+    module = _module_for(density, rgb, lengths, background, constant=(lengths, background))
+    return module.composite(density, rgb, lengths, offsets=offsets, background=background)
+
+
+def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.optical_depth_before`."""
+    module = _module_for(density, lengths, constant=(density, lengths))
+    return module.optical_depth_before(density, lengths, offsets)
+
+
+def adam_rows(
+    table: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    *,
+    step: int,
+    rate: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """See `reference.adam_rows`."""
+    module = _module_for(table, gradient) if table.shape[-1] == 4 else reference
+    module.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
+
+
+def _module_for(*tensors: Tensor, constant: tuple[Tensor, ...] = ()) -> ModuleType:
+    """Where to run: Numba for float32 on the CPU, unless a gradient is wanted that it does not give."""
+    fits = all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in constant)
+    return (_numba_cpu() or reference) if fits and not wanted else reference
+
+
+def prepare(notify: Callable[[str], None]) -> None:
+    """Compile what has to be compiled for this machine, so that no clock runs meanwhile; once per machine."""
+    numba_cpu = _numba_cpu()
+    if numba_cpu is not None:
+        if not numba_cpu.is_compiled():
+            notify("compiling the CPU kernels for this machine, once; this takes about a minute")
+        numba_cpu.warm_up()
 
 
 @functools.cache

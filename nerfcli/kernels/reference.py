@@ -8,6 +8,8 @@ another module of this folder agrees with these functions in value and gradient.
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.activations import density_from_log
+
 HASH_PRIMES = (1, 2654435761, 805459861)
 
 
@@ -222,3 +224,90 @@ def composite(
     weights, transmittance = interval_weights(density, lengths, offsets)
     colour = sum_along_rays(weights[:, None] * rgb, offsets)
     return colour + transmittance[:, None] * background, transmittance, weights
+
+
+def sample_coordinates(
+    origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, unbounded: bool
+) -> Tensor:
+    """The middles of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`."""
+    rays = ray_indices(offsets)
+    points = origins[rays] + directions[rays] * ((starts + ends) / 2)[:, None]
+    return grid_coordinates(points, unbounded)
+
+
+def geometry(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+    """The density network: (N, E) to (N, G), W2 relu(W1 x); the first output is the logarithm of the density."""
+    return torch.relu(encoded @ weights[0].t()) @ weights[1].t()
+
+
+def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+    """Density of encoded positions.
+
+    density = exp(clip(W2 relu(W1 x))_0), clipped to [-15, 15]; see `density_from_log` for its gradient.
+
+    Args:
+        encoded: (N, E).
+        weights: W1 (H, E), W2 (G, H), and whatever follows.
+
+    Returns:
+        (N,).
+    """
+    return density_from_log(geometry(encoded, weights)[:, 0])
+
+
+def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """Density and colour of encoded positions seen along rays.
+
+    g = W2 relu(W1 x),  density = exp(g_0),  rgb = sigmoid(C3 relu(C2 relu(C1 [g, harmonics of the ray])))
+
+    Args:
+        encoded: (N, E).
+        harmonics: (R, S) encoded direction of each ray.
+        rays: (N,) int64, the ray of each sample.
+        weights: W1 (H, E), W2 (G, H), C1 (H, G + S), C2 (H, H), C3 (3, H); no biases.
+
+    Returns:
+        density (N,), rgb (N, 3) in (0, 1).
+
+    Differentiable in encoded and weights.
+    """
+    shape = geometry(encoded, weights)
+    hidden = torch.relu(torch.cat([shape, harmonics[rays]], dim=-1) @ weights[2].t())
+    hidden = torch.relu(hidden @ weights[3].t())
+    return density_from_log(shape[:, 0]), torch.sigmoid(hidden @ weights[4].t())
+
+
+@torch.no_grad()
+def adam_rows(
+    table: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    *,
+    step: int,
+    rate: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """One step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero.
+
+    m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g^2
+    table -= rate (m / (1 - b1^step)) / (sqrt(v / (1 - b2^step)) + eps)
+
+    A row that no sample touched keeps its moments and its value: it does not drift on old momentum, and costs nothing.
+
+    Args:
+        table, gradient, first, second: (..., F), all of one shape.
+        step: number of this step, from 1.
+        rate, betas, eps: of Adam.
+
+    Source: Kingma and Ba 2015, Adam, arXiv:1412.6980, algorithm 1; skipping untouched rows as in Müller et al. 2022.
+    """
+    touched = (gradient != 0).any(-1)
+    g = gradient[touched]
+    first[touched] = betas[0] * first[touched] + (1 - betas[0]) * g
+    second[touched] = betas[1] * second[touched] + (1 - betas[1]) * g * g
+    mean = first[touched] / (1 - betas[0] ** step)
+    spread = (second[touched] / (1 - betas[1] ** step)).sqrt()
+    table[touched] -= rate * mean / (spread + eps)
+    gradient.zero_()

@@ -52,9 +52,10 @@ class Occupancy:
         cells = torch.randperm(side**3, generator=generator, device=device)[: max(1, round(share * side**3))]
         place = torch.stack([cells % side, cells // side % side, cells // side**2], dim=-1)
         inside = torch.rand(len(cells), 3, generator=generator, device=device)
-        points = training_points((place + inside) / side, field.settings.unbounded)
-        density = torch.cat([field.density(chunk)[0] for chunk in points.split(2**16)])
-        step = (growth * points.norm(dim=-1)).clamp_min(shortest_step)
+        coordinates = (place + inside) / side
+        density = torch.cat([field.density(chunk) for chunk in coordinates.split(2**16)])
+        radius = training_points(coordinates, field.settings.unbounded).norm(dim=-1)
+        step = (growth * radius).clamp_min(shortest_step)
         flat = self.optical_depth.view(-1)
         old = flat[cells]
         flat[cells] = torch.maximum(torch.where(old.isinf(), 0.0, old * DECAY), density * step)

@@ -116,13 +116,16 @@ def render_rays(
         occupied=model.occupied,
         unbounded=model.field.settings.unbounded,
     )
-    rays = kernels.ray_indices(offsets)
-    points = origins[rays] + directions[rays] * ((starts + ends) / 2)[:, None]
-    density, features = model.field.density(points)
+    coordinates = kernels.sample_coordinates(
+        origins, directions, starts, ends, offsets=offsets, unbounded=model.field.settings.unbounded
+    )
+    encoded = kernels.hash_encode(coordinates, model.field.table, model.field.settings.resolutions)
+    density = kernels.density(encoded, tuple(model.field.weights))
     weights, transmittance = kernels.interval_weights(density, ends - starts, offsets)
     seen = weights > NEGLIGIBLE_WEIGHT
-    rgb = torch.zeros_like(points)
-    rgb[seen] = model.field.colour(features[seen], directions[rays[seen]])
+    rgb = torch.zeros_like(coordinates)
+    rays = kernels.ray_indices(offsets)[seen]
+    rgb[seen] = model.field.radiance_of_encoded(encoded[seen], directions, rays)[1]
     colour = kernels.sum_along_rays(weights[:, None] * rgb, offsets) + transmittance[:, None] * background
     if depth is None:
         return colour, 1.0 - transmittance, torch.full_like(transmittance, torch.nan)

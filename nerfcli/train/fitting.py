@@ -20,6 +20,12 @@ OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
 REFRESH_SHARE = 1 / 8
 MOST_RAYS = 2**14
+# Samples behind this optical depth see less than a thousandth of the light and are not trained on.
+DEEPEST = 7.0
+# Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
+STRIDES = ((0.02, 4), (0.1, 2), (1.0, 1))
+BETAS = (0.9, 0.99)
+EPS = 1e-15
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,10 @@ class Fitting:
         self.edges = marching.edges().to(device, torch.float32)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
         self.optimiser = torch.optim.Adam(
-            self.field.parameters(), lr=settings.learning_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
+            self.field.weights.parameters(), lr=settings.learning_rate, betas=BETAS, eps=EPS
+        )
+        self.table_gradient, self.table_first, self.table_second = (
+            torch.zeros_like(self.field.table, requires_grad=False) for _ in range(3)
         )
         self.step = 0
         self.samples_per_ray = float(len(self.edges) - 2)
@@ -63,17 +72,30 @@ class Fitting:
         settings = self.settings
         if self.step % REFRESH_EVERY == 0:
             self._refresh_occupancy()
-        rays = min(MOST_RAYS, max(64, round(settings.samples_per_step / max(1.0, self.samples_per_ray))))
+        wanted = settings.first_samples_per_step + share * (settings.samples_per_step - settings.first_samples_per_step)
+        rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
         origins, directions, colours = self.pool.draw(rays, self.generator)
-        loss, samples = self._loss(origins, directions, colours)
+        stride = next(stride for until, stride in STRIDES if share <= until)
+        loss, samples = self._loss(origins, directions, colours, edges=self.edges[::stride].contiguous())
         self.optimiser.zero_grad(set_to_none=True)
         if samples > 0:
             loss.backward()
         self._check_finite(loss)
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate(share)
-        self.optimiser.step()
+        rate = self.learning_rate(share)
         self.step += 1
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.optimiser.step()
+        kernels.adam_rows(
+            self.field.table,
+            self.table_gradient,
+            self.table_first,
+            self.table_second,
+            step=self.step,
+            rate=rate,
+            betas=BETAS,
+            eps=EPS,
+        )
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         return StepResult(loss=loss.item(), samples=samples, rays=rays)
 
@@ -84,25 +106,37 @@ class Fitting:
         warmup = min(1.0, (self.step + 1) / settings.warmup_steps)
         return settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
 
-    def _loss(self, origins: Tensor, directions: Tensor, colours: Tensor) -> tuple[Tensor, int]:
+    def _loss(self, origins: Tensor, directions: Tensor, colours: Tensor, *, edges: Tensor) -> tuple[Tensor, int]:
         """Loss over some rays, and the number of samples it took."""
         device = origins.device
         jitter = torch.rand(len(origins), generator=self.generator, device=device)
         # What the field lets through is shown a random colour: only opacity explains a photo then.
         background = torch.rand(len(origins), 3, generator=self.generator, device=device)
+        field = self.field
         starts, ends, offsets = kernels.march(
             origins,
             directions,
-            self.edges,
+            edges,
             jitter=jitter,
             occupied=self.occupied,
-            unbounded=self.field.settings.unbounded,
+            unbounded=field.settings.unbounded,
         )
-        rays = kernels.ray_indices(offsets)
-        points = origins[rays] + directions[rays] * ((starts + ends) / 2)[:, None]
-        density, rgb = self.field(points, directions[rays])
-        rendered, _, _ = kernels.composite(density, rgb, ends - starts, offsets=offsets, background=background)
-        return colour_loss(rendered, over_background(colours, background)), len(points)
+        coordinates = kernels.sample_coordinates(
+            origins, directions, starts, ends, offsets=offsets, unbounded=field.settings.unbounded
+        )
+        marched = len(coordinates)
+        with torch.no_grad():
+            encoded = kernels.hash_encode(coordinates, field.table, field.settings.resolutions)
+            density = kernels.density(encoded, tuple(field.weights))
+            seen = kernels.optical_depth_before(density, ends - starts, offsets) < DEEPEST
+            offsets = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
+        encoded = kernels.hash_encode(
+            coordinates[seen], field.table, field.settings.resolutions, sink=self.table_gradient, known=encoded[seen]
+        )
+        density, rgb = field.radiance_of_encoded(encoded, directions, kernels.ray_indices(offsets))
+        lengths = (ends - starts)[seen]
+        rendered, _, _ = kernels.composite(density, rgb, lengths, offsets=offsets, background=background)
+        return colour_loss(rendered, over_background(colours, background)), marched
 
     def _refresh_occupancy(self) -> None:
         # The whole grid once, after a warm-up in which everything is open; then a share at a time.
@@ -118,9 +152,9 @@ class Fitting:
         self.occupied = self.occupancy.occupied
 
     def _check_finite(self, loss: Tensor) -> None:
-        suspects = {"loss": loss, **{f"gradient of {n}": p.grad for n, p in self.field.named_parameters()}}
-        for name, tensor in suspects.items():
-            # A sum is non-finite if any term is, and costs one pass without a temporary.
+        gradients = {f"gradient of {name}": p.grad for name, p in self.field.weights.named_parameters()}
+        for name, tensor in {"loss": loss, **gradients}.items():
+            # A sum is non-finite if any term is. The table's gradient comes through that of the first weights.
             if tensor is not None and not math.isfinite(tensor.sum().item()):
                 raise UserError(
                     f"{name} is not finite at step {self.step}",
@@ -130,7 +164,12 @@ class Fitting:
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Everything that `restore` needs to go on bit for bit, besides the field's own weights."""
-        tensors = {"generator": self.generator.get_state(), "optical_depth": self.occupancy.optical_depth}
+        tensors = {
+            "generator": self.generator.get_state(),
+            "optical_depth": self.occupancy.optical_depth,
+            "table_first": self.table_first,
+            "table_second": self.table_second,
+        }
         for index, entry in self.optimiser.state_dict()["state"].items():
             tensors.update({f"adam.{index}.{name}": value for name, value in entry.items()})
         return tensors, {"step": self.step, "samples_per_ray": self.samples_per_ray}
@@ -140,6 +179,7 @@ class Fitting:
         self.generator.set_state(tensors["generator"].cpu())
         self.occupancy.optical_depth = tensors["optical_depth"]
         self.occupied = self.occupancy.occupied
+        self.table_first, self.table_second = tensors["table_first"], tensors["table_second"]
         entries: dict[int, dict[str, Tensor]] = {}
         for key, value in tensors.items():
             if key.startswith("adam."):

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from nerfcli import kernels
 from nerfcli.atomic import cannot_write, write_json
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
@@ -74,6 +75,7 @@ def train(
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     torch.set_num_threads(settings.threads)
+    kernels.prepare(notify)
     if not scene.train_frames:
         raise UserError(f"{scene.root} has no training photo", "every 8th photo is held out; at least 2 are needed")
     first = scene.train_frames[0].camera
@@ -99,7 +101,8 @@ def train(
     else:
         try:
             run.mkdir(parents=True, exist_ok=True)
-            (run / LOG).unlink(missing_ok=True)
+            for name in (FIELD, STATE, LOG):  # what stands there now would not fit to what comes
+                (run / name).unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(run, error) from error
     write_json(run / CONFIG, describe_run(scene, settings, factor))

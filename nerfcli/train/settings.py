@@ -21,7 +21,8 @@ class TrainSettings:
         seed: of everything random.
         device: a torch device name.
         threads: CPU threads.
-        samples_per_step: field samples that one step aims at; the number of rays follows.
+        first_samples_per_step, samples_per_step: field samples that a step aims at, at the start and at the end; the
+            number of rays follows. Small steps learn more from a sample, large ones cost less each.
         learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
         warmup_steps: steps over which the learning rate rises from 0.
 
@@ -35,7 +36,8 @@ class TrainSettings:
     seed: int = 0
     device: str = "cpu"
     threads: int = 1
-    samples_per_step: int = 2**14
+    first_samples_per_step: int = 2**13
+    samples_per_step: int = 2**16
     learning_rate: float = 1e-2
     final_learning_rate: float = 1e-3
     warmup_steps: int = 50

@@ -11,30 +11,14 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from llvmlite import ir
-from numba.core import cgutils, types
-from numba.extending import intrinsic
 from torch import Tensor
+
+from nerfcli.kernels.numba_cpu.threads import thread_count
+from nerfcli.kernels.numba_cpu.vector import prefetch
 
 # Row width that the kernels are unrolled for.
 FEATURES = 4
 BLOCK = 32
-
-
-@intrinsic
-def _prefetch(typingctx: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of array[index] of a flat float32 array, without waiting for it."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, args[0]).data
-        place = builder.bitcast(builder.gep(data, [args[1]]), ir.PointerType(ir.IntType(8)))
-        kind = ir.FunctionType(ir.VoidType(), [ir.PointerType(ir.IntType(8)), *[ir.IntType(32)] * 3])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        read, keep, data_cache = (ir.Constant(ir.IntType(32), value) for value in (0, 3, 1))
-        builder.call(function, [place, read, keep, data_cache])
-        return context.get_dummy_value()
-
-    return types.none(array, index), generate
 
 
 @numba.njit(inline="always")
@@ -108,7 +92,7 @@ def _prepare_block(
         _corner_rows(cx, cy, cz, resolution, rows, index, i)
         _corner_weights(fx, fy, fz, weight, i)
         for corner in range(8):
-            _prefetch(flat, offset + np.int64(index[i, corner]) * FEATURES)
+            prefetch(flat, offset + np.int64(index[i, corner]) * FEATURES)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
@@ -157,6 +141,8 @@ def _encode_backward(points: Any, gradient: Any, rows: Any, resolutions: Any, fl
                 for i in range(count):
                     a, b = gradient[first + i, column], gradient[first + i, column + 1]
                     c, d = gradient[first + i, column + 2], gradient[first + i, column + 3]
+                    if a == 0 and b == 0 and c == 0 and d == 0:  # a sample that nothing depends on
+                        continue
                     for corner in range(8):
                         at = offset + np.int64(index[i, corner]) * FEATURES
                         w = weight[i, corner]
@@ -168,25 +154,39 @@ def _encode_backward(points: Any, gradient: Any, rows: Any, resolutions: Any, fl
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+    def forward(
+        ctx: Any,
+        points: Tensor,
+        table: Tensor,
+        resolutions: tuple[int, ...],
+        sink: Tensor | None,
+        known: Tensor | None,
+    ) -> Tensor:
         points, table = points.detach().contiguous(), table.detach().contiguous()
         levels, rows, features = table.shape
-        out = torch.empty(len(points), levels * features)
         sides = np.array(resolutions, dtype=np.int32)
-        _encode_forward(points.numpy(), table.view(-1).numpy(), rows, sides, out.numpy(), _threads())
+        if known is None:
+            out = torch.empty(len(points), levels * features)
+            _encode_forward(points.numpy(), table.view(-1).numpy(), rows, sides, out.numpy(), thread_count())
+        else:
+            out = known.view_as(known)
         ctx.save_for_backward(points)
-        ctx.table_shape, ctx.sides = table.shape, sides
+        ctx.table_shape, ctx.sides, ctx.sink = table.shape, sides, sink
         return out
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor | None, None, None, None]:
         (points,) = ctx.saved_tensors
-        gradient = torch.zeros(ctx.table_shape)
-        rows = ctx.table_shape[1]
+        total = torch.zeros(ctx.table_shape) if ctx.sink is None else ctx.sink
         _encode_backward(
-            points.numpy(), gradients[0].contiguous().numpy(), rows, ctx.sides, gradient.view(-1).numpy(), _threads()
+            points.numpy(),
+            gradients[0].contiguous().numpy(),
+            ctx.table_shape[1],
+            ctx.sides,
+            total.view(-1).numpy(),
+            thread_count(),
         )
-        return None, gradient, None
+        return None, total if ctx.sink is None else None, None, None, None
 
 
 def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> bool:
@@ -202,11 +202,8 @@ def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...])
     )
 
 
-def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
-    """See `reference.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in the table."""
-    return _HashEncode.apply(points, table, resolutions)  # type: ignore[return-value]
-
-
-def _threads() -> int:
-    """Torch's thread count, which --threads sets, as far as Numba has threads."""
-    return min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)
+def hash_encode(
+    points: Tensor, table: Tensor, resolutions: tuple[int, ...], sink: Tensor | None, known: Tensor | None
+) -> Tensor:
+    """See `kernels.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in the table."""
+    return _HashEncode.apply(points, table, resolutions, sink, known)  # type: ignore[return-value]

@@ -1,0 +1,52 @@
+"""The hot operations on CPU threads, compiled by Numba for the processor they run on, cached on disk."""
+
+from pathlib import Path
+
+import torch
+
+from nerfcli.kernels.numba_cpu.compositing import composite, optical_depth_before
+from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
+from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
+from nerfcli.kernels.numba_cpu.rays import march, ray_indices, sample_coordinates
+from nerfcli.kernels.numba_cpu.row_adam import adam_rows
+
+__all__ = [
+    "adam_rows",
+    "can_hash_encode",
+    "can_radiance",
+    "composite",
+    "density",
+    "hash_encode",
+    "is_compiled",
+    "march",
+    "optical_depth_before",
+    "radiance",
+    "ray_indices",
+    "sample_coordinates",
+    "warm_up",
+]
+
+
+def is_compiled() -> bool:
+    """Whether an earlier process has left compiled kernels in the cache beside the code."""
+    return any((Path(__file__).parent / "__pycache__").glob("*.nbi"))
+
+
+def warm_up() -> None:
+    """Run every kernel once on a ray of two samples, which compiles it or loads it from the cache."""
+    offsets = torch.tensor([0, 2])
+    direction, jitter = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1)
+    occupied = torch.ones(2, 2, 2, dtype=torch.bool)
+    march(direction, direction, torch.arange(4.0), jitter=jitter, occupied=occupied, unbounded=True)
+    starts, lengths = torch.tensor([0.0, 1.0]), torch.ones(2)
+    points = sample_coordinates(direction, direction, starts, starts + 1, offsets=offsets, unbounded=True)
+    table = torch.zeros(8, 16, 4, requires_grad=True)
+    shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
+    weights = tuple(torch.zeros(shape, requires_grad=True) for shape in shapes)
+    encoded = hash_encode(points, table, (2,) * 8, None, None)
+    optical_depth_before(density(encoded, weights), lengths, offsets)
+    thickness, rgb = radiance(encoded, torch.zeros(1, 16), ray_indices(offsets), weights)
+    colour, _, _ = composite(thickness, rgb, lengths, offsets=offsets, background=torch.zeros(3))
+    colour.sum().backward()
+    gradient, first, second = (torch.zeros(8, 16, 4) for _ in range(3))
+    adam_rows(table, gradient, first, second, step=1, rate=0.0, betas=(0.9, 0.99), eps=1e-15)

@@ -1,0 +1,282 @@
+"""The two small networks of the field on CPU threads: tiles of samples go through all layers inside the first cache.
+
+Same operation as `reference.radiance`. Nothing but the inputs is kept for the backward pass: computing the hidden
+layers of a tile again is cheaper than bringing them back from memory. Each thread sums its own weight gradients; the
+sums are added in the order of the threads.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.numba_cpu.threads import thread_count
+from nerfcli.kernels.numba_cpu.vector import ROWS, add_product_16, add_product_32
+
+# Widths that the kernels are written for: encoded features, hidden layers, and the padded width of the outputs.
+WIDTH = 32
+OUT = 16
+TILE = 64
+LOG_DENSITY_LIMIT = np.float32(15.0)
+
+# Where each layer's weights stand in the flat arrays: encoded-hidden, hidden-density, inputs-hidden, hidden-hidden,
+# hidden-colour.
+D1, D2, C1, C2, C3 = 0, 1024, 1536, 2560, 3584
+WEIGHTS = 4096
+
+
+@numba.njit(inline="always")
+def _layer_32(x: Any, weights: Any, at: Any, depth: Any, out: Any) -> None:
+    """out (TILE, 32) = x (TILE, 32)[:, :depth] @ weights[at:] (depth, 32)."""
+    out[: TILE * WIDTH] = np.float32(0)
+    for row in range(0, TILE, ROWS):
+        add_product_32(x, row * WIDTH, WIDTH, 1, weights, at, WIDTH, depth, out, row * WIDTH, WIDTH)
+
+
+@numba.njit(inline="always")
+def _layer_16(x: Any, weights: Any, at: Any, out: Any) -> None:
+    """out (TILE, 16) = x (TILE, 32) @ weights[at:] (32, 16)."""
+    out[: TILE * OUT] = np.float32(0)
+    for row in range(0, TILE, ROWS):
+        add_product_16(x, row * WIDTH, WIDTH, 1, weights, at, OUT, WIDTH, out, row * OUT, OUT)
+
+
+@numba.njit(inline="always")
+def _back_from_16(g: Any, weights: Any, at: Any, depth: Any, out: Any) -> None:
+    """out (TILE, 32) = g (TILE, 16)[:, :depth] @ weights[at:] (depth, 32)."""
+    out[: TILE * WIDTH] = np.float32(0)
+    for row in range(0, TILE, ROWS):
+        add_product_32(g, row * OUT, OUT, 1, weights, at, WIDTH, depth, out, row * WIDTH, WIDTH)
+
+
+@numba.njit(inline="always")
+def _weights_32(x: Any, g: Any, sums: Any, at: Any) -> None:
+    """sums[at:] (32, 32) += x (TILE, 32)^T @ g (TILE, 32)."""
+    for row in range(0, WIDTH, ROWS):
+        add_product_32(x, row, 1, WIDTH, g, 0, WIDTH, TILE, sums, at + row * WIDTH, WIDTH)
+
+
+@numba.njit(inline="always")
+def _weights_16(x: Any, g: Any, sums: Any, at: Any) -> None:
+    """sums[at:] (32, 16) += x (TILE, 32)^T @ g (TILE, 16)."""
+    for row in range(0, WIDTH, ROWS):
+        add_product_16(x, row, 1, WIDTH, g, 0, OUT, TILE, sums, at + row * OUT, OUT)
+
+
+@numba.njit(inline="always")
+def _rectify(x: Any) -> None:
+    for i in range(TILE * WIDTH):
+        x[i] = max(x[i], np.float32(0))
+
+
+@numba.njit(inline="always")
+def _mask(g: Any, h: Any) -> None:
+    """Gradients pass where the rectified value is above 0."""
+    for i in range(TILE * WIDTH):
+        if h[i] <= np.float32(0):
+            g[i] = np.float32(0)
+
+
+@numba.njit(inline="always")
+def _load_rows(source: Any, first: Any, count: Any, out: Any) -> None:
+    """Rows of `source`, and zeros after the last."""
+    for i in range(count):
+        for j in range(WIDTH):
+            out[i * WIDTH + j] = source[first + i, j]
+    out[count * WIDTH :] = np.float32(0)
+
+
+@numba.njit(inline="always")
+def _colour_inputs(geometry: Any, harmonics: Any, rays: Any, first: Any, count: Any, out: Any) -> None:
+    """The 16 outputs of the density network beside the 16 harmonics of the sample's ray."""
+    for i in range(count):
+        ray = rays[first + i]
+        for j in range(OUT):
+            out[i * WIDTH + j] = geometry[i * OUT + j]
+            out[i * WIDTH + OUT + j] = harmonics[ray, j]
+    out[count * WIDTH :] = np.float32(0)
+
+
+@numba.njit(inline="always")
+def _density(log_density: Any) -> Any:
+    return np.exp(min(max(log_density, -LOG_DENSITY_LIMIT), LOG_DENSITY_LIMIT))
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def _density_forward(encoded: Any, weights: Any, density: Any, threads: Any) -> None:
+    samples = encoded.shape[0]
+    tiles = (samples + TILE - 1) // TILE
+    for thread in numba.prange(threads):
+        x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
+        geometry = np.empty(TILE * OUT, np.float32)
+        for tile in range(thread * tiles // threads, (thread + 1) * tiles // threads):
+            first = tile * TILE
+            count = min(TILE, samples - first)
+            _load_rows(encoded, first, count, x)
+            _layer_32(x, weights, D1, WIDTH, h)
+            _rectify(h)
+            _layer_16(h, weights, D2, geometry)
+            for i in range(count):
+                density[first + i] = _density(geometry[i * OUT])
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def _radiance_forward(
+    encoded: Any, harmonics: Any, rays: Any, weights: Any, density: Any, rgb: Any, threads: Any
+) -> None:
+    samples = encoded.shape[0]
+    tiles = (samples + TILE - 1) // TILE
+    for thread in numba.prange(threads):
+        x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
+        geometry, out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
+        for tile in range(thread * tiles // threads, (thread + 1) * tiles // threads):
+            first = tile * TILE
+            count = min(TILE, samples - first)
+            _load_rows(encoded, first, count, x)
+            _layer_32(x, weights, D1, WIDTH, h)
+            _rectify(h)
+            _layer_16(h, weights, D2, geometry)
+            _colour_inputs(geometry, harmonics, rays, first, count, x)
+            _layer_32(x, weights, C1, WIDTH, h)
+            _rectify(h)
+            _layer_32(h, weights, C2, WIDTH, x)
+            _rectify(x)
+            _layer_16(x, weights, C3, out)
+            for i in range(count):
+                density[first + i] = _density(geometry[i * OUT])
+                for channel in range(3):
+                    rgb[first + i, channel] = np.float32(1) / (np.float32(1) + np.exp(-out[i * OUT + channel]))
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def _radiance_backward(
+    encoded: Any,
+    harmonics: Any,
+    rays: Any,
+    weights: Any,
+    back: Any,
+    rgb: Any,
+    density_gradient: Any,
+    rgb_gradient: Any,
+    encoded_gradient: Any,
+    sums: Any,
+    threads: Any,
+) -> None:
+    samples = encoded.shape[0]
+    tiles = (samples + TILE - 1) // TILE
+    for thread in numba.prange(threads):
+        x, h1 = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
+        c0, h2, h3 = (
+            np.empty(TILE * WIDTH, np.float32),
+            np.empty(TILE * WIDTH, np.float32),
+            np.empty(TILE * WIDTH, np.float32),
+        )
+        g, g2 = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
+        geometry, g_out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
+        own = sums[thread]
+        for tile in range(thread * tiles // threads, (thread + 1) * tiles // threads):
+            first = tile * TILE
+            count = min(TILE, samples - first)
+            _load_rows(encoded, first, count, x)
+            _layer_32(x, weights, D1, WIDTH, h1)
+            _rectify(h1)
+            _layer_16(h1, weights, D2, geometry)
+            _colour_inputs(geometry, harmonics, rays, first, count, c0)
+            _layer_32(c0, weights, C1, WIDTH, h2)
+            _rectify(h2)
+            _layer_32(h2, weights, C2, WIDTH, h3)
+            _rectify(h3)
+
+            g_out[:] = np.float32(0)
+            for i in range(count):
+                for channel in range(3):
+                    value = rgb[first + i, channel]
+                    g_out[i * OUT + channel] = rgb_gradient[first + i, channel] * value * (np.float32(1) - value)
+            _weights_16(h3, g_out, own, C3)
+            _back_from_16(g_out, back, C3, 3, g)
+            _mask(g, h3)
+            _weights_32(h2, g, own, C2)
+            _layer_32(g, back, C2, WIDTH, g2)
+            _mask(g2, h2)
+            _weights_32(c0, g2, own, C1)
+            _layer_32(g2, back, C1, WIDTH, g)
+            for i in range(TILE):
+                for j in range(OUT):
+                    g_out[i * OUT + j] = g[i * WIDTH + j]
+            for i in range(count):
+                g_out[i * OUT] += density_gradient[first + i] * _density(geometry[i * OUT])
+            _weights_16(h1, g_out, own, D2)
+            _back_from_16(g_out, back, D2, OUT, g)
+            _mask(g, h1)
+            _weights_32(x, g, own, D1)
+            _layer_32(g, back, D1, WIDTH, g2)
+            for i in range(count):
+                for j in range(WIDTH):
+                    encoded_gradient[first + i, j] = g2[i * WIDTH + j]
+
+
+def _flat(weights: Sequence[Tensor]) -> np.ndarray:
+    """All layers as (inputs, outputs), outputs padded to a multiple of 16, in one array."""
+    padded = [torch.nn.functional.pad(w.detach(), (0, 0, 0, -len(w) % OUT)) for w in weights]
+    return torch.cat([w.t().reshape(-1) for w in padded]).numpy()
+
+
+def _flat_back(weights: Sequence[Tensor]) -> np.ndarray:
+    """All layers as (outputs, inputs), padded alike, as the backward pass reads them."""
+    padded = [torch.nn.functional.pad(w.detach(), (0, 0, 0, -len(w) % OUT)) for w in weights]
+    return torch.cat([w.reshape(-1) for w in padded]).numpy()
+
+
+class _Radiance(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, encoded: Tensor, harmonics: Tensor, rays: Tensor, *weights: Tensor) -> tuple[Tensor, Tensor]:
+        encoded, harmonics = encoded.detach().contiguous(), harmonics.detach().contiguous()
+        density, rgb = torch.empty(len(encoded)), torch.empty(len(encoded), 3)
+        _radiance_forward(
+            encoded.numpy(), harmonics.numpy(), rays.numpy(), _flat(weights), density.numpy(), rgb.numpy(),
+            thread_count(),
+        )  # fmt: skip
+        ctx.save_for_backward(encoded, harmonics, rays, rgb, *weights)
+        return density, rgb
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        encoded, harmonics, rays, rgb, *weights = ctx.saved_tensors
+        threads = thread_count()
+        encoded_gradient = torch.empty_like(encoded)
+        sums = np.zeros((threads, WEIGHTS), np.float32)
+        _radiance_backward(
+            encoded.numpy(), harmonics.numpy(), rays.numpy(), _flat(weights), _flat_back(weights), rgb.numpy(),
+            gradients[0].contiguous().numpy(), gradients[1].contiguous().numpy(), encoded_gradient.numpy(), sums,
+            threads,
+        )  # fmt: skip
+        total = torch.from_numpy(sums.sum(0))
+        slots = zip((D1, D2, C1, C2, C3), (D2, C1, C2, C3, WEIGHTS), weights, strict=True)
+        by_layer = [total[a:b].view(WIDTH, -1).t()[: len(w)].contiguous() for a, b, w in slots]
+        return encoded_gradient, None, None, *by_layer
+
+
+def can_radiance(encoded: Tensor, weights: tuple[Tensor, ...]) -> bool:
+    """Whether this module has code for these sizes, on this device, in this precision."""
+    shapes = [tuple(w.shape) for w in weights]
+    wanted = [(WIDTH, WIDTH), (OUT, WIDTH), (WIDTH, WIDTH), (WIDTH, WIDTH), (3, WIDTH)]
+    return (
+        encoded.device.type == "cpu" and encoded.dtype == torch.float32 and shapes == wanted[: len(shapes)]
+        and encoded.shape[-1] == WIDTH
+    )  # fmt: skip
+
+
+def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """See `reference.radiance`; float32 on the CPU, differentiable in `encoded` and the weights."""
+    return _Radiance.apply(encoded, harmonics, rays, *weights)  # type: ignore[return-value]
+
+
+def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+    """See `reference.density`; float32 on the CPU, without gradients."""
+    encoded = encoded.detach().contiguous()
+    out = torch.empty(len(encoded))
+    _density_forward(encoded.numpy(), _flat(weights[:2]), out.numpy(), thread_count())
+    return out

@@ -1,0 +1,6 @@
+"""Where the photos were taken from: structure from motion with pycolmap, in a process of its own.
+
+`structure_from_motion` is the entrance. `photos` judges the folder and `pairs` says which photos to compare.
+`supervise` runs the child process `worker` on a `job`, through `features` and `mapping`; `reasons` says why a photo
+found no place.
+"""

@@ -1,0 +1,116 @@
+"""The photos of a folder: which can be read, how large they are upright, and which share a camera."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.media.images import IMAGE_SUFFIXES, Exif, list_images, read_exif, read_image
+
+# Three views fix a scene up to scale, but nothing then checks any of them; four are the least that do.
+MIN_PHOTOS = 4
+
+# Decoded photos are large; more readers than this only hold more of them in memory at once.
+_READERS = 4
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo that was decoded from beginning to end. width and height are those of the upright picture."""
+
+    name: str
+    width: int
+    height: int
+    exif: Exif
+
+
+@dataclass(frozen=True)
+class Photos:
+    """The photos of a folder, sorted by name, and why each of the others could not be read (by name)."""
+
+    folder: Path
+    photos: tuple[Photo, ...]
+    unreadable: dict[str, str]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The readable photos' names, sorted."""
+        return tuple(photo.name for photo in self.photos)
+
+
+def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None) -> Photos:
+    """Read every photo of `folder` once, so that a damaged one is found here and not by a solver an hour later.
+
+    Args:
+        folder: a folder with photos; its sub-folders are not searched.
+        progress: told (photos read, photos in all) after each photo.
+
+    Raises:
+        UserError: no such folder, a file instead of a folder, no photos in it, or fewer than `MIN_PHOTOS` readable.
+    """
+    if not folder.exists():
+        raise UserError(f"there is no folder {folder}", "give the folder that holds the photos")
+    if not folder.is_dir():
+        raise UserError(f"{folder} is a file, not a folder", "put the photos into a folder and give that folder")
+    paths = list_images(folder)
+    if not paths:
+        raise UserError(f"no photos in {folder}", _where_photos_may_be(folder))
+    photos: list[Photo] = []
+    unreadable: dict[str, str] = {}
+    with ThreadPoolExecutor(_READERS) as readers:
+        for index, found in enumerate(readers.map(_examine, paths)):
+            if isinstance(found, Photo):
+                photos.append(found)
+            else:
+                unreadable[paths[index].name] = found
+            if progress:
+                progress(index + 1, len(paths))
+    if len(photos) < MIN_PHOTOS:
+        raise UserError(_too_few(folder, photos, unreadable), _more_photos_hint(unreadable), TOO_FEW_PHOTOS)
+    return Photos(folder=folder, photos=tuple(photos), unreadable=unreadable)
+
+
+def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
+    """Names of photos that may share intrinsics: same make, model, lens, focal length and upright size.
+
+    Photos without EXIF are told apart by their size alone. Groups and the names in them are in the order of `photos`.
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for photo in photos:
+        exif = photo.exif
+        # The 35 mm equivalent also tells digital zoom, which leaves the focal length in millimetres as it is.
+        optics = (exif.make, exif.model, exif.lens, exif.focal_mm, exif.focal_35mm)
+        groups.setdefault((*optics, photo.width, photo.height), []).append(photo.name)
+    return tuple(tuple(names) for names in groups.values())
+
+
+def _examine(path: Path) -> Photo | str:
+    """The photo, or why it cannot be read."""
+    try:
+        height, width = read_image(path).shape[:2]
+        return Photo(name=path.name, width=width, height=height, exif=read_exif(path))
+    except UserError as error:
+        return error.message.replace(str(path), "").removeprefix(" is ").strip(" :")
+
+
+def _too_few(folder: Path, photos: list[Photo], unreadable: dict[str, str]) -> str:
+    total = len(photos) + len(unreadable)
+    if not unreadable:
+        return f"only {total} photo{'s' if total > 1 else ''} in {folder}, at least {MIN_PHOTOS} are needed"
+    name, reason = next(iter(unreadable.items()))
+    readable = f"only {len(photos)} of {total} photos in {folder} can be read, at least {MIN_PHOTOS} are needed"
+    return f"{readable} ({name}: {reason})"
+
+
+def _more_photos_hint(unreadable: dict[str, str]) -> str:
+    if unreadable:
+        return "copy the damaged files again, or add photos; 20 or more that overlap by two thirds work well"
+    return "add photos from other viewpoints; 20 or more that overlap by two thirds work well"
+
+
+def _where_photos_may_be(folder: Path) -> str:
+    for child in sorted(folder.iterdir()):
+        if child.is_dir() and list_images(child):
+            return f"there are photos in {child}: give that folder"
+    return f"expected files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"

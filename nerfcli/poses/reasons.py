@@ -1,0 +1,57 @@
+"""Why a photo has no place in the model: the evidence that the feature database holds, put into words."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+# Below this a photo is blank for our purposes: pycolmap's mapper asks for 100 common points to begin with.
+FEW_FEATURES = 100
+# pycolmap's mapper places a photo only with this many of its points known (abs_pose_min_num_inliers).
+FEW_MATCHES = 30
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of one photo that was not registered.
+
+    features: keypoints found in it. best_matches: the most geometrically verified matches with any one photo,
+    best_partner: that photo's name. other_model_size: photos in the other model that holds it, 0 if none does.
+    """
+
+    features: int
+    best_matches: int
+    best_partner: str | None
+    other_model_size: int
+
+
+def reason(evidence: Evidence) -> str:
+    """One phrase: the first of the conditions that by itself explains that the photo was left out."""
+    if evidence.other_model_size:
+        return f"in another model of {evidence.other_model_size} photos"
+    if evidence.features < FEW_FEATURES:
+        return f"too few features ({evidence.features})"
+    if evidence.best_matches < FEW_MATCHES:
+        return f"matches no other photo well (best {evidence.best_matches} verified matches)"
+    return f"rejected by the mapper ({evidence.best_matches} verified matches with {evidence.best_partner})"
+
+
+_ADVICE = {
+    "unreadable": "copy the damaged files again",
+    "too few features": "take sharper photos of a textured scene",
+    "matches no other photo well": "take photos with more overlap, two thirds from one to the next",
+    "in another model": "take photos that join the parts of the scene",
+    "rejected by the mapper": "take photos with more overlap and while moving sideways, or allow more features",
+}
+
+
+def dominant(reasons: Iterable[str]) -> tuple[str, str]:
+    """The kind of reason that most photos share, and what to do about it.
+
+    Raises:
+        ValueError: no reason, or none that this module or `photos` gave.
+    """
+    kinds = Counter(kind for text in reasons for kind in _ADVICE if text.startswith(kind))
+    if not kinds:
+        raise ValueError("no reasons to choose from")
+    kind = kinds.most_common(1)[0][0]
+    return kind, _ADVICE[kind]

@@ -1,0 +1,308 @@
+"""Lens models against closed forms and OpenCV, the domain in which they can be inverted, and turning with the photo."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.orientation import fit_to_picture, turned
+from nerfcli.errors import UserError
+
+WIDTH, HEIGHT = 100, 80
+BARREL = (-0.35, 0.15, 0.001, -0.002)  # k1, k2, p1, p2: the corners of a wide lens
+
+PARAMS = {
+    "SIMPLE_PINHOLE": (80, 51, 39),
+    "PINHOLE": (80, 79, 51, 39),
+    "SIMPLE_RADIAL": (80, 51, 39, -0.25),
+    "RADIAL": (80, 51, 39, -0.35, 0.15),
+    "OPENCV": (80, 79, 51, 39, *BARREL),
+    "OPENCV_FISHEYE": (45, 44, 51, 39, 0.02, -0.01, 0.003, -0.001),
+    "FULL_OPENCV": (80, 79, 51, 39, *BARREL, 0.02, 0.01, -0.02, 0.003),
+    "SIMPLE_RADIAL_FISHEYE": (45, 51, 39, 0.02),
+    "RADIAL_FISHEYE": (45, 51, 39, 0.02, -0.01),
+    "FOV": (80, 79, 51, 39, 0.6),
+    "THIN_PRISM_FISHEYE": (45, 44, 51, 39, 0.02, -0.01, 0.001, 0.002, 0.003, -0.001, 0.001, 0.003),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        *(50, 50, 51, 39, 0.02, -0.01, 0.01, 0.001, 0.002, 0.001),
+        *(0.001, 0.003, 0.001, 0.002, 0.003, 0.004),
+    ),
+    "SIMPLE_DIVISION": (80, 51, 39, -0.2),
+    "DIVISION": (80, 79, 51, 39, -0.2),
+    "SIMPLE_FISHEYE": (45, 51, 39),
+    "FISHEYE": (45, 44, 51, 39),
+    "EUCM": (45, 44, 51, 39, 0.5, 1.0),
+    "EQUIRECTANGULAR": (100, 80),
+}
+WITH_FOCAL = [model for model in PARAMS if model != "EQUIRECTANGULAR"]
+
+
+def camera_of(model: str) -> Camera:
+    return Camera(model, WIDTH, HEIGHT, PARAMS[model])
+
+
+def pixel_grid(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
+
+
+def directions_within(angle_rad: float, *, count: int = 400, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    angle, azimuth = rng.uniform(0, angle_rad, count), rng.uniform(0, 2 * np.pi, count)
+    return np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], axis=-1)
+
+
+@pytest.mark.parametrize("model", PARAMS)
+def test_projecting_the_bearing_of_a_pixel_gives_the_pixel(model):
+    camera = camera_of(model)
+    directions, valid = camera.pixel_bearings()
+    pixels, in_front = camera.project(directions[valid])
+    assert valid.mean() > 0.95
+    assert in_front.all()
+    np.testing.assert_allclose(pixels, pixel_grid()[valid], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, rtol=0, atol=1e-15)
+
+
+def test_a_large_picture_is_as_exact_as_a_small_one():
+    """COLMAP's own undistortion stops at 1e-7 px here."""
+    camera = Camera("OPENCV", 2000, 1600, (1600, 1580, 1020, 780, *BARREL))
+    pixels = pixel_grid(2000, 1600)[::101]
+    directions, valid = camera.bearings(pixels)
+    assert valid.all()
+    np.testing.assert_allclose(camera.project(directions)[0], pixels, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", PARAMS)
+def test_every_direction_in_the_picture_is_found_again(model):
+    camera = camera_of(model)
+    directions = directions_within(np.radians(89))
+    pixels, valid = camera.project(directions)
+    seen = valid & (pixels >= 0).all(axis=1) & (pixels <= (WIDTH, HEIGHT)).all(axis=1)
+    found, found_valid = camera.bearings(pixels[seen])
+    assert seen.sum() > 50
+    assert found_valid.all()
+    np.testing.assert_allclose(found, directions[seen], rtol=0, atol=1e-9)
+
+
+def test_pinhole_bearing_by_hand():
+    camera = Camera("PINHOLE", 4, 2, (2.0, 4.0, 2.0, 1.0))
+    directions, valid = camera.bearings(np.array([[2.0, 1.0], [4.0, 1.0], [2.0, 5.0], [0.0, -3.0]]))
+    assert valid.all()
+    np.testing.assert_allclose(directions / directions[:, 2:], [[0, 0, 1], [1, 0, 1], [0, 1, 1], [-1, -1, 1]])
+    middle, _ = Camera("SIMPLE_PINHOLE", 3, 3, (5.0, 1.5, 1.5)).bearings(np.array([[1.5, 1.5]]))
+    np.testing.assert_array_equal(middle, [[0, 0, 1]])
+
+
+def test_pixel_bearings_go_row_by_row_through_pixel_centres():
+    camera = camera_of("OPENCV")
+    directions, valid = camera.pixel_bearings()
+    expected, expected_valid = camera.bearings(pixel_grid())
+    np.testing.assert_array_equal(directions, expected)
+    np.testing.assert_array_equal(valid, expected_valid)
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"])
+def test_perspective_models_agree_with_opencv(model):
+    camera = camera_of(model)
+    values = dict(zip(parameter_names(model), camera.params, strict=True))
+    focal = values.get("f")
+    matrix = np.array(
+        [[values.get("fx", focal), 0, values["cx"]], [0, values.get("fy", focal), values["cy"]], [0, 0, 1]]
+    )
+    names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    distortion = np.array([values.get(name, values.get("k", 0.0) if name == "k1" else 0.0) for name in names])
+    points = directions_within(np.radians(40)) * np.random.default_rng(1).uniform(0.1, 100, (400, 1))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
+    pixels, valid = camera.project(points)
+    assert valid.all()
+    np.testing.assert_allclose(pixels, np.reshape(expected, (-1, 2)), rtol=0, atol=1e-10)
+
+
+def test_opencv_fisheye_agrees_with_opencv():
+    camera = camera_of("OPENCV_FISHEYE")
+    fx, fy, cx, cy, *distortion = camera.params
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    points = directions_within(np.radians(80))
+    expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(distortion))
+    pixels, valid = camera.project(points)
+    assert valid.all()
+    np.testing.assert_allclose(pixels, np.reshape(expected, (-1, 2)), rtol=0, atol=1e-10)
+
+
+@given(k=st.integers(-600, 600).map(lambda thousandth: thousandth / 1000), radius=st.floats(0.01, 1.5))
+@settings(max_examples=60, deadline=None)
+def test_simple_radial_bearing_is_the_smallest_root_of_its_cubic_or_invalid(k, radius):
+    """r (1 + k r^2) = radius: closed form through the roots of the cubic, at any strength of the distortion."""
+    camera = Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, (100.0, 50.0, 40.0, k))
+    directions, valid = camera.bearings(np.array([[50 + 100 * radius, 40.0]]))
+    roots = np.roots([k, 0.0, 1.0, -radius]) if k else np.array([radius])
+    real = np.sort(np.real(roots[np.abs(np.imag(roots)) < 1e-9]))
+    real = real[real > 0]
+    turn = np.sqrt(-1 / (3 * k)) if k < 0 else np.inf
+    inside = real[real < turn * (1 - 1e-3)]
+    if len(inside):
+        assert valid[0]
+        np.testing.assert_allclose(directions[0, 0] / directions[0, 2], inside[0], rtol=1e-8)
+    elif not (len(real) and real[0] < turn * (1 + 1e-3)):  # within a thousandth of the turn either answer will do
+        assert not valid[0]
+        np.testing.assert_array_equal(directions[0], [0, 0, 1])
+
+
+def test_barrel_distortion_ends_where_its_polynomial_turns():
+    """k1 = -0.35: r (1 + k1 r^2) is largest at r = (3 * 0.35)^-1/2, where it is 2/3 of r; no pixel lies beyond."""
+    camera = Camera("SIMPLE_RADIAL", 1000, 800, (800.0, 500.0, 400.0, -0.35))
+    largest_px = 800 * 2 / 3 / np.sqrt(3 * 0.35)
+    radius = np.linalg.norm(pixel_grid(1000, 800)[::97] - (500, 400), axis=1)
+    directions, valid = camera.bearings(pixel_grid(1000, 800)[::97])
+    assert np.isfinite(directions).all()
+    np.testing.assert_array_equal(
+        valid[np.abs(radius - largest_px) > 0.01], (radius < largest_px)[np.abs(radius - largest_px) > 0.01]
+    )
+    assert 0 < (~valid).mean() < 0.2
+
+
+def test_an_outer_root_is_not_taken_for_the_direction():
+    """k1 = -0.35, k2 = 0.05 turns at r = 1.21 and grows again from r = 1.66: a root out there is no direction."""
+    camera = Camera("RADIAL", 1000, 800, (300.0, 500.0, 400.0, -0.35, 0.05))
+    roots = np.sort(np.roots([5 * 0.05, 0, -3 * 0.35, 0, 1]).real)
+    turn = roots[roots > 0][0]
+    largest_px = 300 * turn * (1 - 0.35 * turn**2 + 0.05 * turn**4)
+    pixels = pixel_grid(1000, 800)[::97]
+    radius = np.linalg.norm(pixels - (500, 400), axis=1)
+    directions, valid = camera.bearings(pixels)
+    np.testing.assert_array_equal(
+        valid[np.abs(radius - largest_px) > 0.01], (radius < largest_px)[np.abs(radius - largest_px) > 0.01]
+    )
+    beyond = np.array([[1.9, 0.0, 1.0]])  # its pixel lies inside the picture, but an inner direction owns it
+    assert not camera.project(beyond)[1][0]
+    assert (np.hypot(*directions[valid, :2].T) / directions[valid, 2]).max() <= turn
+
+
+@pytest.mark.parametrize("model", PARAMS)
+def test_answers_are_finite_whatever_is_asked(model):
+    camera = camera_of(model)
+    pixels = np.array([[np.nan, 1], [np.inf, 1], [1e12, -1e12], [0, 0], [WIDTH, HEIGHT]])
+    directions, valid = camera.bearings(pixels)
+    assert np.isfinite(directions).all()
+    assert not valid[:2].any()
+    points = np.array([[0, 0, 0], [0, 0, -1], [1, 0, 0], [np.nan, 0, 1], [1e-200, 0, 1e-200], [1e150, 0, 1e150]])
+    pixels, valid = camera.project(points)
+    assert np.isfinite(pixels).all()
+    assert not valid[[0, 3]].any()
+    assert camera.bearings(np.zeros((0, 2)))[0].shape == (0, 3)
+    assert camera.project(np.zeros((0, 3)))[0].shape == (0, 2)
+
+
+@pytest.mark.parametrize("model", WITH_FOCAL)
+def test_what_is_behind_the_camera_is_not_seen(model):
+    assert not camera_of(model).project(np.array([[0.1, 0.1, -1.0], [0, 0, -1.0]]))[1].any()
+
+
+@pytest.mark.parametrize("model", PARAMS)
+def test_a_resized_camera_sees_the_same_in_scaled_pixels(model):
+    camera = camera_of(model)
+    half = camera.resized(50, 40)
+    directions, valid = camera.bearings(pixel_grid())
+    halved, halved_valid = half.bearings(pixel_grid() / 2)
+    assert (half.width, half.height) == (50, 40)
+    np.testing.assert_array_equal(halved_valid, valid)
+    np.testing.assert_allclose(halved, directions, rtol=0, atol=1e-9)
+    assert half.resized(WIDTH, HEIGHT).params == pytest.approx(camera.params)
+
+
+def test_resizing_allows_for_rounding_and_refuses_another_shape():
+    camera = Camera.pinhole(1081, 1920, 1000.0)
+    assert camera.resized(1081, 1920) is camera
+    eighth = camera.resized(135, 240)
+    np.testing.assert_allclose(eighth.params, (1000 * 135 / 1081, 125, 67.5, 120))
+    with pytest.raises(UserError, match="1920x1081 pixels does not fit a camera of 1081x1920"):
+        camera.resized(1920, 1081)
+    with pytest.raises(UserError, match="500x500 pixels"):
+        camera.resized(500, 500)
+
+
+def test_field_of_view_and_focal_length_by_hand():
+    camera = Camera.pinhole(200, 100, 100.0)
+    np.testing.assert_allclose(camera.fov_deg, (90.0, np.degrees(2 * np.arctan(0.5))))
+    assert camera.focal_px == 100
+    assert camera.principal_point == (100, 50)
+    fisheye = Camera("SIMPLE_FISHEYE", 200, 100, (100.0, 100.0, 50.0))  # radius = f * angle
+    np.testing.assert_allclose(fisheye.fov_deg, np.degrees((2.0, 1.0)))
+    assert Camera("PINHOLE", 10, 10, (90.0, 110.0, 5.0, 5.0)).focal_px == 100
+    sphere = camera_of("EQUIRECTANGULAR")
+    assert sphere.fov_deg == (360, 180)
+    assert sphere.focal_px == pytest.approx(100 / (2 * np.pi))
+    assert sphere.undistorted().model == "PINHOLE"
+
+
+def test_a_camera_survives_json_and_is_a_key():
+    for model in PARAMS:
+        camera = camera_of(model)
+        back = Camera.from_json(json.loads(json.dumps(camera.to_json())))
+        assert back == camera
+        assert hash(back) == hash(camera)
+
+
+@pytest.mark.parametrize(
+    ("model", "size", "params", "what"),
+    [
+        ("PINHOL", (4, 4), (1, 1, 1, 1), "unknown camera model 'PINHOL'"),
+        ("INVALID", (4, 4), (), "unknown camera model"),
+        ("PINHOLE", (4, 4), (1, 1, 1), "PINHOLE has 4 parameters, got 3"),
+        ("PINHOLE", (0, 4), (1, 1, 1, 1), "0x4 pixels"),
+        ("PINHOLE", (4, 4), (1, -1, 1, 1), "make no camera"),
+        ("SIMPLE_PINHOLE", (4, 4), (float("nan"), 1, 1), "make no camera"),
+    ],
+)
+def test_what_is_no_camera_is_refused(model, size, params, what):
+    with pytest.raises(UserError, match=what):
+        Camera(model, size[0], size[1], params)
+
+
+def test_json_that_is_no_camera_is_refused():
+    with pytest.raises(UserError, match="not a camera: KeyError: 'params'"):
+        Camera.from_json({"model": "PINHOLE", "width": 3, "height": 3})
+
+
+def upright_pixels(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Where the pixels of a stored WIDTH x HEIGHT picture are once it is shown as its EXIF orientation says."""
+    u, v = pixels.T
+    return {3: np.stack([WIDTH - u, HEIGHT - v], 1), 6: np.stack([HEIGHT - v, u], 1), 8: np.stack([v, WIDTH - u], 1)}[
+        orientation
+    ]
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("model", WITH_FOCAL)
+def test_a_turned_camera_sees_the_world_in_the_upright_picture(model, orientation):
+    stored = camera_of(model)
+    world_from_stored = rigid.look_at(np.array([1.0, 2, 3]), np.zeros(3), np.array([0, 0, 1.0]))
+    upright, world_from_upright = turned(stored, world_from_stored, orientation=orientation)
+    assert (upright.width, upright.height) == ((WIDTH, HEIGHT) if orientation == 3 else (HEIGHT, WIDTH))
+    in_world = rigid.apply(world_from_stored, directions_within(np.radians(35)))
+    before, _ = stored.project(rigid.apply(rigid.inverse(world_from_stored), in_world))
+    after, valid = upright.project(rigid.apply(rigid.inverse(world_from_upright), in_world))
+    assert valid.all()
+    np.testing.assert_allclose(after, upright_pixels(before, orientation), rtol=0, atol=1e-9)
+
+
+def test_a_calibration_is_fitted_to_the_picture_on_disk(tmp_path):
+    camera, pose, path = camera_of("PINHOLE"), np.eye(4), tmp_path / "a.jpg"
+    # Stored lying, shown upright; the calibration is for the stored pixels, or already for the upright ones.
+    for calibrated in (camera, turned(camera, pose, orientation=6)[0]):
+        fitted, _ = fit_to_picture(calibrated, pose, path=path, measure=lambda _: (40, 50, 6))
+        assert (fitted.width, fitted.height) == (40, 50)
+        np.testing.assert_allclose(fitted.params, (39.5, 40, 20.5, 25.5))
+    untouched, same = fit_to_picture(camera, pose, path=path, measure=lambda _: (100, 80, 1))
+    assert untouched is camera
+    assert same is pose
+    with pytest.raises(UserError, match=r"a\.jpg: a picture of 90x90 pixels does not fit a camera of 100x80"):
+        fit_to_picture(camera, pose, path=path, measure=lambda _: (90, 90, 1))
+    with pytest.raises(UserError, match="orientation 5 mirrors"):
+        fit_to_picture(camera, pose, path=path, measure=lambda _: (80, 100, 5))
+    with pytest.raises(UserError, match="spherical picture"):
+        turned(camera_of("EQUIRECTANGULAR"), pose, orientation=6)

@@ -1,0 +1,395 @@
+"""Readers of captures against files made by hand and, for COLMAP, by pycolmap; and what they say of damaged files."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.colmap import is_model, read_colmap, read_model
+from nerfcli.cameras.conventions import (
+    opencv_from_llff_pose,
+    opencv_from_opengl_pose,
+    opengl_from_opencv_pose,
+)
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.llff import read_llff
+from nerfcli.cameras.transforms import read_blender, read_camera_path, read_transforms, write_transforms
+from nerfcli.errors import BAD_INPUT, UserError
+
+# A camera at (1, 2, 3) that looks along -x with +z up. OpenGL axes: right +y, up +z, backward +x, as columns.
+OPENGL_POSE = [[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+# OpenCV axes: right +y, down -z, forward -x.
+OPENCV_POSE = [[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, -1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+# LLFF axes: down -z, right +y, backward +x.
+LLFF_POSE = [[0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+
+SHARED = {"fl_x": 50.0, "fl_y": 51.0, "cx": 33.0, "cy": 23.0, "w": 64.0, "h": 48}
+
+
+def measure(_: Path) -> tuple[int, int, int]:
+    """Stands for media: every image is 64 x 48 and upright."""
+    return 64, 48, 1
+
+
+def list_files(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir())
+
+
+def touch(folder: Path, *names: str) -> None:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"")
+
+
+def write_capture(folder: Path, content: dict[str, Any], *, name: str = "transforms.json") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / name
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def entry(file_path: str, **more: Any) -> dict[str, Any]:
+    return {"file_path": file_path, "transform_matrix": OPENGL_POSE, **more}
+
+
+def test_axes_of_other_programs_by_hand():
+    np.testing.assert_array_equal(opencv_from_opengl_pose(np.array(OPENGL_POSE)), OPENCV_POSE)
+    np.testing.assert_array_equal(opengl_from_opencv_pose(np.array(OPENCV_POSE)), OPENGL_POSE)
+    np.testing.assert_array_equal(opencv_from_llff_pose(np.array(LLFF_POSE)), OPENCV_POSE)
+
+
+def test_instant_ngp_file_with_shared_intrinsics_and_missing_images(tmp_path):
+    names = ["./images/a b.jpg", "images\\ü.jpg", "images/gone.jpg", "images/no_suffix"]
+    touch(tmp_path, "images/a b.jpg", "images/ü.jpg", "images/no_suffix.png")
+    content = {**SHARED, "k1": 0.1, "k2": -0.05, "p1": 0.001, "p2": 0.002, "aabb_scale": 4, "scale": 0.33}
+    path = write_capture(tmp_path, {**content, "frames": [entry(name, sharpness=3.0) for name in names]})
+    capture = read_transforms(path, measure)
+    assert capture.kind == "transforms"
+    assert [frame.name for frame in capture.frames] == ["images/a b.jpg", "images/ü.jpg", "images/no_suffix.png"]
+    assert all(frame.image is not None and frame.image.is_file() for frame in capture.frames)
+    assert capture.missing == ("images/gone.jpg",)
+    first = capture.frames[0]
+    assert first.camera == Camera("OPENCV", 64, 48, (50, 51, 33, 23, 0.1, -0.05, 0.001, 0.002))
+    np.testing.assert_allclose(first.world_from_cam, OPENCV_POSE, rtol=0, atol=1e-15)
+    assert capture.points.shape == (0, 3)
+
+
+def test_nerfstudio_file_with_intrinsics_and_masks_per_frame(tmp_path):
+    touch(tmp_path, "a.png", "b.png", "masks/a.png")
+    fisheye = {**SHARED, "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4, "camera_model": "OPENCV_FISHEYE"}
+    frames = [entry("a.png", mask_path="masks/a.png", **fisheye), entry("b.png", **SHARED, k3=0.3)]
+    path = write_capture(tmp_path, {"frames": frames, "train_filenames": ["a.png"], "test_filenames": ["./b.png"]})
+    first, second = read_transforms(path, measure).frames
+    assert first.camera == Camera("OPENCV_FISHEYE", 64, 48, (50, 51, 33, 23, 0.1, 0.2, 0.3, 0.4))
+    assert second.camera == Camera("FULL_OPENCV", 64, 48, (50, 51, 33, 23, 0, 0, 0, 0, 0.3, 0, 0, 0))
+    assert (first.mask, second.mask) == (tmp_path / "masks/a.png", None)
+    assert (first.split, second.split) == ("train", "test")
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "params"),
+    [
+        ({"camera_angle_x": 2 * np.arctan(0.5)}, (64, 64, 32, 24)),  # square pixels, size and centre of the image
+        ({"camera_angle_x": 2 * np.arctan(0.5), "camera_angle_y": 2 * np.arctan(0.25)}, (64, 96, 32, 24)),
+        ({"fl_y": 50.0}, (50, 50, 32, 24)),
+        ({"fl_x": 100.0, "w": 128, "h": 96}, (50, 50, 32, 24)),  # for twice the size that is on disk
+        ({"fl_x": 100.0, "cx": 60.0, "cy": 50.0, "w": 128, "h": 96}, (50, 50, 30, 25)),
+    ],
+)
+def test_focal_length_from_what_the_file_gives(tmp_path, intrinsics, params):
+    touch(tmp_path, "a.png")
+    path = write_capture(tmp_path, {**intrinsics, "frames": [entry("a.png")]})
+    camera = read_transforms(path, measure).frames[0].camera
+    assert (camera.model, camera.width, camera.height) == ("PINHOLE", 64, 48)
+    np.testing.assert_allclose(camera.params, params, rtol=1e-14)
+
+
+def test_rounded_poses_become_exactly_rigid(tmp_path):
+    touch(tmp_path, "a.png")
+    rounded = rigid.look_at(np.array([1.0, 2, 3]), np.zeros(3), np.array([0, 0, 1.0])).round(4)
+    path = write_capture(tmp_path, {**SHARED, "frames": [{"file_path": "a", "transform_matrix": rounded[:3].tolist()}]})
+    pose = read_transforms(path, measure).frames[0].world_from_cam
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(opengl_from_opencv_pose(pose), rounded, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"frames": []}, "has no list of frames"),
+        ({"frames": [3]}, "has no list of frames"),
+        ({"frames": [{"file_path": "a.png"}]}, r"frames\[0\]: transform_matrix is missing"),
+        ({"frames": [entry("a.png", transform_matrix=[[1, 0], [0, 1]])]}, r"shape \(2, 2\)"),
+        ({"frames": [entry("a.png", transform_matrix="no")]}, "no matrix"),
+        ({"frames": [entry("a.png", transform_matrix=(2 * np.eye(4)).tolist())]}, "is no rotation"),
+        ({"frames": [entry("a.png", transform_matrix=np.diag([1, 1, -1, 1]).tolist())]}, "mirrors the scene"),
+        ({"frames": [entry("a.png", transform_matrix=np.full((4, 4), np.nan).tolist())]}, "not finite"),
+        ({"frames": [entry("a.png"), {"transform_matrix": OPENGL_POSE}]}, r"frames\[1\]: file_path is None"),
+        ({"frames": [entry("a.png"), entry("./a.png")]}, "a.png is listed twice"),
+        ({"frames": [entry("x.png"), entry("y.png")]}, "none of the 2 images .* such as x.png"),
+        ({"frames": [entry("a.png", mask_path="m.png")]}, "mask m.png is not on disk"),
+        ({"fl_x": "wide"}, "fl_x is 'wide'"),
+        ({"fl_x": -3}, "fl_x is -3.0"),
+        ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
+        ({"fl_x": None, "camera_angle_x": 4.0}, "camera_angle_x is 4.0"),
+        ({"w": 63.5}, "w and h are 63.5"),
+        ({"w": 48, "h": 64}, "64x48 pixels does not fit a camera of 48x64"),
+        ({"camera_model": "PENTAGON"}, "camera_model 'PENTAGON' is not supported"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "fisheye camera with p1 or p2"),
+        ({"k4": 0.1}, "k4 is 0.1 without a fisheye"),
+        ({"test_filenames": "a.png"}, "test_filenames is no list"),
+    ],
+)
+def test_malformed_transforms_are_refused_with_file_and_field(tmp_path, change, what):
+    touch(tmp_path, "a.png")
+    path = write_capture(tmp_path, {**SHARED, "frames": [entry("a.png")], **change})
+    with pytest.raises(UserError, match=what) as caught:
+        read_transforms(path, measure)
+    assert caught.value.exit_code == BAD_INPUT
+    assert str(tmp_path) in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        (b'{"frames": [', "not valid JSON: Expecting value in line 1"),
+        (b"", "not valid JSON"),
+        (b"[1, 2]", "holds a list"),
+        (b"\xff\xfe\x00", "not UTF-8"),
+    ],
+)
+def test_what_is_no_json_object_is_refused(tmp_path, data, what):
+    path = tmp_path / "transforms.json"
+    path.write_bytes(data)
+    with pytest.raises(UserError, match=what):
+        read_transforms(path, measure)
+    with pytest.raises(UserError, match="No such file"):
+        read_transforms(tmp_path / "none.json", measure)
+
+
+def test_blender_splits_are_kept_and_val_is_left_out(tmp_path):
+    touch(tmp_path, "train/r_0.png", "train/r_1.png", "test/r_0.png", "val/r_0.png")
+    angle = {"camera_angle_x": 2 * np.arctan(0.5)}
+    write_capture(
+        tmp_path, {**angle, "frames": [entry("./train/r_0"), entry("./train/r_1")]}, name="transforms_train.json"
+    )
+    write_capture(
+        tmp_path, {**angle, "frames": [entry("./test/r_0"), entry("./test/r_1")]}, name="transforms_test.json"
+    )
+    write_capture(tmp_path, {**angle, "frames": [entry("./val/r_0")]}, name="transforms_val.json")
+    capture = read_blender(tmp_path, measure)
+    assert [(frame.name, frame.split) for frame in capture.frames] == [
+        ("train/r_0.png", "train"),
+        ("train/r_1.png", "train"),
+        ("test/r_0.png", "test"),
+    ]
+    assert capture.missing == ("test/r_1",)
+    assert capture.kind == "blender"
+
+
+WRITABLE = {
+    "PINHOLE": (50, 51, 33, 23),
+    "SIMPLE_RADIAL": (50, 33, 23, 0.1),
+    "RADIAL": (50, 33, 23, 0.1, -0.05),
+    "OPENCV": (50, 51, 33, 23, 0.1, -0.05, 0.001, 0.002),
+    "FULL_OPENCV": (50, 51, 33, 23, 0.1, -0.05, 0.001, 0.002, 0.01, 0, 0, 0),
+    "OPENCV_FISHEYE": (50, 51, 33, 23, 0.1, -0.05, 0.01, 0.02),
+    "SIMPLE_FISHEYE": (50, 33, 23),
+    "RADIAL_FISHEYE": (50, 33, 23, 0.1, -0.05),
+}
+
+
+@pytest.mark.parametrize("model", WRITABLE)
+def test_written_cameras_are_read_back(tmp_path, model):
+    rng = np.random.default_rng(0)
+    cameras = [Camera(model, 64, 48, WRITABLE[model]), Camera.pinhole(32, 32, 40.0)]
+    poses = [rigid.look_at(rng.normal(size=3), rng.normal(size=3), rng.normal(size=3)) for _ in range(4)]
+    for chosen in (cameras[:1] * 4, cameras * 2):  # shared intrinsics and intrinsics per frame
+        frames = [Frame(f"view_{i}", camera, pose) for i, (camera, pose) in enumerate(zip(chosen, poses, strict=True))]
+        write_transforms(tmp_path / "path.json", frames)
+        back = read_camera_path(tmp_path / "path.json")
+        assert [frame.name for frame in back] == [frame.name for frame in frames]
+        for frame, again in zip(frames, back, strict=True):
+            np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
+            directions, valid = frame.camera.pixel_bearings()
+            directions_again, valid_again = again.camera.pixel_bearings()
+            np.testing.assert_array_equal(valid_again, valid)
+            np.testing.assert_allclose(directions_again, directions, rtol=0, atol=1e-12)
+
+
+def test_a_model_without_words_in_transforms_is_refused(tmp_path):
+    for model, params in (
+        ("FOV", (50, 50, 32, 24, 0.5)),
+        ("FULL_OPENCV", (50, 51, 33, 23, 0.1, 0, 0, 0, 0, 0, 0, 0.1)),
+    ):
+        with pytest.raises(UserError, match=f"{model} cannot be written"):
+            write_transforms(tmp_path / "path.json", [Frame("a", Camera(model, 64, 48, params), np.eye(4))])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_camera_path_needs_the_size_of_its_pictures(tmp_path):
+    path = write_capture(tmp_path, {"fl_x": 50, "frames": [entry("a")]})
+    with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing"):
+        read_camera_path(path)
+
+
+def llff_rows(count: int) -> np.ndarray:
+    """Full size 256 x 192 with focal length 200; the centre of camera i is (1, 2, 3 + i)."""
+    rows = []
+    for index in range(count):
+        pose = np.array(LLFF_POSE)[:3]
+        pose[2, 3] += index
+        rows.append(np.concatenate([np.column_stack([pose, [192.0, 256.0, 200.0]]).ravel(), [1.5, 20.0 + index]]))
+    return np.array(rows)
+
+
+def test_llff_by_hand(tmp_path):
+    np.save(tmp_path / "poses_bounds.npy", llff_rows(2))
+    # images/ holds another number of photos than there are poses, images_4/ the right one, at a quarter of the size.
+    touch(tmp_path, "images/1.jpg", "images_4/b.png", "images_4/a.png")
+    capture = read_llff(tmp_path, measure, list_files)
+    assert [frame.name for frame in capture.frames] == ["images_4/a.png", "images_4/b.png"]
+    assert capture.frames[0].camera == Camera("PINHOLE", 64, 48, (50, 50, 32, 24))
+    np.testing.assert_allclose(capture.frames[0].world_from_cam, OPENCV_POSE, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(capture.frames[1].centre, [1, 2, 4])
+    np.testing.assert_array_equal(capture.depth_bounds, [[1.5, 20], [1.5, 21]])
+    assert capture.kind == "llff"
+    touch(tmp_path, "images/2.jpg")
+    assert read_llff(tmp_path, measure, list_files).frames[0].name == "images/1.jpg"
+
+
+def test_malformed_llff_is_refused(tmp_path):
+    path = tmp_path / "poses_bounds.npy"
+    np.save(path, llff_rows(3))
+    with pytest.raises(UserError, match="has 3 rows, but there is no folder images/"):
+        read_llff(tmp_path, measure, list_files)
+    touch(tmp_path, "images/1.jpg", "images_8/1.jpg", "images_8/2.jpg")
+    with pytest.raises(UserError, match="3 rows, but images/ has 1, images_8/ has 2"):
+        read_llff(tmp_path, measure, list_files)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(UserError, match=r"poses_bounds\.npy: no readable NumPy array"):
+        read_llff(tmp_path, measure, list_files)
+    path.write_bytes(b"")
+    with pytest.raises(UserError, match="no readable NumPy array"):
+        read_llff(tmp_path, measure, list_files)
+    np.save(path, llff_rows(3)[:, :15])
+    with pytest.raises(UserError, match=r"an array of \(3, 15\)"):
+        read_llff(tmp_path, measure, list_files)
+    for column, value, what in (
+        (15, 0.0, "depth bounds 0 and 20"),
+        (14, -1.0, "row 0: .* -1"),
+        (3, np.nan, "row 0: .*finite"),
+    ):
+        rows = llff_rows(1)
+        rows[0, column] = value
+        np.save(path, rows)
+        with pytest.raises(UserError, match=what):
+            read_llff(tmp_path, measure, list_files)
+
+
+@pytest.fixture(scope="module")
+def synthetic() -> pycolmap.Reconstruction:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_points3D = 30
+    pycolmap.set_random_seed(0)
+    reconstruction = pycolmap.synthesize_dataset(options)
+    for index, image in enumerate(reconstruction.images.values()):
+        image.name = f"ring {index % 2}/ä {index}.jpg"
+    return reconstruction
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+def test_a_colmap_model_is_read_as_pycolmap_wrote_it(tmp_path, synthetic, suffix):
+    (synthetic.write_binary if suffix == "bin" else synthetic.write_text)(str(tmp_path))
+    assert is_model(tmp_path)
+    model = read_model(tmp_path)
+    expected = {image.name: image for image in synthetic.images.values()}
+    assert [image.name for image in model.images] == sorted(expected)
+    for image in model.images:
+        camera = expected[image.name].camera
+        assert camera is not None
+        assert model.cameras[image.camera_id] == Camera(
+            camera.model.name, camera.width, camera.height, tuple(camera.params)
+        )
+        cam_from_world = np.vstack([expected[image.name].cam_from_world().matrix(), [0, 0, 0, 1]])
+        np.testing.assert_allclose(image.world_from_cam @ cam_from_world, np.eye(4), rtol=0, atol=1e-14)
+    points = np.array([point.xyz for point in synthetic.points3D.values()])
+    np.testing.assert_allclose(np.sort(model.points, axis=0), np.sort(points, axis=0), rtol=0, atol=1e-15)
+
+
+def test_points_of_a_colmap_model_project_onto_their_observations(tmp_path, synthetic):
+    """The whole chain against COLMAP's own: pose, lens and pixel positions, half a pixel included."""
+    synthetic.write_binary(str(tmp_path))
+    model = read_model(tmp_path)
+    by_name = {image.name: image for image in synthetic.images.values()}
+    for image in model.images:
+        observed = [p for p in by_name[image.name].points2D if p.has_point3D()]
+        points = np.array([synthetic.points3D[p.point3D_id].xyz for p in observed])
+        pixels, valid = model.cameras[image.camera_id].project(rigid.apply(rigid.inverse(image.world_from_cam), points))
+        assert valid.all()
+        np.testing.assert_allclose(pixels, np.array([p.xy for p in observed]), rtol=0, atol=1e-6)
+
+
+def test_colmap_images_that_are_not_on_disk_are_missing(tmp_path, synthetic):
+    synthetic.write_binary(str(tmp_path))
+    names = sorted(image.name for image in synthetic.images.values())
+    with pytest.raises(UserError, match=r"none of the 10 images .*, such as ring 0/ä 0\.jpg"):
+        read_colmap(tmp_path, tmp_path / "images", lambda _: (1024, 768, 1))
+    touch(tmp_path / "images", *names[1:])
+    capture = read_colmap(tmp_path, tmp_path / "images", lambda _: (512, 384, 1))
+    assert capture.missing == (names[0],)
+    assert [frame.name for frame in capture.frames] == names[1:]
+    assert capture.frames[0].camera.params == (640, 256, 192, 0.05)
+    assert capture.kind == "colmap"
+    with pytest.raises(UserError, match="500x500 pixels does not fit a camera of 1024x768"):
+        read_colmap(tmp_path, tmp_path / "images", lambda _: (500, 500, 1))
+
+
+@pytest.mark.parametrize(
+    "name", ["cameras.bin", "images.bin", "points3D.bin", "cameras.txt", "images.txt", "points3D.txt"]
+)
+def test_a_damaged_colmap_file_is_named(tmp_path, synthetic, name):
+    """A file that is cut off anywhere never hangs and never passes for whole; pycolmap loops on some of these."""
+    (synthetic.write_binary if name.endswith("bin") else synthetic.write_text)(str(tmp_path))
+    path = tmp_path / name
+    whole = path.read_bytes()
+    if name.endswith("bin"):
+        damaged = [whole[:size] for size in (0, 5, 20, len(whole) // 2, len(whole) - 1)] + [b"garbage " * 100]
+    else:
+        damaged = [b"garbage " * 100, b"\xff\xfe\xfd", b"1 2 3\n"]
+    for data in damaged:
+        path.write_bytes(data)
+        with pytest.raises(UserError, match=name.replace(".", r"\.")):
+            read_model(tmp_path)
+    path.unlink()
+    with pytest.raises(UserError, match=r"No such file|cameras\.txt"):
+        read_model(tmp_path)
+    assert not is_model(tmp_path)
+
+
+def test_colmap_text_by_hand(tmp_path):
+    """Names with spaces, images without points (an empty line), comments and a model without points."""
+    (tmp_path / "cameras.txt").write_text("# cameras\n3 PINHOLE 64 48 50 51 33 23\n")
+    (tmp_path / "images.txt").write_text("# images\n\n1 1 0 0 0 1 2 3 3 b c.jpg\n\n2 0 0 0 1 0 0 0 3 a.jpg\n1 2 -1\n")
+    (tmp_path / "points3D.txt").write_text("# points\n")
+    model = read_model(tmp_path)
+    assert [image.name for image in model.images] == ["a.jpg", "b c.jpg"]
+    np.testing.assert_allclose(model.images[1].world_from_cam[:3, 3], [-1, -2, -3])
+    np.testing.assert_allclose(model.images[0].world_from_cam[:3, :3], np.diag([-1, -1, 1]), rtol=0, atol=1e-15)
+    assert model.points.shape == (0, 3)
+    for text, what in (
+        ("1 1 0 0 0 1 2 3 4 a.jpg\n\n", "image a.jpg has camera 4, which is not there"),
+        ("1 1 0 0 0 1 2 3 3 a.jpg\n\n2 1 0 0 0 1 2 3 3 a.jpg\n\n", "a.jpg is registered twice"),
+        ("1 0 0 0 0 1 2 3 3 a.jpg\n\n", r"images\.txt is damaged: a quaternion"),
+        ("1 1 0 0 0 nan 2 3 3 a.jpg\n\n", "pose of image a.jpg is not 7 finite"),
+        ("# nothing\n", "no registered image"),
+    ):
+        (tmp_path / "images.txt").write_text(text)
+        with pytest.raises(UserError, match=what):
+            read_model(tmp_path)

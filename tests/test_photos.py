@@ -1,0 +1,194 @@
+"""Which photos of a folder can be used, which share a camera, which are compared, and what is said about the rest."""
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
+from nerfcli.media.images import Exif
+from nerfcli.poses.pairs import EXHAUSTIVE_UP_TO, capture_order, choose_pairs, estimated_seconds
+from nerfcli.poses.photos import Photo, camera_groups, find_photos
+from nerfcli.poses.reasons import Evidence, dominant, reason
+
+NO_EXIF = Exif(
+    make=None,
+    model=None,
+    lens=None,
+    focal_mm=None,
+    focal_35mm=None,
+    orientation=1,
+    width=64,
+    height=48,
+    exposure_seconds=None,
+    iso=None,
+    gps=None,
+)
+
+
+def save_photo(path: Path, *, seed: int = 0, size: tuple[int, int] = (64, 48), orientation: int = 1) -> None:
+    """A picture of noise, `size` as stored."""
+    pixels = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(pixels).save(path, quality=90, exif=exif)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Five good photos; b.jpg is stored lying on its side."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for seed, name in enumerate("abcde"):
+        save_photo(folder / f"{name}.jpg", seed=seed, orientation=6 if name == "b" else 1)
+    return folder
+
+
+def test_photos_are_sorted_and_upright(folder: Path):
+    photos = find_photos(folder)
+    assert photos.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg", "e.jpg")
+    assert [(photo.width, photo.height) for photo in photos.photos[:2]] == [(64, 48), (48, 64)]
+    assert photos.unreadable == {}
+
+
+def test_progress_counts_every_file(folder: Path):
+    (folder / "f.jpg").write_text("not a picture")
+    told: list[tuple[int, int]] = []
+    find_photos(folder, lambda done, total: told.append((done, total)))
+    assert told == [(done, 6) for done in range(1, 7)]
+
+
+def test_text_and_truncated_files_are_left_out_with_their_reason(folder: Path):
+    (folder / "note.jpg").write_text("this is text")
+    whole = (folder / "e.jpg").read_bytes()
+    (folder / "e.jpg").write_bytes(whole[: len(whole) // 2])
+    photos = find_photos(folder)
+    assert photos.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg")
+    assert photos.unreadable["note.jpg"] == "not a picture that can be read"
+    assert photos.unreadable["e.jpg"].startswith("damaged or cut short")
+    assert str(folder) not in " ".join(photos.unreadable.values())
+
+
+def test_a_missing_folder_is_bad_input(tmp_path: Path):
+    with pytest.raises(UserError, match=r"there is no folder .*nowhere") as caught:
+        find_photos(tmp_path / "nowhere")
+    assert caught.value.exit_code == BAD_INPUT
+
+
+def test_a_file_is_no_folder(folder: Path):
+    with pytest.raises(UserError, match=r"a\.jpg is a file, not a folder") as caught:
+        find_photos(folder / "a.jpg")
+    assert caught.value.exit_code == BAD_INPUT
+
+
+def test_an_empty_folder_is_bad_input(tmp_path: Path):
+    with pytest.raises(UserError, match="no photos in") as caught:
+        find_photos(tmp_path)
+    assert caught.value.exit_code == BAD_INPUT
+    assert ".jpg" in caught.value.hint
+
+
+def test_photos_one_level_down_are_pointed_at(folder: Path):
+    with pytest.raises(UserError, match="no photos in") as caught:
+        find_photos(folder.parent)
+    assert str(folder) in caught.value.hint
+
+
+def test_two_photos_are_too_few(folder: Path):
+    for name in "cde":
+        (folder / f"{name}.jpg").unlink()
+    with pytest.raises(UserError, match=r"only 2 photos in .*, at least 4 are needed") as caught:
+        find_photos(folder)
+    assert caught.value.exit_code == TOO_FEW_PHOTOS
+
+
+def test_too_few_readable_photos_name_a_broken_one(folder: Path):
+    (folder / "a.jpg").write_text("this is text")
+    (folder / "b.jpg").write_bytes(b"")
+    with pytest.raises(UserError, match=r"only 3 of 5 photos .* can be read.*\(a\.jpg: not a picture") as caught:
+        find_photos(folder)
+    assert caught.value.exit_code == TOO_FEW_PHOTOS
+
+
+def photo(name: str, exif: Exif, *, size: tuple[int, int] = (64, 48)) -> Photo:
+    return Photo(name=name, width=size[0], height=size[1], exif=exif)
+
+
+def test_photos_share_a_camera_when_all_optics_and_the_size_agree():
+    phone = replace(NO_EXIF, make="A", model="B", lens="wide", focal_mm=4.0, focal_35mm=28.0)
+    photos = [
+        photo("1", phone),
+        photo("2", NO_EXIF),
+        photo("3", replace(phone, exposure_seconds=0.5, orientation=6)),
+        photo("4", replace(phone, lens="tele")),
+        photo("5", replace(phone, focal_35mm=56.0)),
+        photo("6", phone, size=(48, 64)),
+        photo("7", NO_EXIF),
+        photo("8", NO_EXIF, size=(128, 96)),
+    ]
+    groups = camera_groups(photos)
+    assert groups == (("1", "3"), ("2", "7"), ("4",), ("5",), ("6",), ("8",))
+
+
+@pytest.mark.parametrize("names", [["IMG_9.jpg", "IMG_10.jpg", "IMG_8.jpg"], ["0009.png", "0010.png", "0008.png"]])
+def test_names_are_ordered_by_their_number(names: list[str]):
+    assert capture_order(names) == [2, 0, 1]
+
+
+@pytest.mark.parametrize("names", [["a.jpg", "b.jpg"], ["a1.jpg", "b2.jpg"], ["a1.jpg", "a01.jpg"], ["1.jpg", "x.jpg"]])
+def test_names_that_differ_in_more_than_a_number_have_no_order(names: list[str]):
+    assert capture_order(names) is None
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, EXHAUSTIVE_UP_TO])
+def test_small_captures_are_compared_exhaustively(count: int):
+    pairing = choose_pairs([f"{number:03}.jpg" for number in range(count)])
+    assert pairing.rule == "exhaustive"
+    assert sorted(pairing.pairs) == list(combinations(range(count), 2))
+
+
+def test_large_unordered_captures_are_compared_exhaustively():
+    names = [f"{chr(97 + k % 26)}{chr(97 + k // 26)}.jpg" for k in range(100)]
+    assert choose_pairs(names).rule == "exhaustive"
+    assert len(choose_pairs(names).pairs) == 4950
+
+
+def test_large_numbered_captures_compare_neighbours_and_close_loops():
+    count = 300
+    pairing = choose_pairs([f"frame_{number}.jpg" for number in range(count)])
+    pairs = set(pairing.pairs)
+    assert pairing.rule == "sequential"
+    assert len(pairs) == len(pairing.pairs) < 0.15 * count * (count - 1) / 2
+    assert all(0 <= i < j < count for i, j in pairs)
+    assert all((i, i + step) in pairs for step in (1, 10, 16, 256) for i in range(count - step))
+    assert (0, count - 1) in pairs
+
+
+def test_the_estimate_falls_with_threads_and_features():
+    alone = estimated_seconds(1000, max_features=4096, threads=1)
+    assert estimated_seconds(1000, max_features=2048, threads=4) == pytest.approx(alone / 8)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "words"),
+    [
+        (Evidence(83, 0, None, 0), "too few features (83)"),
+        (Evidence(4000, 12, "a.jpg", 0), "matches no other photo well (best 12 verified matches)"),
+        (Evidence(4000, 41, "a.jpg", 0), "rejected by the mapper (41 verified matches with a.jpg)"),
+        (Evidence(4000, 41, "a.jpg", 7), "in another model of 7 photos"),
+    ],
+)
+def test_reasons(evidence: Evidence, words: str):
+    assert reason(evidence) == words
+
+
+def test_the_dominant_reason_brings_its_advice():
+    few, alone = Evidence(10, 0, None, 0), Evidence(4000, 3, "a", 0)
+    kind, advice = dominant([reason(few), reason(alone), reason(alone), "unreadable: damaged"])
+    assert kind == "matches no other photo well"
+    assert "overlap" in advice
+    with pytest.raises(ValueError, match="no reasons"):
+        dominant([])

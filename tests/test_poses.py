@@ -1,0 +1,392 @@
+"""Structure from motion, end to end, on a room corner of three textured walls that is rendered here with known poses.
+
+One capture carries what real folders hold: photos stored lying on their side, photos of a second size, a blank
+photo, a text file, names with spaces.
+"""
+
+import json
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from nerfcli import scene
+from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY, TOO_FEW_PHOTOS, UserError
+from nerfcli.media.images import read_image
+from nerfcli.poses import structure_from_motion, supervise
+from nerfcli.poses.mapping import refine_principal_point
+from nerfcli.poses.structure_from_motion import PoseSettings, PosesReport, estimate_poses
+
+WIDTH, HEIGHT, FOCAL_PX = 480, 360, 450.0
+# Where the photos are taken from, and whether each is stored lying (EXIF orientation 6) or is of the smaller size.
+CENTRES = np.array(
+    [
+        (3.4, 1.6, 1.5),
+        (3.1, 2.2, 1.6),
+        (2.7, 2.7, 1.4),
+        (2.2, 3.1, 1.7),
+        (1.6, 3.4, 1.5),
+        (2.9, 2.4, 2.3),
+        (2.4, 2.9, 2.4),
+    ]
+)
+NAMES = ("view 0.png", "view 1.jpg", "view 2.png", "view 3.png", "view 4.jpg", "view 5.png", "view 6.png")
+LYING = {1, 4}
+SMALLER = {5, 6}
+FAST = PoseSettings(max_features=1000, threads=2)
+
+
+def wall(seed: int) -> np.ndarray:
+    """A 400 x 400 texture with detail at all scales, so that it looks like something from any distance."""
+    rng = np.random.default_rng(seed)
+    layers = [
+        cv2.resize(rng.uniform(-1, 1, (cells, cells, 3)), (400, 400), interpolation=cv2.INTER_CUBIC) * cells**-0.3
+        for cells in (12, 25, 50, 100, 200)
+    ]
+    total = sum(layers, start=np.zeros((400, 400, 3)))
+    return np.clip(128 + 190 * total, 0, 255).astype(np.uint8)
+
+
+def cam_from_world(centre: np.ndarray) -> np.ndarray:
+    """(3, 4) pose of a camera at `centre` that looks at (0.5, 0.5, 0.5), z being up; OpenCV axes."""
+    forward = np.array([0.5, 0.5, 0.5]) - centre
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.column_stack([rotation, -rotation @ centre])
+
+
+def render(centre: np.ndarray, scale: float) -> np.ndarray:
+    """The corner x = 0, y = 0, z = 0 with walls of side 2, each drawn by its homography; none hides another."""
+    intrinsics = np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1]]) * [[scale], [scale], [1]]
+    size = (round(WIDTH * scale), round(HEIGHT * scale))
+    pose = cam_from_world(centre)
+    image = np.full((size[1], size[0], 3), 90, np.uint8)
+    # OpenCV's pixel centres are whole numbers, ours are at the halves.
+    ours_from_cv = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    for seed, (u_axis, v_axis) in enumerate([(0, 1), (1, 2), (0, 2)]):
+        wall_from_texture = np.diag([2 / 400, 2 / 400, 1.0]) @ ours_from_cv
+        cam_from_wall = pose[:, [u_axis, v_axis, 3]]
+        homography = np.linalg.inv(ours_from_cv) @ intrinsics @ cam_from_wall @ wall_from_texture
+        drawn = cv2.warpPerspective(wall(seed), homography, size, flags=cv2.INTER_AREA)
+        covered = cv2.warpPerspective(np.full((400, 400), 255, np.uint8), homography, size) > 127
+        image[covered] = drawn[covered]
+    return image
+
+
+def write_capture(folder: Path) -> None:
+    """The seven views, a blank photo and a text file named like a photo."""
+    folder.mkdir()
+    for index, name in enumerate(NAMES):
+        picture = Image.fromarray(render(CENTRES[index], 0.8 if index in SMALLER else 1.0))
+        exif = Image.Exif()
+        if index in LYING:
+            picture = picture.transpose(Image.Transpose.ROTATE_90)
+            exif[0x0112] = 6
+        picture.save(folder / name, quality=97, exif=exif)
+    Image.new("RGB", (WIDTH, HEIGHT), (200, 200, 200)).save(folder / "wall.png")
+    (folder / "notes.jpg").write_text("this is text")
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The capture after structure from motion."""
+
+    photos: Path
+    scene: Path
+    report: PosesReport
+    notes: list[str]
+    stages: list[tuple[str, int, int]]
+
+    @property
+    def model(self) -> pycolmap.Reconstruction:
+        return pycolmap.Reconstruction(str(self.scene / "sparse" / "0"))
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Solved:
+    folder = tmp_path_factory.mktemp("capture")
+    photos, scene_dir = folder / "my photos", folder / "corner"
+    write_capture(photos)
+    notes: list[str] = []
+    stages: list[tuple[str, int, int]] = []
+    report = estimate_poses(
+        photos,
+        scene_dir,
+        settings=FAST,
+        notify=notes.append,
+        progress=lambda stage, done, total: stages.append((stage, done, total)),
+    )
+    return Solved(photos, scene_dir, report, notes, stages)
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """scale, rotation, translation with b = scale * rotation @ a + translation, least squares (Umeyama 1991)."""
+    a_mean, b_mean = a.mean(axis=0), b.mean(axis=0)
+    u, sizes, vt = np.linalg.svd((b - b_mean).T @ (a - a_mean))
+    signs = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * signs) @ vt
+    scale = (sizes * signs).sum() / ((a - a_mean) ** 2).sum()
+    return scale, rotation, b_mean - scale * rotation @ a_mean
+
+
+def test_poses_agree_with_the_truth(solved: Solved):
+    """Synthetic truth. The cameras are 4 units from the corner; the errors seen are 0.003 and 0.09 degrees."""
+    model = solved.model
+    estimated = [model.find_image_with_name(name) for name in NAMES]
+    centres = np.array([image.projection_center() for image in estimated])
+    scale, rotation, translation = similarity(centres, CENTRES)
+    aligned = scale * centres @ rotation.T + translation
+    assert np.linalg.norm(aligned - CENTRES, axis=1).max() < 0.008
+    for image, centre in zip(estimated, CENTRES, strict=True):
+        found = image.cam_from_world().rotation.matrix() @ rotation.T
+        cosine = (np.trace(found @ cam_from_world(centre)[:, :3].T) - 1) / 2
+        assert np.degrees(np.arccos(min(cosine, 1.0))) < 0.3
+
+
+def test_intrinsics_agree_with_the_truth_and_are_shared_by_size(solved: Solved):
+    cameras = {(camera["width"], camera["height"]): camera for camera in solved.report.cameras}
+    assert {size: camera["images"] for size, camera in cameras.items()} == {(480, 360): 5, (384, 288): 2}
+    assert all(camera["model"] == "SIMPLE_RADIAL" for camera in cameras.values())
+    assert cameras[480, 360]["params"][:3] == pytest.approx([FOCAL_PX, 240, 180], rel=0.005)
+    assert cameras[384, 288]["params"][0] == pytest.approx(0.8 * FOCAL_PX, rel=0.005)
+
+
+@pytest.mark.parametrize("index", range(len(NAMES)))
+def test_points_project_onto_the_upright_picture_where_their_colour_is(solved: Solved, index: int):
+    """The model's points, seen by each camera, have the colour of our own reader's pixels there."""
+    model = solved.model
+    picture = read_image(solved.photos / NAMES[index])
+    image = model.find_image_with_name(NAMES[index])
+    camera = model.camera(image.camera_id)
+    assert picture.shape == (camera.height, camera.width, 3)
+    seen = [model.point3D(point.point3D_id) for point in image.points2D if point.has_point3D()]
+    pixels = np.array([image.project_point(point.xyz) for point in seen])
+    column, row = np.floor(pixels).astype(int).clip(0, np.array([camera.width, camera.height]) - 1).T
+    difference = picture[row, column].astype(float) - np.array([point.color for point in seen])
+    assert len(seen) > 50
+    assert np.median(np.abs(difference)) < 12
+
+
+def test_every_file_is_registered_or_has_its_reason(solved: Solved):
+    images = {image.name: image for image in solved.report.images}
+    assert sorted(images) == sorted([*NAMES, "notes.jpg", "wall.png"])
+    assert all(images[name].registered and images[name].reason is None for name in NAMES)
+    assert images["notes.jpg"].reason == "unreadable: not a picture that can be read"
+    assert images["wall.png"].reason == "too few features (0)"
+    assert (solved.report.registered, solved.report.total) == (7, 9)
+    assert "notes.jpg is left out: not a picture that can be read" in solved.notes
+
+
+def test_the_scene_folder_holds_the_model_and_nothing_of_the_work(solved: Solved):
+    assert {path.name for path in solved.scene.iterdir()} == {"sparse", "scene.json", "poses_report.json"}
+    assert {path.name for path in solved.scene.parent.iterdir()} == {"my photos", "corner"}
+    assert {"cameras.bin", "images.bin", "points3D.bin"} <= {
+        path.name for path in (solved.scene / "sparse/0").iterdir()
+    }
+    assert solved.model.num_points3D() == solved.report.points > 200
+    assert 0 < solved.report.mean_reprojection_error_px < 1
+
+
+def test_the_report_file_has_the_promised_keys(solved: Solved):
+    report = json.loads((solved.scene / "poses_report.json").read_text())
+    assert set(report["seconds"]) == {"extract", "match", "map", "total"}
+    assert report["seconds"]["total"] >= sum(report["seconds"][stage] for stage in ("extract", "match", "map"))
+    assert report["images"][0] == {"name": "notes.jpg", "registered": False, "reason": solved.report.images[0].reason}
+    assert report["models"][0] == report["registered"] == 7
+    assert report["settings"]["max_features"] == 1000
+    assert report["versions"]["pycolmap"] == pycolmap.__version__
+    assert report["matching"] == {"rule": "exhaustive", "pairs": 28}
+
+
+def test_a_blank_photo_costs_no_second_attempt(solved: Solved):
+    """It matches nothing, so no other start of the mapper could place it."""
+    assert [attempt["models"] for attempt in solved.report.attempts] == [[7]]
+
+
+def test_progress_goes_through_all_stages(solved: Solved):
+    assert list(dict.fromkeys(stage for stage, _, _ in solved.stages)) == ["read", "extract", "match", "map"]
+    last = {stage: (done, total) for stage, done, total in solved.stages}
+    assert last["extract"] == (8, 8)
+    assert last["match"] == (28, 28)
+
+
+def test_the_scene_can_be_loaded(solved: Solved):
+    loaded = scene.load(solved.scene)
+    assert [frame.name for frame in loaded.frames] == sorted(NAMES)
+    assert loaded.unit == "arbitrary"
+
+
+def write_noise(folder: Path) -> None:
+    """Five photos that have nothing in common."""
+    folder.mkdir()
+    for seed in range(5):
+        Image.fromarray(wall(100 + seed)[:200, :200]).save(folder / f"{seed}.png")
+
+
+def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], None] | None = None) -> PosesReport:
+    return estimate_poses(
+        photos, scene_dir, settings=FAST, notify=lambda note: None, progress=progress or (lambda *told: None)
+    )
+
+
+def test_photos_without_overlap_are_too_few_and_leave_nothing(tmp_path: Path):
+    write_noise(tmp_path / "photos")
+    with pytest.raises(UserError, match=r"only 0 of 5 photos could be placed.*matches no other photo well") as caught:
+        estimate(tmp_path / "photos", tmp_path / "scene")
+    assert caught.value.exit_code == TOO_FEW_PHOTOS
+    assert "overlap" in caught.value.hint
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_an_interrupt_ends_the_worker_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    workers: list[subprocess.Popen[bytes]] = []
+
+    class Recorded(subprocess.Popen[bytes]):
+        def __init__(self, *args, **options):
+            super().__init__(*args, **options)
+            workers.append(self)
+
+    def interrupt(stage: str, done: int, total: int) -> None:
+        if stage == "extract":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", Recorded)
+    write_noise(tmp_path / "photos")
+    with pytest.raises(KeyboardInterrupt):
+        estimate(tmp_path / "photos", tmp_path / "scene", interrupt)
+    assert [worker.returncode for worker in workers] == [-9]
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_dying_worker_is_told_with_its_last_words(tmp_path: Path):
+    with pytest.raises(UserError, match=r"died \(exit status 1\) while starting: .*FileNotFoundError.*job\.json"):
+        supervise.run_worker(tmp_path / "job.json", threads=1, progress=lambda *told: None)
+
+
+def test_deaths_are_explained():
+    log = "*** Aborted at 1 ***\nF1120 bundle.cc:9] Check failed: x > 0\n    @ 0x7f (libc.so)\n"
+    aborted = supervise.explain_death(-6, "matching photos (3 of 10 done)", log)
+    assert aborted.message == (
+        "structure from motion died (SIGABRT) while matching photos (3 of 10 done): "
+        "F1120 bundle.cc:9] Check failed: x > 0"
+    )
+    assert supervise.explain_death(-9, "finding features", "").exit_code == OUT_OF_MEMORY
+
+
+def test_a_scene_never_takes_the_place_of_the_photos(tmp_path: Path):
+    write_noise(tmp_path / "photos")
+    for destination in (tmp_path / "photos", tmp_path):
+        with pytest.raises(UserError, match="would take the place of the photos"):
+            estimate(tmp_path / "photos", destination)
+    assert len(list((tmp_path / "photos").iterdir())) == 5
+
+
+def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path: Path):
+    write_noise(tmp_path / "photos")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
+    with pytest.raises(UserError, match="holds something that is no scene"):
+        estimate(tmp_path / "photos", tmp_path / "thesis")
+    assert (tmp_path / "thesis" / "chapter.tex").is_file()
+
+
+def test_an_output_that_cannot_be_written_is_bad_input(tmp_path: Path):
+    write_noise(tmp_path / "photos")
+    with pytest.raises(UserError, match="cannot write") as caught:
+        estimate(tmp_path / "photos", tmp_path / "photos" / "0.png" / "scene")
+    assert caught.value.exit_code == BAD_INPUT
+
+
+def test_too_few_photos_write_nothing(tmp_path: Path):
+    write_noise(tmp_path / "photos")
+    for name in ("0.png", "1.png", "2.png"):
+        (tmp_path / "photos" / name).unlink()
+    with pytest.raises(UserError, match="only 2 photos"):
+        estimate(tmp_path / "photos", tmp_path / "scene")
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def synthetic_model(*, photos: int, principal_point: tuple[float, float]) -> pycolmap.Reconstruction:
+    """Exact poses and points, half a pixel of noise in the observations; the principal point then set to the centre."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = 1
+    options.num_frames_per_rig = photos
+    options.num_points3D = 200
+    options.camera_params = [1280.0, *principal_point, 0.05]
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.5
+    pycolmap.synthesize_noise(noise, model)
+    for camera in model.cameras.values():
+        camera.principal_point_x, camera.principal_point_y = 512.0, 384.0
+    model.update_point_3d_errors()
+    return model
+
+
+def principal_point(model: pycolmap.Reconstruction) -> tuple[float, float]:
+    camera = next(iter(model.cameras.values()))
+    return camera.principal_point_x, camera.principal_point_y
+
+
+def test_the_principal_point_of_a_large_capture_is_found():
+    """Synthetic truth: 1.5 % of the width off the centre, recovered to two pixels."""
+    model = synthetic_model(photos=30, principal_point=(527.0, 380.0))
+    refined = refine_principal_point(model, 1)
+    assert principal_point(refined) == pytest.approx((527.0, 380.0), abs=2.0)
+    assert refined.compute_mean_reprojection_error() < 0.9 * model.compute_mean_reprojection_error()
+
+
+@pytest.mark.parametrize(
+    ("photos", "truth"),
+    [(29, (527.0, 380.0)), (30, (580.0, 384.0))],
+    ids=["too few photos", "farther than a twentieth"],
+)
+def test_the_principal_point_stays_at_the_centre(photos: int, truth: tuple[float, float]):
+    model = synthetic_model(photos=photos, principal_point=truth)
+    assert refine_principal_point(model, 1) is model
+    assert principal_point(model) == (512.0, 384.0)
+
+
+@pytest.mark.parametrize(("count", "model"), [(19, "SIMPLE_RADIAL"), (20, "OPENCV")])
+def test_large_groups_get_the_larger_camera_model(count: int, model: str):
+    assert structure_from_motion.auto_camera_model(count) == model
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (PoseSettings(max_features=0), "must be positive, got 1600 and 0"),
+        (PoseSettings(camera_model="BROWN"), "camera_model must be one of auto, .*, got BROWN"),
+        (PoseSettings(min_registered=1.5), r"within 0\.\.\.1, got 1\.5"),
+    ],
+)
+def test_settings_out_of_range_are_refused(tmp_path: Path, settings: PoseSettings, words: str):
+    with pytest.raises(ValueError, match=words):
+        estimate_poses(
+            tmp_path, tmp_path / "scene", settings=settings, notify=lambda note: None, progress=lambda *told: None
+        )
+
+
+@pytest.mark.slow
+def test_one_thread_and_the_same_seed_give_the_same_poses(tmp_path: Path):
+    write_capture(tmp_path / "photos")
+    models: list[bytes] = []
+    for name in ("a", "b"):
+        estimate_poses(
+            tmp_path / "photos",
+            tmp_path / name,
+            settings=replace(FAST, threads=1),
+            notify=lambda note: None,
+            progress=lambda *told: None,
+        )
+        models.append((tmp_path / name / "sparse/0/images.bin").read_bytes())
+    assert models[0] == models[1]

@@ -1,0 +1,276 @@
+"""Scenes: finding the format of a folder, the held-out split, nerfcli's own scene.json, and the fingerprint."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from nerfcli import scene as scenes
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.errors import BAD_INPUT, UserError
+
+POSE = np.eye(4).tolist()
+NAMES = [f"photo {index:02d}.jpg" for index in range(10)]
+
+
+def write_image(path: Path, *, size: tuple[int, int] = (64, 48), orientation: int = 1) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.new("RGB", size).save(path, exif=exif)
+
+
+def write_transforms(folder: Path, names: list[str], *, file: str = "transforms.json") -> None:
+    frames = []
+    for index, name in enumerate(names):
+        pose = np.eye(4)
+        pose[0, 3] = index
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    content = {"fl_x": 50.0, "w": 64, "h": 48, "frames": frames}
+    (folder / file).write_text(json.dumps(content), encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> Path:
+    """A COLMAP model of ten images of 1024 x 768, by pycolmap."""
+    folder = tmp_path_factory.mktemp("model")
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_points3D = 30
+    pycolmap.set_random_seed(0)
+    reconstruction = pycolmap.synthesize_dataset(options)
+    for name, image in zip(NAMES, reconstruction.images.values(), strict=True):
+        image.name = name
+    reconstruction.write_binary(str(folder))
+    return folder
+
+
+@pytest.fixture
+def own(tmp_path, model) -> Path:
+    """A scene as `nerfcli poses` leaves it: photos beside it, sparse/0 and scene.json in it."""
+    for name in NAMES:
+        write_image(tmp_path / "photos" / name)
+    folder = tmp_path / "photos-scene"
+    shutil.copytree(model, folder / "sparse/0")
+    scenes.save(folder, image_folder=tmp_path / "photos", provenance={"command": "poses"})
+    return folder
+
+
+def edit(folder: Path, **changes: object) -> None:
+    path = folder / "scene.json"
+    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8")
+
+
+def test_every_eighth_name_is_held_out():
+    names = [f"{index:02d}" for index in range(20)]
+    assert scenes.default_split(reversed(names)) == {"00", "08", "16"}
+    assert scenes.default_split([]) == frozenset()
+
+
+def test_transforms_by_folder_and_by_file(tmp_path):
+    names = [f"images/{index}.png" for index in range(9)]
+    for name in names[:-1]:
+        write_image(tmp_path / name)
+    write_transforms(tmp_path, names)
+    for path in (tmp_path, tmp_path / "transforms.json"):
+        scene = scenes.load(path)
+        assert (scene.root, scene.kind, scene.unit) == (tmp_path, "transforms", "arbitrary")
+        assert [frame.name for frame in scene.frames] == names[:-1]
+        assert [frame.name for frame in scene.test_frames] == [names[0]]
+        assert len(scene.train_frames) == 7
+        assert scene.missing == (names[-1],)
+
+
+def test_blender_folder_keeps_its_own_split(tmp_path):
+    for name in ("train/a.png", "train/b.png", "test/a.png"):
+        write_image(tmp_path / name)
+    write_transforms(tmp_path, ["train/a", "train/b"], file="transforms_train.json")
+    write_transforms(tmp_path, ["test/a"], file="transforms_test.json")
+    scene = scenes.load(tmp_path)
+    assert scene.kind == "blender"
+    assert scene.test_names == {"test/a.png"}
+    assert [frame.name for frame in scene.train_frames] == ["train/a.png", "train/b.png"]
+
+
+def test_splits_that_nerfstudio_lists_are_kept(tmp_path):
+    for name in "abcd":
+        write_image(tmp_path / f"{name}.png")
+    write_transforms(tmp_path, [f"{name}.png" for name in "abcd"])
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "train_filenames": ["a.png", "b.png"], "val_filenames": ["c.png"]}))
+    assert scenes.load(tmp_path).test_names == {"c.png"}  # held out for want of a test split; d is not used
+    assert [frame.name for frame in scenes.load(tmp_path).frames] == ["a.png", "b.png", "c.png"]
+    path.write_text(
+        json.dumps({**content, "train_filenames": ["a.png"], "val_filenames": ["c.png"], "test_filenames": ["d.png"]})
+    )
+    assert [frame.name for frame in scenes.load(tmp_path).frames] == ["a.png", "d.png"]
+    assert scenes.load(tmp_path).test_names == {"d.png"}
+
+
+def test_llff_folder(tmp_path):
+    write_image(tmp_path / "images_8/0.png")
+    pose = np.column_stack([np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.zeros(3), [96, 128, 100]])
+    np.save(tmp_path / "poses_bounds.npy", np.concatenate([pose.ravel(), [1.0, 9.0]])[None])
+    scene = scenes.load(tmp_path)
+    assert scene.kind == "llff"
+    assert scene.frames[0].camera == Camera.pinhole(64, 48, 50.0)
+    np.testing.assert_array_equal(scene.depth_bounds, [[1, 9]])
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_colmap_project_wherever_its_model_stands(tmp_path, model, place):
+    shutil.copytree(model, tmp_path / place, dirs_exist_ok=True)
+    with pytest.raises(UserError, match="holds a COLMAP model, but no photos"):
+        scenes.load(tmp_path)
+    for name in NAMES[1:]:
+        write_image(tmp_path / "images" / name)
+    scene = scenes.load(tmp_path)
+    assert scene.kind == "colmap"
+    assert scene.missing == (NAMES[0],)
+    assert scene.points.shape == (30, 3)
+    assert scene.test_names == {NAMES[1], NAMES[9]}
+    assert scenes.load(tmp_path / place).frames[0].image == scene.frames[0].image or place != "."
+
+
+def test_a_colmap_model_of_photos_stored_lying_is_turned_upright(tmp_path, model):
+    """COLMAP ignores the EXIF orientation: its cameras are of the stored pixels, ours of the picture as it is shown."""
+    shutil.copytree(model, tmp_path / "sparse/0")
+    for name in NAMES:
+        write_image(tmp_path / "images" / name, orientation=6 if name == NAMES[0] else 1)
+    turned, plain = scenes.load(tmp_path).frames[:2]
+    assert (turned.camera.width, turned.camera.height) == (48, 64)
+    assert (plain.camera.width, plain.camera.height) == (64, 48)
+    write_image(tmp_path / "images" / NAMES[0])
+    stored = scenes.load(tmp_path).frames[0]
+    # The stored picture's right edge is the upright one's bottom edge.
+    right, _ = stored.camera.bearings(np.array([[64.0, 10.0]]))
+    bottom, _ = turned.camera.bearings(np.array([[48.0 - 10.0, 64.0]]))
+    in_world = [rigid.apply(f.world_from_cam, d) for f, d in ((stored, right), (turned, bottom))]
+    np.testing.assert_allclose(in_world[1], in_world[0], rtol=0, atol=1e-9)
+
+
+def test_own_scene_is_read_back(own, tmp_path):
+    content = json.loads((own / "scene.json").read_text(encoding="utf-8"))
+    assert content["image_folder"] == "../photos"
+    assert content["split"] == {"test": [NAMES[0], NAMES[8]]}
+    assert content["provenance"] == {"command": "poses"}
+    scene = scenes.load(own)
+    assert (scene.kind, scene.unit, scene.missing) == ("nerfcli", "arbitrary", ())
+    assert scene.frames[3].image == tmp_path / "photos" / NAMES[3]
+    assert scene.test_names == {NAMES[0], NAMES[8]}
+    np.testing.assert_array_equal(scene.points.min(axis=0), content["bounds"]["points_min"])
+    assert scenes.load(own / "scene.json").test_names == scene.test_names
+    # The scene and its photos can move together, and the split stays when a photo goes.
+    (tmp_path / "elsewhere").mkdir()
+    for folder in ("photos", "photos-scene"):
+        (tmp_path / folder).rename(tmp_path / "elsewhere" / folder)
+    (tmp_path / "elsewhere/photos" / NAMES[0]).unlink()
+    moved = scenes.load(tmp_path / "elsewhere/photos-scene")
+    assert moved.missing == (NAMES[0],)
+    assert moved.test_names == {NAMES[8]}
+
+
+def test_cameras_of_an_own_scene_refer_to_upright_photos(own, tmp_path):
+    """`nerfcli poses` shows pycolmap upright photos: nothing is turned a second time."""
+    before = scenes.load(own).frames[0]
+    write_image(tmp_path / "photos" / NAMES[0], orientation=3)
+    after = scenes.load(own).frames[0]
+    assert after.camera == before.camera
+    np.testing.assert_array_equal(after.world_from_cam, before.world_from_cam)
+
+
+def test_masks_are_found_by_the_photos_name(own, tmp_path):
+    masks = tmp_path / "masks"
+    write_image(masks / f"{NAMES[0]}.png")
+    write_image(masks / "photo 01.png")
+    write_image(masks / NAMES[2])
+    scenes.save(own, image_folder=tmp_path / "photos", provenance={}, masks=masks, unit="metre", unit_source="a ruler")
+    scene = scenes.load(own)
+    assert [frame.mask for frame in scene.frames[:4]] == [
+        masks / f"{NAMES[0]}.png",
+        masks / "photo 01.png",
+        masks / NAMES[2],
+        None,
+    ]
+    assert scene.unit == "metre"
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"version": 2}, "version 2 is not known"),
+        ({"image_folder": 3}, "image_folder is 3"),
+        ({"image_folder": "../gone"}, "photos should be in .*gone, which is not there"),
+        ({"model": None}, "model is None"),
+        ({"model": "sparse/1"}, r"sparse/1.cameras\.txt: No such file"),
+        ({"unit": "mile"}, "unit is 'mile'"),
+        ({"split": {}}, "split.test is no list"),
+        ({"split": {"test": [1]}}, "split.test is no list"),
+    ],
+)
+def test_malformed_scene_json_is_refused(own, changes, what):
+    edit(own, **changes)
+    with pytest.raises(UserError, match=what) as caught:
+        scenes.load(own)
+    assert caught.value.exit_code == BAD_INPUT
+
+
+def test_save_refuses_an_unknown_unit(own, tmp_path):
+    with pytest.raises(ValueError, match="unit must be one of"):
+        scenes.save(own, image_folder=tmp_path, provenance={}, unit="mile")
+
+
+def test_what_is_no_scene_says_what_was_looked_for(tmp_path):
+    with pytest.raises(UserError, match=r"there is no .*nowhere"):
+        scenes.load(tmp_path / "nowhere")
+    with pytest.raises(
+        UserError, match=r"no scene; looked for scene\.json, sparse/0.*transforms\.json.*poses_bounds"
+    ) as caught:
+        scenes.load(tmp_path)
+    assert caught.value.exit_code == BAD_INPUT
+    write_image(tmp_path / "images/a.JPG")
+    with pytest.raises(UserError, match=r"images holds 1 photos, but no poses") as caught:
+        scenes.load(tmp_path)
+    assert caught.value.hint == f"run: nerfcli poses {tmp_path / 'images'}"
+    with pytest.raises(UserError, match="is a file, not a scene"):
+        scenes.load(tmp_path / "images/a.JPG")
+
+
+def test_fingerprint_knows_names_cameras_poses_and_split_and_nothing_else(own):
+    scene = scenes.load(own)
+    original = scenes.fingerprint(scene)
+    assert len(original) == 64
+    first, *rest = scene.frames
+
+    def with_first(**changes) -> str:
+        return scenes.fingerprint(replace(scene, frames=(replace(first, **changes), *rest)))
+
+    nudged = first.world_from_cam.copy()
+    nudged[0, 3] += 1e-6
+    turned = rigid.from_parts(first.world_from_cam[:3, :3] @ np.diag([-1, -1, 1]), first.centre)
+    different = {
+        with_first(name="other.jpg"),
+        with_first(camera=Camera(first.camera.model, 64, 48, (*first.camera.params[:-1], 0.0501))),
+        with_first(world_from_cam=nudged),
+        with_first(world_from_cam=turned),
+        scenes.fingerprint(replace(scene, test_names=frozenset([NAMES[1]]))),
+        scenes.fingerprint(replace(scene, frames=tuple(rest))),
+    }
+    assert original not in different
+    assert len(different) == 6
+    zeros = with_first(world_from_cam=np.eye(4))
+    assert zeros == with_first(world_from_cam=np.where(np.eye(4) == 0, -0.0, np.eye(4)))
+    # The order of frames, where the files are, and the last bits of a pose are not part of it.
+    last_bits = first.world_from_cam * (1 + 2e-16)
+    same = {
+        with_first(world_from_cam=last_bits),
+        with_first(image=None),
+        scenes.fingerprint(replace(scene, frames=scene.frames[::-1], root=Path("/elsewhere"), points=np.zeros((0, 3)))),
+    }
+    assert same == {original}
