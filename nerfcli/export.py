@@ -88,18 +88,19 @@ def export_frames(
             "nerfcli": __version__,
             "settings": settings.to_json(),
             **({"depth_meaning": asdict(meta)} if "depth" in settings.outputs else {}),
-            "frames": [
-                {
-                    "file": name,
-                    "camera": frame.camera.to_json(),
-                    "world_from_cam": frame.world_from_cam.tolist(),
-                }
-                for frame, name in zip(frames, names, strict=True)
-            ],
+            "frames": describe_frames(frames),
             **provenance,
         }
         write_json(partial / DESCRIPTION, description)
     return [folder / (f"{output}.mp4" if settings.video else output) for output in settings.outputs]
+
+
+def describe_frames(frames: Sequence[Frame]) -> list[dict[str, Any]]:
+    """The files, cameras and poses of the pictures, as they stand in render.json."""
+    return [
+        {"file": name, "camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
+        for frame, name in zip(frames, file_names(frames), strict=True)
+    ]
 
 
 def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:

@@ -1,10 +1,19 @@
-"""Shared fixtures and the one table of tolerances."""
+"""Shared fixtures, the trained run that several files look at, and the one table of tolerances."""
+
+from pathlib import Path
 
 import pytest
 import torch
 
+from nerfcli import scene
+from nerfcli.train.loop import train
+from nerfcli.train.settings import TrainSettings
+
 # Relative tolerance of a chain of some dozen operations, per dtype. A looser one in a test carries its reason.
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 5e-6}
+
+# Five balls and a box with known geometry: 21 views to train on, 3 held out, 96 x 72 RGBA.
+SPHERES = Path(__file__).parent.parent / "sample_scenes" / "spheres"
 
 
 @pytest.fixture
@@ -16,3 +25,17 @@ def generator() -> torch.Generator:
 def _two_threads():
     """Small tensors do not pay for more, and the answers must not depend on it."""
     torch.set_num_threads(2)
+
+
+@pytest.fixture(scope="session")
+def spheres() -> scene.Scene:
+    return scene.load(SPHERES)
+
+
+@pytest.fixture(scope="session")
+def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short but real training on the spheres. Look at it, do not write into it."""
+    run = tmp_path_factory.mktemp("trained") / "spheres-run"
+    settings = TrainSettings(budget_seconds=None, steps=250, samples_per_step=2**13, threads=2)
+    train(spheres, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
+    return run

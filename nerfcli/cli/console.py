@@ -107,7 +107,8 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
-            return function(*args, **kwargs)
+            with out_of_memory_told():
+                return function(*args, **kwargs)
         except UserError as error:
             report_error(error)
             raise typer.Exit(error.exit_code) from error
@@ -118,18 +119,21 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
             # Whoever read our results has gone: end quietly, and let Python not complain while closing stdout.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from error
-        except (MemoryError, RuntimeError) as error:
-            if not _is_out_of_memory(error):
-                raise
-            report_error(
-                UserError("out of memory", "try --downscale 4, smaller pictures (--max-size), or fewer photos")
-            )
-            raise typer.Exit(OUT_OF_MEMORY) from error
 
     return guarded
 
 
-def _is_out_of_memory(error: BaseException) -> bool:
-    """Torch says it in a RuntimeError's text on the CPU, and in a subclass of RuntimeError on a GPU."""
-    text = str(error).lower()
-    return isinstance(error, MemoryError) or "not enough memory" in text or "out of memory" in text
+@contextmanager
+def out_of_memory_told() -> Iterator[None]:
+    """Turn the ways in which memory runs out into a UserError.
+
+    Torch says it in a RuntimeError's text on the CPU, and in a subclass of RuntimeError on a GPU.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        text = str(error).lower()
+        if not isinstance(error, MemoryError) and "not enough memory" not in text and "out of memory" not in text:
+            raise
+        hint = "try --downscale 4, smaller pictures (--max-size), or fewer photos"
+        raise UserError("out of memory", hint, OUT_OF_MEMORY) from error

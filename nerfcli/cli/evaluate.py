@@ -54,7 +54,7 @@ def evaluate_run(
     from nerfcli.evaluate.protocol import METRICS, HeldOut, evaluate_model
     from nerfcli.render.model import load_model
     from nerfcli.train.photos import load_photos
-    from nerfcli.train.run_folder import FIELD, read_cameras, read_config, read_log
+    from nerfcli.train.run_folder import FIELD, LOG, read_cameras, read_config, read_log
 
     torch.set_num_threads(threads)
     config, cameras = read_config(run), read_cameras(run)
@@ -68,13 +68,15 @@ def evaluate_run(
         console.note(f"{path} is kept; --overwrite measures again")
         return path, metrics
 
+    log = read_log(run)
+    if not log:
+        raise UserError(f"{run} has no {LOG}, which tells the time of the training", "train again with --overwrite")
     photos = load_photos(cameras["test"], factor=config["settings"]["downscale"], threads=threads)
     held_out = [HeldOut(photo.frame, photo.pixels, photo.used) for photo in photos]
     with console.progress("evaluate") as update:
         metrics = evaluate_model(
             model, held_out, on_image=lambda done, total: update(done / total, f"{done}/{total} rays")
         )
-    log = read_log(run)
     metrics["training"] = {
         "seconds": log[-1]["seconds"],
         "steps": log[-1]["step"],

@@ -137,7 +137,7 @@ def render_run(
 
     import torch
 
-    from nerfcli.export import DESCRIPTION, export_frames
+    from nerfcli.export import DESCRIPTION, describe_frames, export_frames
     from nerfcli.render.model import load_model
     from nerfcli.train.run_folder import FIELD
 
@@ -154,13 +154,12 @@ def render_run(
         "run": run.name,
         "field_sha256": hashlib.sha256((run / FIELD).read_bytes()).hexdigest(),
     }
-    if target.exists() and not overwrite:
-        same = False
-        if (target / DESCRIPTION).exists():
-            made = json_module.loads((target / DESCRIPTION).read_text(encoding="utf-8"))
-            wanted = {"settings": settings.to_json(), **provenance}
-            same = all(made.get(key) == value for key, value in wanted.items()) and len(made["frames"]) == len(views)
-        if not same:
+    if target.is_file() or (target.is_dir() and not (target / DESCRIPTION).exists() and any(target.iterdir())):
+        raise UserError(f"{target} holds something else than renders", "choose another place with -o")
+    if (target / DESCRIPTION).exists() and not overwrite:
+        made = json_module.loads((target / DESCRIPTION).read_text(encoding="utf-8"))
+        wanted = {"settings": settings.to_json(), "frames": describe_frames(views), **provenance}
+        if any(made.get(key) != value for key, value in wanted.items()):
             raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another place with -o")
         console.note(f"{target} is kept: it was rendered with these settings; --overwrite renders again")
         return [target / (f"{name}.mp4" if settings.video else name) for name in settings.outputs]

@@ -50,7 +50,7 @@ def run(
     from nerfcli.cli.evaluate import evaluate_run
     from nerfcli.cli.poses import estimate_scene
     from nerfcli.cli.render import folder_name, render_run
-    from nerfcli.cli.train import train_scene
+    from nerfcli.cli.train import train_scene, was_interrupted
     from nerfcli.export import OUTPUTS, ExportSettings
     from nerfcli.poses.structure_from_motion import PoseSettings
     from nerfcli.render.pictures import DepthRequest
@@ -70,7 +70,8 @@ def run(
         if output is not None:
             scene, field = scene / "scene", scene / "run"
         estimate_scene(folder, scene, settings=pose_settings, overwrite=overwrite, console=console)
-        train_scene(scene, field, settings=train_settings, resume=False, overwrite=overwrite, console=console)
+        resume = not overwrite and was_interrupted(scene, field, train_settings)
+        train_scene(scene, field, settings=train_settings, resume=resume, overwrite=overwrite, console=console)
         metrics, numbers = evaluate_run(field, device=torch_device, threads=cores, overwrite=overwrite, console=console)
         console.result(scene)
         console.result(field)

@@ -1,5 +1,6 @@
 """nerfcli train: from a scene to a field."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -92,25 +93,27 @@ def train_scene(
     from nerfcli import scene as scenes
     from nerfcli.train.loop import Progress
     from nerfcli.train.loop import train as fit
-    from nerfcli.train.run_folder import CONFIG, FIELD, is_complete, is_same_run
+    from nerfcli.train.run_folder import CONFIG, FIELD, is_complete, is_same_run, read_config
 
     scene = scenes.load(folder)
     if scene.missing:
         listed = ", ".join(scene.missing[:NAMES_SHOWN])
         more = f" and {len(scene.missing) - NAMES_SHOWN} more" if len(scene.missing) > NAMES_SHOWN else ""
         console.warn(f"{len(scene.missing)} photos of {folder} are not there and are left out: {listed}{more}")
-    exists = (run / CONFIG).exists() or (run / FIELD).exists()
-    if resume and not (run / FIELD).exists():
+    trained = (run / FIELD).exists()
+    if resume and not trained:
         raise UserError(f"nothing to resume in {run}", "leave --resume out to start, or give the run with -o")
-    if exists and not resume and not overwrite:
+    if resume and read_config(run).get("scene_fingerprint") != scenes.fingerprint(scene):
+        raise UserError(f"{run} was trained on another scene than {folder}", "choose another place with -o")
+    if trained and not resume and not overwrite:
         if is_same_run(run, scene, settings) and is_complete(run, settings):
             console.note(f"{run} is kept: it was trained with these settings; --overwrite trains again")
             return
         raise UserError(
             f"{run} exists", "add --resume to go on, --overwrite to replace it, or choose another place with -o"
         )
-    if run.exists() and not exists and any(run.iterdir()):
-        raise UserError(f"{run} holds other files", "choose another place with -o")
+    if run.is_file() or (run.is_dir() and not (run / CONFIG).exists() and any(run.iterdir())):
+        raise UserError(f"{run} is not a run, but something else", "choose another place with -o")
 
     with console.progress(f"train {folder.name}") as update:
 
@@ -126,5 +129,16 @@ def train_scene(
             fit(scene, run, settings, resume=resume, notify=console.note, on_progress=on_progress)
         except KeyboardInterrupt:
             if (run / FIELD).exists():
-                console.note(f"checkpoint saved; go on with: nerfcli train {folder} -o {run} --resume")
+                paths = f"{shlex.quote(str(folder))} -o {shlex.quote(str(run))}"
+                console.note(f"checkpoint saved; go on with: nerfcli train {paths} --resume")
             raise
+
+
+def was_interrupted(folder: Path, run: Path, settings: "TrainSettings") -> bool:
+    """Whether a training of this scene with these settings stopped before its end and left a checkpoint."""
+    from nerfcli import scene as scenes
+    from nerfcli.train.run_folder import FIELD, is_complete, is_same_run
+
+    if not (run / FIELD).exists():
+        return False
+    return is_same_run(run, scenes.load(folder), settings) and not is_complete(run, settings)

@@ -18,6 +18,7 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, 
     with atomic_path(path) as partial:
         try:
             save_file(content, partial, metadata={"description": json.dumps(description, allow_nan=False)})
+            partial.chmod(0o644)  # safetensors makes files that only their owner can read
         except SafetensorError as error:  # a full disk comes as this, not as OSError
             raise OSError(str(error)) from error
 

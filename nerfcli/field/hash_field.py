@@ -49,7 +49,7 @@ class HashField(nn.Module):
     """Density by position, colour by position and direction, on coordinates of the unit cube.
 
     Positions are those of `kernels.grid_coordinates`. The table starts near zero and the networks have no biases, so a
-    fresh field is a thin grey fog of density 1: thin enough that every sample of a ray gets a gradient.
+    fresh field is a grey fog of density 1: thin enough that every sample of a ray gets a gradient.
     """
 
     def __init__(self, settings: HashFieldSettings):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import reference
-from nerfcli.kernels.reference import contract, grid_coordinates, interval_weights, sum_along_rays
+from nerfcli.kernels.reference import contract, grid_coordinates, sum_along_rays
 
 __all__ = [
     "adam_rows",
@@ -29,6 +29,7 @@ __all__ = [
     "radiance",
     "ray_indices",
     "sample_coordinates",
+    "scatter_max",
     "sum_along_rays",
 ]
 
@@ -109,6 +110,16 @@ def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> T
     """See `reference.optical_depth_before`."""
     module = _module_for(density, lengths, constant=(density, lengths))
     return module.optical_depth_before(density, lengths, offsets)
+
+
+def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """See `reference.interval_weights`."""
+    return _module_for(density, lengths, constant=(density, lengths)).interval_weights(density, lengths, offsets)
+
+
+def scatter_max(grid: Tensor, coordinates: Tensor, values: Tensor) -> None:
+    """See `reference.scatter_max`."""
+    _module_for(grid, coordinates, values).scatter_max(grid, coordinates, values)
 
 
 def adam_rows(

@@ -26,7 +26,7 @@ def density_from_log(log_density: Tensor) -> Tensor:
     """exp(x) for |x| <= 15, constant beyond, with a gradient that never vanishes or overflows.
 
     Args:
-        log_density: any shape, finite.
+        log_density: x, any shape, finite.
 
     Returns:
         density in [3e-7, 3.3e6], in 1 / unit of the training frame.

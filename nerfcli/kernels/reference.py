@@ -236,14 +236,14 @@ def sample_coordinates(
 
 
 def geometry(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
-    """The density network: (N, E) to (N, G), W2 relu(W1 x); the first output is the logarithm of the density."""
+    """The density network: (N, E) to (N, G), W2 relu(W1 x); the first output is the log of the density."""
     return torch.relu(encoded @ weights[0].t()) @ weights[1].t()
 
 
 def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
     """Density of encoded positions.
 
-    density = exp(clip(W2 relu(W1 x))_0), clipped to [-15, 15]; see `density_from_log` for its gradient.
+    density = exp((W2 relu(W1 x))_0), the exponent clipped to [-15, 15]; see `density_from_log`.
 
     Args:
         encoded: (N, E).
@@ -311,3 +311,16 @@ def adam_rows(
     spread = (second[touched] / (1 - betas[1] ** step)).sqrt()
     table[touched] -= rate * mean / (spread + eps)
     gradient.zero_()
+
+
+def scatter_max(grid: Tensor, coordinates: Tensor, values: Tensor) -> None:
+    """Raise each cell of a grid, in place, to the largest of the values that fall into it.
+
+    Args:
+        grid: (G, G, G) over the unit cube, indexed [z, y, x].
+        coordinates: (N, 3) in [0, 1], x y z.
+        values: (N,).
+    """
+    side = grid.shape[0]
+    x, y, z = (coordinates * side).long().clamp(0, side - 1).unbind(-1)
+    grid.view(-1).scatter_reduce_(0, (z * side + y) * side + x, values, "amax")

@@ -1,45 +1,56 @@
 """Which cells of space hold anything: a coarse grid over the field's unit cube that lets rays skip the rest."""
 
+import numpy as np
 import torch
+from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
+from nerfcli import kernels
 from nerfcli.field.contraction import training_points
 from nerfcli.field.hash_field import HashField
 
-# A cell counts as occupied when one step through it takes away more than this share of the light.
+# A cell counts as occupied when one step through it takes away more than this share of the light,
 OCCUPIED_OPTICAL_DEPTH = 0.01
+# and when some ray still has more than this share of its light when it gets there.
+VISIBLE_TRANSMITTANCE = 5e-3
 DECAY = 0.8
+# Of the cells asked about at a refresh, this share is taken for visible again, to be looked into by the rays.
+REOPENED = 1 / 16
 
 
 class Occupancy:
-    """Optical depth of one ray step at each cell, as a decaying maximum over random points inside the cell.
+    """What fills each cell, and whether light gets there: decaying maxima over what was seen of the cell lately.
 
-    A cell is occupied where that exceeds min(0.01, its mean over the grid): the mean keeps cells open at the start,
-    when all of space is thin fog.
-    Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, appendix C, with a faster decay for short trainings.
+    The optical depth of one ray step comes from asking the field at random points; a cell is full where it exceeds
+    min(0.01, its mean over the grid): the mean keeps cells open at the start, when all of space is thin fog. The
+    transmittance comes from the rays of the training itself, and changes only where rays have been: it closes what lies
+    behind surfaces, which nothing ever tells to be empty.
+    Source of the first: Müller et al. 2022, Instant NGP, arXiv:2201.05989, appendix C, with a faster decay for short
+    trainings.
     """
 
     def __init__(self, side: int, device: torch.device):
         self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
+        self.transmittance = torch.ones((side, side, side), device=device)
+        self.lately = torch.full((side, side, side), -1.0, device=device)
 
     @property
     def occupied(self) -> Tensor:
         """(side, side, side) bool, indexed [z, y, x]; cells never looked at are occupied."""
         known = self.optical_depth[self.optical_depth.isfinite()]
         mean = known.mean() if len(known) else self.optical_depth.new_tensor(0.0)
-        return self.optical_depth > mean.clamp_max(OCCUPIED_OPTICAL_DEPTH)
+        full = self.optical_depth > mean.clamp_max(OCCUPIED_OPTICAL_DEPTH)
+        return full & (self.transmittance > VISIBLE_TRANSMITTANCE)
+
+    def observe(self, coordinates: Tensor, transmittance: Tensor) -> None:
+        """Take note of the light (N,) that rays had when they came to points (N, 3) of the unit cube."""
+        kernels.scatter_max(self.lately, coordinates, transmittance)
 
     @torch.no_grad()
     def refresh(
-        self,
-        field: HashField,
-        *,
-        share: float,
-        shortest_step: float,
-        growth: float,
-        generator: torch.Generator,
+        self, field: HashField, *, share: float, shortest_step: float, growth: float, generator: torch.Generator
     ) -> None:
-        """Ask the field at one random point in each of a random `share` of the cells.
+        """Ask the field at one random point in each of a random `share` of the cells, and take in what rays saw.
 
         Args:
             field: the field being trained.
@@ -55,7 +66,43 @@ class Occupancy:
         coordinates = (place + inside) / side
         density = torch.cat([field.density(chunk) for chunk in coordinates.split(2**16)])
         radius = training_points(coordinates, field.settings.unbounded).norm(dim=-1)
-        step = (growth * radius).clamp_min(shortest_step)
+        step = (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as `sampling.step_length`
         flat = self.optical_depth.view(-1)
         old = flat[cells]
         flat[cells] = torch.maximum(torch.where(old.isinf(), 0.0, old * DECAY), density * step)
+
+        passed = torch.maximum(self.transmittance * DECAY, self.lately)
+        self.transmittance = torch.where(self.lately >= 0, passed, self.transmittance)
+        self.transmittance.view(-1)[cells[: round(REOPENED * len(cells))]] = 1.0
+        self.lately.fill_(-1.0)
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs."""
+        return {"optical_depth": self.optical_depth, "transmittance": self.transmittance, "lately": self.lately}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take up what `state` gave."""
+        self.optical_depth = tensors["optical_depth"]
+        self.transmittance = tensors["transmittance"]
+        self.lately = tensors["lately"]
+
+
+def cells_from_points(points: np.ndarray, side: int, unbounded: bool) -> Tensor:
+    """How many cells each cell of a grid is away from the nearest point, diagonal steps counting one.
+
+    Args:
+        points: (N, 3) in the training frame; those outside the grid are left out.
+        side: cells per axis.
+        unbounded: see `kernels.grid_coordinates`.
+
+    Returns:
+        (side, side, side) int32, indexed [z, y, x]; 0 everywhere if there is no point.
+    """
+    coordinates = kernels.grid_coordinates(torch.as_tensor(points), unbounded).numpy()
+    coordinates = coordinates[((coordinates >= 0) & (coordinates < 1)).all(-1)]
+    if len(coordinates) == 0:
+        return torch.zeros((side, side, side), dtype=torch.int32)
+    empty = np.ones((side, side, side), dtype=bool)
+    x, y, z = (coordinates * side).astype(int).T
+    empty[z, y, x] = False
+    return torch.from_numpy(np.asarray(distance_transform_cdt(empty, metric="chessboard"), dtype=np.int32))

@@ -121,12 +121,14 @@ def render_rays(
     )
     encoded = kernels.hash_encode(coordinates, model.field.table, model.field.settings.resolutions)
     density = kernels.density(encoded, tuple(model.field.weights))
-    weights, transmittance = kernels.interval_weights(density, ends - starts, offsets)
+    weights, _ = kernels.interval_weights(density, ends - starts, offsets)
     seen = weights > NEGLIGIBLE_WEIGHT
     rgb = torch.zeros_like(coordinates)
     rays = kernels.ray_indices(offsets)[seen]
     rgb[seen] = model.field.radiance_of_encoded(encoded[seen], directions, rays)[1]
-    colour = kernels.sum_along_rays(weights[:, None] * rgb, offsets) + transmittance[:, None] * background
+    colour, transmittance, _ = kernels.composite(
+        density, rgb, ends - starts, offsets=offsets, background=background.expand(len(origins), 3)
+    )
     if depth is None:
         return colour, 1.0 - transmittance, torch.full_like(transmittance, torch.nan)
     distance = _distance(depth, model, density=density, starts=starts, ends=ends, offsets=offsets)

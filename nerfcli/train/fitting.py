@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,7 +12,7 @@ from nerfcli import kernels
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.render.model import Marching
-from nerfcli.render.occupancy import Occupancy
+from nerfcli.render.occupancy import Occupancy, cells_from_points
 from nerfcli.train.losses import colour_loss, over_background
 from nerfcli.train.photos import PixelPool
 from nerfcli.train.settings import TrainSettings
@@ -22,10 +23,26 @@ REFRESH_SHARE = 1 / 8
 MOST_RAYS = 2**14
 # Samples behind this optical depth see less than a thousandth of the light and are not trained on.
 DEEPEST = 7.0
+# Cells around a point that are open at the start, and the steps after which the next ones open.
+FIRST_CELLS = 2
+STEPS_PER_CELL = 100
 # Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
-STRIDES = ((0.02, 4), (0.1, 2), (1.0, 1))
+STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
 BETAS = (0.9, 0.99)
 EPS = 1e-15
+
+
+def _scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """The same values with gradients times min(1, distance^2).
+
+    Space near a camera is crossed by many of its rays and by those of no other camera: without this it learns
+    faster than what all cameras see, and fog grows in front of the lenses.
+    Source: Philip and Deschaintre 2023, Floaters no more, arXiv:2305.02756, eq. 6.
+    """
+    scale = distance.square().clamp_max(1.0)
+    density = density * scale + (density * (1.0 - scale)).detach()
+    rgb = rgb * scale[:, None] + (rgb * (1.0 - scale)[:, None]).detach()
+    return density, rgb
 
 
 @dataclass(frozen=True)
@@ -40,15 +57,25 @@ class StepResult:
 class Fitting:
     """The state of a training. Same seed, threads and device give the same numbers, step for step."""
 
-    def __init__(self, pool: PixelPool, marching: Marching, *, unbounded: bool, settings: TrainSettings):
+    def __init__(
+        self,
+        pool: PixelPool,
+        marching: Marching,
+        *,
+        points: np.ndarray,
+        unbounded: bool,
+        settings: TrainSettings,
+    ):
         device = pool.colours.device
         torch.manual_seed(settings.seed)
         self.pool = pool
         self.marching = marching
         self.settings = settings
+        self.step = 0
         self.field = HashField(HashFieldSettings(unbounded=unbounded)).to(device)
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
-        self.occupied = self.occupancy.occupied
+        self.cells_from_points = cells_from_points(points, OCCUPANCY_SIDE, unbounded).to(device)
+        self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
         self.optimiser = torch.optim.Adam(
@@ -57,7 +84,6 @@ class Fitting:
         self.table_gradient, self.table_first, self.table_second = (
             torch.zeros_like(self.field.table, requires_grad=False) for _ in range(3)
         )
-        self.step = 0
         self.samples_per_ray = float(len(self.edges) - 2)
 
     def advance(self, share: float) -> StepResult:
@@ -110,8 +136,11 @@ class Fitting:
         """Loss over some rays, and the number of samples it took."""
         device = origins.device
         jitter = torch.rand(len(origins), generator=self.generator, device=device)
-        # What the field lets through is shown a random colour: only opacity explains a photo then.
-        background = torch.rand(len(origins), 3, generator=self.generator, device=device)
+        # Photos with alpha are shown on random colours, so that only opacity explains them. Others fill the frame:
+        # behind them is black, as random colours shining through the fog of the start would drown all else.
+        background = torch.zeros(len(origins), 3, device=device)
+        if colours.shape[-1] == 4:
+            background = torch.rand(len(origins), 3, generator=self.generator, device=device)
         field = self.field
         starts, ends, offsets = kernels.march(
             origins,
@@ -128,13 +157,16 @@ class Fitting:
         with torch.no_grad():
             encoded = kernels.hash_encode(coordinates, field.table, field.settings.resolutions)
             density = kernels.density(encoded, tuple(field.weights))
-            seen = kernels.optical_depth_before(density, ends - starts, offsets) < DEEPEST
+            before = kernels.optical_depth_before(density, ends - starts, offsets)
+            self.occupancy.observe(coordinates, torch.exp(-before))
+            seen = before < DEEPEST
             offsets = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
         encoded = kernels.hash_encode(
             coordinates[seen], field.table, field.settings.resolutions, sink=self.table_gradient, known=encoded[seen]
         )
         density, rgb = field.radiance_of_encoded(encoded, directions, kernels.ray_indices(offsets))
         lengths = (ends - starts)[seen]
+        density, rgb = _scale_gradients(density, rgb, distance=starts[seen])
         rendered, _, _ = kernels.composite(density, rgb, lengths, offsets=offsets, background=background)
         return colour_loss(rendered, over_background(colours, background)), marched
 
@@ -149,7 +181,15 @@ class Fitting:
             growth=self.marching.growth,
             generator=self.generator,
         )
-        self.occupied = self.occupancy.occupied
+        self.occupied = self._open_cells()
+
+    def _open_cells(self) -> Tensor:
+        """Occupied cells, but for those that are still too far from the points that structure from motion found.
+
+        Surfaces are near these points; what lies between them and the cameras is mostly air. Cells open from the points
+        outwards, so that fog cannot grow in front of the cameras before there is something to see behind it.
+        """
+        return self.occupancy.occupied & (self.cells_from_points <= FIRST_CELLS + self.step / STEPS_PER_CELL)
 
     def _check_finite(self, loss: Tensor) -> None:
         gradients = {f"gradient of {name}": p.grad for name, p in self.field.weights.named_parameters()}
@@ -166,7 +206,7 @@ class Fitting:
         """Everything that `restore` needs to go on bit for bit, besides the field's own weights."""
         tensors = {
             "generator": self.generator.get_state(),
-            "optical_depth": self.occupancy.optical_depth,
+            **self.occupancy.state(),
             "table_first": self.table_first,
             "table_second": self.table_second,
         }
@@ -177,8 +217,7 @@ class Fitting:
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
         """Take up what `state` gave; the field's weights are loaded by the caller."""
         self.generator.set_state(tensors["generator"].cpu())
-        self.occupancy.optical_depth = tensors["optical_depth"]
-        self.occupied = self.occupancy.occupied
+        self.occupancy.restore(tensors)
         self.table_first, self.table_second = tensors["table_first"], tensors["table_second"]
         entries: dict[int, dict[str, Tensor]] = {}
         for key, value in tensors.items():
@@ -188,3 +227,4 @@ class Fitting:
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": entries})
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
+        self.occupied = self._open_cells()

@@ -93,7 +93,8 @@ def train(
         f"{'unbounded' if unbounded else 'bounded'} scene, {settings.device}, {settings.threads} threads"
     )
 
-    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings)
+    points = similarity.apply(scene.points)
+    fitting = Fitting(pool, marching, points=points, unbounded=unbounded, settings=settings)
     totals = _Totals()
     if resume:
         totals = _restore(fitting, run)

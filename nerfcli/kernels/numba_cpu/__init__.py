@@ -4,10 +4,10 @@ from pathlib import Path
 
 import torch
 
-from nerfcli.kernels.numba_cpu.compositing import composite, optical_depth_before
+from nerfcli.kernels.numba_cpu.compositing import composite, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
-from nerfcli.kernels.numba_cpu.rays import march, ray_indices, sample_coordinates
+from nerfcli.kernels.numba_cpu.rays import march, ray_indices, sample_coordinates, scatter_max
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows
 
 __all__ = [
@@ -17,12 +17,14 @@ __all__ = [
     "composite",
     "density",
     "hash_encode",
+    "interval_weights",
     "is_compiled",
     "march",
     "optical_depth_before",
     "radiance",
     "ray_indices",
     "sample_coordinates",
+    "scatter_max",
     "warm_up",
 ]
 
@@ -40,12 +42,14 @@ def warm_up() -> None:
     march(direction, direction, torch.arange(4.0), jitter=jitter, occupied=occupied, unbounded=True)
     starts, lengths = torch.tensor([0.0, 1.0]), torch.ones(2)
     points = sample_coordinates(direction, direction, starts, starts + 1, offsets=offsets, unbounded=True)
+    scatter_max(torch.zeros(2, 2, 2), points, lengths)
     table = torch.zeros(8, 16, 4, requires_grad=True)
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     weights = tuple(torch.zeros(shape, requires_grad=True) for shape in shapes)
     encoded = hash_encode(points, table, (2,) * 8, None, None)
     optical_depth_before(density(encoded, weights), lengths, offsets)
     thickness, rgb = radiance(encoded, torch.zeros(1, 16), ray_indices(offsets), weights)
+    interval_weights(thickness, lengths, offsets)
     colour, _, _ = composite(thickness, rgb, lengths, offsets=offsets, background=torch.zeros(3))
     colour.sum().backward()
     gradient, first, second = (torch.zeros(8, 16, 4) for _ in range(3))

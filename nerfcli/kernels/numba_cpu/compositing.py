@@ -82,6 +82,17 @@ def _backward(
             rgb_gradient[i, 2] = weight * gb
 
 
+@numba.njit(parallel=True, cache=True, nogil=True)
+def _weights(density: Any, lengths: Any, offsets: Any, weights: Any, transmittance: Any) -> None:
+    for ray in numba.prange(offsets.shape[0] - 1):
+        depth = 0.0
+        for i in range(offsets[ray], offsets[ray + 1]):
+            own = np.float64(density[i]) * np.float64(lengths[i])
+            weights[i] = np.exp(-depth) * -np.expm1(-own)
+            depth += own
+        transmittance[ray] = np.exp(-depth)
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -118,3 +129,12 @@ def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> T
     out = torch.empty_like(density)
     _depth_before(density.contiguous().numpy(), lengths.contiguous().numpy(), offsets.numpy(), out.numpy())
     return out
+
+
+def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """See `reference.interval_weights`; float32 on the CPU, without gradients."""
+    numba.set_num_threads(thread_count())
+    weights, transmittance = torch.empty_like(density), torch.empty(len(offsets) - 1)
+    arrays = (density.detach().contiguous(), lengths.contiguous(), offsets, weights, transmittance)
+    _weights(*(x.numpy() for x in arrays))
+    return weights, transmittance

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
 from nerfcli.kernels.numba_cpu.threads import thread_count
 from nerfcli.kernels.numba_cpu.vector import ROWS, add_product_16, add_product_32
 
@@ -20,7 +21,7 @@ from nerfcli.kernels.numba_cpu.vector import ROWS, add_product_16, add_product_3
 WIDTH = 32
 OUT = 16
 TILE = 64
-LOG_DENSITY_LIMIT = np.float32(15.0)
+LIMIT = np.float32(LOG_DENSITY_LIMIT)
 
 # Where each layer's weights stand in the flat arrays: encoded-hidden, hidden-density, inputs-hidden, hidden-hidden,
 # hidden-colour.
@@ -102,7 +103,12 @@ def _colour_inputs(geometry: Any, harmonics: Any, rays: Any, first: Any, count: 
 
 @numba.njit(inline="always")
 def _density(log_density: Any) -> Any:
-    return np.exp(min(max(log_density, -LOG_DENSITY_LIMIT), LOG_DENSITY_LIMIT))
+    return np.exp(min(max(log_density, -LIMIT), LIMIT))
+
+
+@numba.njit(inline="always")
+def _sigmoid(x: Any) -> Any:
+    return np.float32(1) / (np.float32(1) + np.exp(-x))
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
@@ -148,7 +154,7 @@ def _radiance_forward(
             for i in range(count):
                 density[first + i] = _density(geometry[i * OUT])
                 for channel in range(3):
-                    rgb[first + i, channel] = np.float32(1) / (np.float32(1) + np.exp(-out[i * OUT + channel]))
+                    rgb[first + i, channel] = _sigmoid(out[i * OUT + channel])
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
@@ -158,7 +164,6 @@ def _radiance_backward(
     rays: Any,
     weights: Any,
     back: Any,
-    rgb: Any,
     density_gradient: Any,
     rgb_gradient: Any,
     encoded_gradient: Any,
@@ -175,7 +180,8 @@ def _radiance_backward(
             np.empty(TILE * WIDTH, np.float32),
         )
         g, g2 = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
-        geometry, g_out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
+        geometry, out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
+        g_out = np.empty(TILE * OUT, np.float32)
         own = sums[thread]
         for tile in range(thread * tiles // threads, (thread + 1) * tiles // threads):
             first = tile * TILE
@@ -190,11 +196,14 @@ def _radiance_backward(
             _layer_32(h2, weights, C2, WIDTH, h3)
             _rectify(h3)
 
+            # The slope of the sigmoid from both its tails: value * (1 - value) loses every digit near 1.
+            _layer_16(h3, weights, C3, out)
             g_out[:] = np.float32(0)
             for i in range(count):
                 for channel in range(3):
-                    value = rgb[first + i, channel]
-                    g_out[i * OUT + channel] = rgb_gradient[first + i, channel] * value * (np.float32(1) - value)
+                    x_out = out[i * OUT + channel]
+                    slope = _sigmoid(x_out) * _sigmoid(-x_out)
+                    g_out[i * OUT + channel] = rgb_gradient[first + i, channel] * slope
             _weights_16(h3, g_out, own, C3)
             _back_from_16(g_out, back, C3, 3, g)
             _mask(g, h3)
@@ -239,17 +248,17 @@ class _Radiance(torch.autograd.Function):
             encoded.numpy(), harmonics.numpy(), rays.numpy(), _flat(weights), density.numpy(), rgb.numpy(),
             thread_count(),
         )  # fmt: skip
-        ctx.save_for_backward(encoded, harmonics, rays, rgb, *weights)
+        ctx.save_for_backward(encoded, harmonics, rays, *weights)
         return density, rgb
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        encoded, harmonics, rays, rgb, *weights = ctx.saved_tensors
+        encoded, harmonics, rays, *weights = ctx.saved_tensors
         threads = thread_count()
         encoded_gradient = torch.empty_like(encoded)
         sums = np.zeros((threads, WEIGHTS), np.float32)
         _radiance_backward(
-            encoded.numpy(), harmonics.numpy(), rays.numpy(), _flat(weights), _flat_back(weights), rgb.numpy(),
+            encoded.numpy(), harmonics.numpy(), rays.numpy(), _flat(weights), _flat_back(weights),
             gradients[0].contiguous().numpy(), gradients[1].contiguous().numpy(), encoded_gradient.numpy(), sums,
             threads,
         )  # fmt: skip

@@ -1,7 +1,7 @@
 """What Numba has no words for: asking for a cache line ahead of time, and a block of a matrix product in registers."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -30,7 +30,7 @@ def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
 
 
 # prefetch(array, index) asks for the cache line of array[index] of a flat float32 array, without waiting for it.
-prefetch: Callable[[Any, Any], None] = _prefetch
+prefetch: Callable[[Any, Any], None] = cast(Any, _prefetch)
 
 
 def _block_product(vectors: int) -> Callable[..., None]:

@@ -1,0 +1,51 @@
+# What to do with a fresh copy of this project:
+#   make demo    photos of a desk -> poses, field, numbers, depth maps and a flight around it, in demo/
+#   make test    what CI runs: format, lint, types, tests
+#   make clean   remove .venv, demo/ and all caches
+# Demo and test make .venv first, once. With a Python of your choice: make test PYTHON=/opt/python/bin/python3.13
+
+PYTHON =
+BIN = .venv/bin
+PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.PHONY: demo test clean
+
+demo: .venv/installed
+	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --frames 48 --max-size 400
+	@printf '%s\n' '' 'Have a look at:' \
+	    '  demo/run/renders/orbit-conditional-z/rgb.mp4     a flight around the desk' \
+	    '  demo/run/renders/orbit-conditional-z/depth.mp4   the same flight in depth' \
+	    '  demo/run/renders/test-conditional-z/             held-out views: rgb/, depth/, opacity/' \
+	    '  demo/run/metrics.json                            how close these are to the photos' \
+	    '  demo/scene/poses_report.json                     what became of each photo'
+
+test: .venv/installed-dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/basedpyright
+	$(BIN)/pytest
+
+.venv/installed: $(BIN)/python pyproject.toml constraints.txt
+	$(PIP_INSTALL) -e .
+	@touch $@
+
+.venv/installed-dev: $(BIN)/python pyproject.toml constraints.txt
+	$(PIP_INSTALL) -e '.[dev]'
+	@touch $@ .venv/installed
+
+$(BIN)/python:
+	@if [ -n "$(PYTHON)" ]; then set -- "$(PYTHON)"; else set -- python3.11 python3; fi; \
+	found=; \
+	for python; do \
+	    version=$$("$$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null) || continue; \
+	    found="$$found $$python is Python $$version;"; \
+	    "$$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || continue; \
+	    echo "making .venv with $$python (Python $$version)"; \
+	    "$$python" -m venv .venv && exit 0; \
+	    rm -rf .venv; exit 1; \
+	done; \
+	echo "Python 3.11 or newer is needed;$${found:- none found;} name one with PYTHON=/path/to/python" >&2; exit 1
+
+clean:
+	rm -rf .venv demo build dist nerfcli.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,132 @@
+"""Who imports whom, where heavy libraries may stand, and how large a file may grow: read from the source itself."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import nerfcli
+
+ROOT = Path(nerfcli.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
+
+# A part is a folder of nerfcli or a module beside the folders. What stands on the right may be imported by the left.
+LEAVES = {"errors", "atomic", "__init__"}
+MAY_IMPORT = {
+    "errors": set(),
+    "atomic": set(),
+    "__init__": set(),
+    "cameras": set(),
+    "media": set(),
+    "kernels": set(),
+    "field": {"kernels"},
+    "scene": {"cameras", "media"},
+    "poses": {"scene", "cameras", "media"},
+    "render": {"field", "kernels", "cameras"},
+    "train": {"render", "field", "kernels", "scene", "cameras", "media"},
+    "evaluate": {"render", "field", "scene", "cameras", "media"},
+    "export": {"render", "field", "scene", "cameras", "media"},
+    "report": {"media"},
+    "viewer": {"render", "field", "scene", "cameras", "media"},
+}
+# Libraries that are heavy, or whose ways must not spread, and the parts that may use them.
+CONFINED = {
+    "torch": {"kernels", "field", "render", "train", "evaluate", "export", "viewer", "cli"},
+    "safetensors": {"field"},
+    "numba": {"kernels"},
+    "triton": {"kernels"},
+    "pycolmap": {"poses", "cameras"},
+    "typer": {"cli"},
+    "rich": {"cli"},
+}
+# The command line starts in a fraction of a second because these are imported inside the commands that need them.
+NOT_AT_START = ("torch", "numpy", "numba", "scipy", "cv2", "pycolmap", "skimage", "PIL", "imageio_ffmpeg", "rich")
+MOST_LINES = 400
+
+
+def part_of(path: Path) -> str:
+    """The part of the program that a file belongs to."""
+    first = path.relative_to(ROOT).parts[0]
+    return first.removesuffix(".py")
+
+
+def imported(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and full dotted name of everything that a file imports, inside functions too."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: relative imports hide who imports whom"
+            yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
+
+
+def imported_parts(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and part of what a file imports from nerfcli; "from nerfcli import x" means part x, or the version."""
+    for line, name in imported(path):
+        library, *rest = name.split(".")
+        if library == "nerfcli":
+            yield line, rest[0] if rest and rest[0] in {*MAY_IMPORT, "cli"} else "__init__"
+
+
+def test_there_is_something_to_check():
+    assert len(FILES) > 30
+    assert {part_of(path) for path in FILES} >= {"cli", "train", "render", "field", "kernels", "cameras", "media"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_point_down(path):
+    part = part_of(path)
+    allowed = {*MAY_IMPORT, "cli"} if part == "cli" else MAY_IMPORT[part] | LEAVES | {part}
+    wrong = [f"line {line}: {part} imports {other}" for line, other in imported_parts(path) if other not in allowed]
+    assert not wrong
+
+
+def test_the_rules_have_no_circle():
+    seen: set[str] = set()
+    while left := set(MAY_IMPORT) - seen:
+        ready = {part for part in left if MAY_IMPORT[part] <= seen}
+        assert ready, f"{left} import each other"
+        seen |= ready
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_heavy_libraries_stay_where_they_belong(path):
+    part = part_of(path)
+    libraries = [(line, name.split(".")[0]) for line, name in imported(path)]
+    assert not [f"line {line}: {name} in {part}" for line, name in libraries if part not in CONFINED.get(name, {part})]
+
+
+def test_the_command_line_starts_without_heavy_libraries():
+    # Of the process that `nerfcli --help` is; libraries that Python itself loads at its start do not count.
+    code = "import sys; import nerfcli.cli; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not set(NOT_AT_START) & set(loaded)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_only_the_command_line_prints_and_exits(path):
+    if part_of(path) == "cli":
+        return
+    wrong = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("print", "exit", "quit", "sys.exit"):
+            wrong.append(f"line {node.lineno}: {ast.unparse(node.func)}")
+    assert not wrong
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
+def test_a_folder_holds_several_ideas(folder):
+    assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) >= 2
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_file_holds_one_idea_and_says_which(path):
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= MOST_LINES
+    assert path.stem not in ("utils", "util", "helpers", "misc", "common")
+    if text.strip():
+        assert ast.get_docstring(ast.parse(text)), "a module says in its docstring what it is for"

@@ -1,0 +1,579 @@
+"""The commands as a user meets them: help, exit codes, two-line errors, batches, what is kept and what is refused."""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer.main
+from conftest import SPHERES
+from fog import fog, foggy_cells
+from PIL import Image
+from typer.exceptions import TyperException
+from typer.testing import CliRunner, Result
+
+from nerfcli import cli, scene
+from nerfcli.atomic import write_json
+from nerfcli.cli import poses as poses_command
+from nerfcli.cli.options import seconds_from_text, thread_count
+from nerfcli.errors import BAD_INPUT, INTERRUPTED, OUT_OF_MEMORY, TOO_FEW_PHOTOS
+from nerfcli.media.depth import read_tiff
+from nerfcli.render.model import save_model
+from nerfcli.train import loop
+from nerfcli.train.loop import Progress
+from nerfcli.train.normalisation import training_frame
+from nerfcli.train.run_folder import append_log, describe_run, write_cameras
+from nerfcli.train.settings import TrainSettings
+
+COMMANDS = ("poses", "train", "evaluate", "render", "run", "info")
+USAGE = 2
+README = Path(__file__).parent.parent / "README.md"
+# Enough for a command that trains to do everything that it does.
+QUICK = ("--steps", "1", "--downscale", "8", "--threads", "2")
+
+
+def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:
+    """Run a command in this process; a bug keeps its traceback."""
+    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments], input=stdin)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def error_of(result: Result) -> tuple[str, str]:
+    """Error and hint of a failed command, which are all that it said besides notes."""
+    lines = [line for line in result.stderr.splitlines() if line.startswith(("Error:", "Hint:"))]
+    assert len(lines) == 2, result.stderr
+    assert "Traceback" not in result.stderr
+    return lines[0], lines[1]
+
+
+def listing(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder with its content, hidden ones too."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def write_photos(folder: Path, count: int) -> Path:
+    folder.mkdir(parents=True)
+    for index in range(count):
+        pixels = np.random.default_rng(index).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+        Image.fromarray(pixels).save(folder / f"photo {index}.jpg", quality=95)
+    return folder
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """A scene of a few views in a place with a space and letters beyond ASCII."""
+    folder = tmp_path / "Küche 2" / "spheres"
+    for split, names in (("train", range(4)), ("test", range(1))):
+        (folder / split).mkdir(parents=True)
+        listed = json.loads((SPHERES / f"transforms_{split}.json").read_text())
+        listed["frames"] = listed["frames"][: len(names)]
+        (folder / f"transforms_{split}.json").write_text(json.dumps(listed))
+        for index in names:
+            shutil.copy(SPHERES / split / f"r_{index:03d}.png", folder / split)
+    return folder
+
+
+@pytest.fixture
+def finished(capture: Path) -> Path:
+    """A run of `capture` whose field is fog; nothing was trained."""
+    run = capture.with_name("spheres-run")
+    loaded = scene.load(capture)
+    settings = TrainSettings(budget_seconds=None, steps=7)
+    similarity, _ = training_frame(loaded, unbounded=False)
+    run.mkdir()
+    write_json(run / "config.json", describe_run(loaded, settings, 8))
+    write_cameras(run, loaded.train_frames, loaded.test_frames)
+    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    save_model(run / "field.safetensors", fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32))
+    entry = {"step": 7, "seconds": 2.0, "samples": 100, "loss": 0.1, "samples_per_second": 50, "peak_memory_bytes": 9}
+    append_log(run, entry)
+    return run
+
+
+# Help, examples, README
+
+
+def check_that_it_parses(line: str) -> None:
+    """Every `nerfcli ...` of a shell line names a command and options that exist, with values that they take."""
+    for part in line.split("|"):
+        words = shlex.split(part.split("->")[0], comments=True)
+        if not words or words[0] != "nerfcli":
+            continue
+        if words[1:] not in (["--help"], ["--version"]) and "--help" not in words:
+            group: Any = typer.main.get_command(cli.app)
+            group.commands[words[1]].make_context(words[1], words[2:])
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_examples_that_parse(command):
+    result = nerfcli(command, "--help")
+    assert result.exit_code == 0
+    after = result.stdout.split("Examples:")[1]
+    examples = [line.strip() for line in after.splitlines() if re.match(rf"\s+.*nerfcli {command} ", line)]
+    assert examples
+    for example in examples:
+        check_that_it_parses(example)
+
+
+def test_help_lists_every_command_and_the_exit_codes():
+    result = nerfcli("--help")
+    assert result.exit_code == 0
+    assert all(re.search(rf"^\s+{command}\b", result.stdout, re.M) for command in COMMANDS)
+    assert "130 interrupted" in re.sub(r"\s+", " ", result.stdout)
+    for line in result.stdout.splitlines():
+        if line.strip().startswith("nerfcli "):
+            check_that_it_parses(line)
+
+
+def test_version():
+    assert nerfcli("--version").stdout.split() == ["nerfcli", "0.1.0"]
+
+
+def readme_lines() -> list[str]:
+    """The command lines of the README's fenced blocks, continued lines joined."""
+    blocks = re.findall(r"^```[a-z]*\n(.*?)^```", README.read_text(encoding="utf-8"), re.M | re.S)
+    lines = "".join(blocks).replace("\\\n", " ").splitlines()
+    return [line.strip().removeprefix("$ ") for line in lines if re.search(r"(^|\|)\s*(\$ )?nerfcli ", line)]
+
+
+def test_every_command_line_of_the_readme_parses():
+    lines = readme_lines()
+    assert {line.split("nerfcli ")[1].split()[0] for line in lines} >= {"poses", "train", "evaluate", "render", "run"}
+    for line in lines:
+        check_that_it_parses(line)
+
+
+def test_a_line_that_does_not_parse_is_noticed():
+    for line, message in (
+        ("nerfcli trian x", "trian"),
+        ("nerfcli train x --stepz 3", "stepz"),
+        ("nerfcli train x --steps 0  # a comment", "greater than or equal to 1"),
+        ("ls -d */ | nerfcli train", None),
+    ):
+        with pytest.raises((KeyError, TyperException), match=message):
+            check_that_it_parses(line)
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90s", 90), ("5m", 300), ("1.5h", 5400), ("45", 45), (" 2 m ", 120)])
+def test_times(text, seconds):
+    assert seconds_from_text(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "0s", "-5s", "5 minutes", "1e3", "m"])
+def test_what_is_no_time(text):
+    with pytest.raises(typer.BadParameter, match="is not a time; write 90s, 5m or 1h"):
+        seconds_from_text(text)
+
+
+def test_all_threads_are_the_processors_of_this_process():
+    assert thread_count(3) == 3
+    assert 1 <= thread_count(0) <= (os.cpu_count() or 1)
+
+
+# Exit codes and errors
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("train", "scene"),
+        ("trian x", "trian"),
+        ("train x --stepz 3", "--stepz"),
+        ("train x --steps 0", "--steps"),
+        ("train x --downscale 3", "'3'; choose auto, 1, 2, 4 or 8"),
+        ("train x --budget soon", "'soon' is not a time"),
+        ("train x --device tpu", "'tpu'"),
+        ("poses x --camera-model PERSPECTIVE", "'PERSPECTIVE'; choose auto"),
+        ("render x --depth expected", "'expected'; choose one of conditional, moment"),
+        ("render x --depth-axis y", "'y'; choose ray or z"),
+        ("render x --outputs rgb,normals", "'normals'; choose some of rgb,depth,opacity"),
+        ("render x --opacity-floor 1.5", "--opacity-floor"),
+        ("run x --budget -1", "'-1' is not a time"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2_and_names_the_value(line, named):
+    result = nerfcli(*line.split())
+    assert result.exit_code == USAGE
+    assert result.stdout == ""
+    assert named in re.sub(r"\s+", " ", result.stderr)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_missing_path_is_told_in_two_lines(command, tmp_path):
+    result = nerfcli(command, tmp_path / "nö such")
+    assert result.exit_code == BAD_INPUT
+    assert "nö such" in error_of(result)[0]
+    assert listing(tmp_path) == {}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_empty_folder_is_told_in_two_lines(command, tmp_path):
+    (tmp_path / "empty").mkdir()
+    result = nerfcli(command, tmp_path / "empty")
+    assert result.exit_code == BAD_INPUT
+    assert "empty" in error_of(result)[0]
+    assert listing(tmp_path) == {}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_file_instead_of_a_folder_is_told_in_two_lines(command, tmp_path):
+    (tmp_path / "file.txt").write_text("hello")
+    result = nerfcli(command, tmp_path / "file.txt")
+    assert result.exit_code == BAD_INPUT
+    assert "file.txt" in error_of(result)[0]
+    assert listing(tmp_path) == {"file.txt": b"hello"}
+
+
+@pytest.mark.parametrize("command", ["poses", "run"])
+def test_two_photos_are_too_few(command, tmp_path):
+    write_photos(tmp_path / "photos", 2)
+    before = listing(tmp_path)
+    result = nerfcli(command, tmp_path / "photos")
+    assert result.exit_code == TOO_FEW_PHOTOS
+    error, hint = error_of(result)
+    assert "only 2 photos" in error
+    assert "at least 4" in error
+    assert "20 or more" in hint
+    assert listing(tmp_path) == before
+
+
+def test_damaged_photos_are_named_with_what_is_wrong(tmp_path):
+    photos = write_photos(tmp_path / "photos", 4)
+    short = photos / "photo 0.jpg"
+    short.write_bytes(short.read_bytes()[:1500])
+    (photos / "photo 1.jpg").write_text("this is text")
+    before = listing(tmp_path)
+    result = nerfcli("poses", photos)
+    assert result.exit_code == TOO_FEW_PHOTOS
+    error, hint = error_of(result)
+    assert "only 2 of 4 photos" in error
+    assert "photo 0.jpg: damaged or cut short" in error.replace(" is ", " ")
+    assert "copy the damaged files again" in hint
+    assert listing(tmp_path) == before
+
+
+def test_photos_without_poses_are_sent_to_poses(tmp_path):
+    photos = write_photos(tmp_path / "photos", 5)
+    result = nerfcli("train", photos, *QUICK)
+    assert result.exit_code == BAD_INPUT
+    error, hint = error_of(result)
+    assert "holds 5 photos, but no poses" in error
+    assert f"nerfcli poses {photos}" in hint
+    assert not (tmp_path / "photos-run").exists()
+
+
+@pytest.mark.parametrize("command", ["evaluate", "render"])
+def test_a_folder_that_is_no_run_is_told(command, capture):
+    before = listing(capture.parent)
+    result = nerfcli(command, capture)
+    assert result.exit_code == BAD_INPUT
+    error, hint = error_of(result)
+    assert str(capture) in error
+    assert "nerfcli train" in hint or "train first" in hint
+    assert listing(capture.parent) == before
+
+
+def test_an_output_that_cannot_be_written_leaves_nothing(capture, finished, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    photos = write_photos(tmp_path / "photos", 5)
+    before = listing(tmp_path)
+    for arguments in (
+        ["poses", photos],
+        ["train", capture, *QUICK],
+        ["render", finished, "--outputs", "opacity"],
+    ):
+        result = nerfcli(*arguments, "-o", tmp_path / "file" / "result")
+        assert result.exit_code == BAD_INPUT, arguments
+        assert "cannot write" in error_of(result)[0]
+        assert listing(tmp_path) == before, arguments
+        result = nerfcli(*arguments, "-o", tmp_path / "file")
+        assert result.exit_code == BAD_INPUT, arguments
+        error_of(result)
+        assert listing(tmp_path) == before, arguments
+
+
+def test_memory_that_runs_out_is_exit_code_6(monkeypatch, capture, finished):
+    def exhausted(*args: object, **kwargs: object) -> None:
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp:114] DefaultCPUAllocator: not enough memory: you tried")
+
+    monkeypatch.setattr("nerfcli.render.model.load_model", exhausted)
+    result = nerfcli("evaluate", finished)
+    assert result.exit_code == OUT_OF_MEMORY
+    assert error_of(result)[0] == "Error: out of memory"
+    result = nerfcli("evaluate", "-", stdin=f"{finished}\n{finished}\n")
+    assert result.exit_code == OUT_OF_MEMORY
+    assert result.stderr.count("out of memory") == 2
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch, finished):
+    def broken(*args: object, **kwargs: object) -> None:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("nerfcli.render.model.load_model", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        nerfcli("evaluate", finished)
+
+
+# Results, batches, what is kept
+
+
+def test_train_evaluate_render_info_in_a_row(capture):
+    run = capture.with_name("spheres-run")
+    trained = nerfcli("train", capture, *QUICK)
+    assert (trained.exit_code, trained.stdout) == (0, f"{run}\n")
+    evaluated = nerfcli("evaluate", run, "--json")
+    assert evaluated.exit_code == 0
+    metrics = json.loads(evaluated.stdout)
+    assert metrics["path"] == str(run / "metrics.json")
+    assert set(metrics["mean"]) == {"psnr", "ssim"}
+    assert [image["name"] for image in metrics["images"]] == ["test/r_000.png"]
+    assert metrics["training"]["steps"] == 1
+    assert json.loads((run / "metrics.json").read_text()) == {k: v for k, v in metrics.items() if k != "path"}
+    rendered = nerfcli("render", run, "--depth", "median", "--depth-axis", "ray", "--quiet")
+    assert rendered.stderr == ""
+    folder = run / "renders" / "test-median-ray"
+    assert rendered.stdout.splitlines() == [str(folder / name) for name in ("rgb", "depth", "opacity")]
+    depth, meta = read_tiff(folder / "depth" / "test" / "r_000.tiff")
+    assert depth.shape == (9, 12)
+    assert (meta.convention, meta.axis, meta.unit) == ("median", "ray", "arbitrary")
+    told = json.loads(nerfcli("info", run, "--json").stdout)
+    assert (told["kind"], told["photos"], told["held_out"], told["step"]) == ("run", 4, 1, 1)
+    assert told["metrics"] == metrics["mean"]
+
+
+def test_info_of_a_scene(capture):
+    told = json.loads(nerfcli("info", capture, "--json").stdout)
+    assert (told["path"], told["kind"], told["photos"], told["held_out"]) == (str(capture), "blender", 5, 1)
+    assert told["fingerprint"] == scene.fingerprint(scene.load(capture))
+    plain = nerfcli("info", capture).stdout
+    assert plain.splitlines()[0] == str(capture)
+    assert "  kind: blender" in plain
+
+
+def test_a_batch_goes_on_after_a_bad_path(capture, tmp_path):
+    other = tmp_path / "zweite Szene"
+    shutil.copytree(capture, other)
+    result = nerfcli("train", "-", *QUICK, stdin=f"{capture}\n{tmp_path / 'missing'}\n\n{other}\n")
+    assert result.exit_code == BAD_INPUT
+    assert result.stdout.splitlines() == [f"{capture}-run", f"{other}-run"]
+    error, _ = error_of(result)
+    assert error.startswith(f"Error: {tmp_path / 'missing'}: ")
+    assert (capture.with_name("spheres-run") / "field.safetensors").exists()
+    # Those results, as they stand on stdout, are the next command's input.
+    result = nerfcli("evaluate", "-", "--json", stdin=result.stdout)
+    assert result.exit_code == 0
+    paths = [json.loads(line)["path"] for line in result.stdout.splitlines()]
+    assert paths == [f"{capture}-run/metrics.json", f"{other}-run/metrics.json"]
+
+
+def test_many_inputs_share_one_output_folder(capture, tmp_path):
+    result = nerfcli("train", "-", *QUICK, "-o", tmp_path / "runs", stdin=f"{capture}\n")
+    assert result.stdout.splitlines() == [str(tmp_path / "runs" / "spheres-run")]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("stdin", ["", "\n\n"])
+def test_an_empty_batch_is_told(command, stdin):
+    result = nerfcli(command, "-", stdin=stdin)
+    assert result.exit_code == BAD_INPUT
+    assert "no path came on standard input" in error_of(result)[0]
+
+
+def test_a_finished_training_is_kept_another_one_refused_and_overwritten_on_demand(capture):
+    run = capture.with_name("spheres-run")
+    assert nerfcli("train", capture, *QUICK).exit_code == 0
+    before = listing(run)
+    again = nerfcli("train", capture, *QUICK)
+    assert (again.exit_code, again.stdout) == (0, f"{run}\n")
+    assert "is kept" in again.stderr
+    assert listing(run) == before
+    other = nerfcli("train", capture, *QUICK, "--seed", "5")
+    assert other.exit_code == BAD_INPUT
+    assert "exists" in error_of(other)[0]
+    assert listing(run) == before
+    replaced = nerfcli("train", capture, *QUICK, "--seed", "5", "--overwrite")
+    assert replaced.exit_code == 0
+    assert listing(run)["field.safetensors"] != before["field.safetensors"]
+    longer = nerfcli("train", capture, "--steps", "2", "--downscale", "8", "--seed", "5", "--resume")
+    assert longer.exit_code == 0
+    assert "resumed at step 1" in longer.stderr
+
+
+def test_resume_needs_a_run_of_the_same_scene(capture, finished, tmp_path):
+    result = nerfcli("train", capture, *QUICK, "--resume", "-o", tmp_path / "nothing")
+    assert result.exit_code == BAD_INPUT
+    assert "nothing to resume" in error_of(result)[0]
+    other = tmp_path / "other"
+    shutil.copytree(capture, other)
+    listed = json.loads((other / "transforms_train.json").read_text())
+    listed["frames"].pop()
+    (other / "transforms_train.json").write_text(json.dumps(listed))
+    result = nerfcli("train", other, *QUICK, "--resume", "-o", finished)
+    assert result.exit_code == BAD_INPUT
+    assert "another scene" in error_of(result)[0]
+
+
+def test_train_does_not_write_into_a_folder_with_other_files(capture, tmp_path):
+    (tmp_path / "diary").mkdir()
+    (tmp_path / "diary" / "monday.txt").write_text("rain")
+    result = nerfcli("train", capture, *QUICK, "-o", tmp_path / "diary", "--overwrite")
+    assert result.exit_code == BAD_INPUT
+    error_of(result)
+    assert listing(tmp_path / "diary") == {"monday.txt": b"rain"}
+
+
+def test_a_run_without_its_log_cannot_be_evaluated(finished):
+    (finished / "log.jsonl").unlink()
+    result = nerfcli("evaluate", finished)
+    assert result.exit_code == BAD_INPUT
+    assert "has no log.jsonl" in error_of(result)[0]
+
+
+def test_metrics_are_kept_for_the_same_checkpoint_and_refused_for_another(finished):
+    first = nerfcli("evaluate", finished)
+    assert (first.exit_code, first.stdout) == (0, f"{finished / 'metrics.json'}\n")
+    before = listing(finished)
+    again = nerfcli("evaluate", finished)
+    assert "is kept" in again.stderr
+    assert listing(finished) == before
+    metrics = json.loads(before["metrics.json"]) | {"checkpoint_sha256": "another"}
+    write_json(finished / "metrics.json", metrics)
+    result = nerfcli("evaluate", finished)
+    assert result.exit_code == BAD_INPUT
+    assert "earlier state" in error_of(result)[0]
+    assert nerfcli("evaluate", finished, "--overwrite").exit_code == 0
+
+
+def test_a_folder_with_other_files_is_never_replaced_by_renders(finished, tmp_path):
+    (tmp_path / "diary").mkdir()
+    (tmp_path / "diary" / "monday.txt").write_text("rain")
+    for target in (tmp_path / "diary", tmp_path / "diary" / "monday.txt"):
+        result = nerfcli("render", finished, "--outputs", "rgb", "-o", target, "--overwrite")
+        assert result.exit_code == BAD_INPUT
+        assert "something else than renders" in error_of(result)[0]
+    assert listing(tmp_path / "diary") == {"monday.txt": b"rain"}
+
+
+def test_renders_are_kept_refused_and_overwritten(finished, tmp_path):
+    arguments = ["render", finished, "--outputs", "opacity", "-o", tmp_path / "views"]
+    assert nerfcli(*arguments).stdout == f"{tmp_path / 'views' / 'opacity'}\n"
+    before = listing(tmp_path / "views")
+    assert "is kept" in nerfcli(*arguments).stderr
+    result = nerfcli(*arguments, "--max-size", "8")
+    assert result.exit_code == BAD_INPUT
+    assert "exists" in error_of(result)[0]
+    assert listing(tmp_path / "views") == before
+    assert nerfcli(*arguments, "--max-size", "8", "--overwrite").exit_code == 0
+    assert listing(tmp_path / "views") != before
+
+
+@pytest.mark.parametrize("cameras", ["train", "orbit", "spiral", "interpolate"])
+def test_cameras_to_render_from(cameras, finished):
+    arguments = ("--cameras", cameras, "--frames", "3", "--outputs", "rgb", "--max-size", "10", "--video")
+    result = nerfcli("render", finished, *arguments)
+    folder = finished / "renders" / cameras
+    assert (result.exit_code, result.stdout) == (0, f"{folder / 'rgb.mp4'}\n")
+    assert len(list((folder / "rgb").rglob("*.png"))) == (4 if cameras == "train" else 3)
+
+
+def test_cameras_of_another_file_and_none_at_all(capture, finished, tmp_path):
+    arguments = ["render", finished, "--outputs", "rgb", "--max-size", "10", "-o", tmp_path / "views"]
+    assert nerfcli(*arguments, "--cameras", capture).exit_code == 0
+    assert len(list((tmp_path / "views" / "rgb").rglob("*.png"))) == 5
+    result = nerfcli(*arguments, "--cameras", "somewhere")
+    assert result.exit_code == BAD_INPUT
+    assert "no cameras called somewhere" in error_of(result)[0]
+
+
+def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch, capture, tmp_path):
+    # Structure from motion has its own tests; here it finds the poses that the capture has.
+    def known_poses(folder: Path, target: Path, **settings: object) -> None:
+        if not target.exists():
+            shutil.copytree(folder, target)
+
+    monkeypatch.setattr(poses_command, "estimate_scene", known_poses)
+    arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--frames", "2", "--max-size", "16"]
+
+    def interrupted(*args: Any, on_progress: Callable[[Progress], None], **settings: Any) -> None:
+        def stop_at_the_first_step(progress: Progress) -> None:
+            raise KeyboardInterrupt
+
+        loop_train(*args, on_progress=stop_at_the_first_step, **settings)
+
+    loop_train = loop.train
+    monkeypatch.setattr(loop, "train", interrupted)
+    stopped = nerfcli(*arguments)
+    assert (stopped.exit_code, stopped.stdout) == (INTERRUPTED, "")
+    monkeypatch.undo()
+    monkeypatch.setattr(poses_command, "estimate_scene", known_poses)
+
+    first = nerfcli(*arguments)
+    assert "resumed at step 1" in first.stderr
+    run = tmp_path / "all" / "run"
+    expected = [
+        *(tmp_path / "all" / "scene", run, run / "metrics.json"),
+        *(run / "renders" / "test-conditional-z" / name for name in ("rgb", "depth", "opacity")),
+        *(run / "renders" / "orbit-conditional-z" / f"{name}.mp4" for name in ("rgb", "depth")),
+    ]
+    assert first.exit_code == 0, first.stderr
+    assert first.stdout.splitlines() == [str(path) for path in expected]
+    assert all(path.exists() for path in expected)
+    before = listing(run)
+    again = nerfcli(*arguments)
+    assert (again.exit_code, again.stdout) == (0, first.stdout)
+    assert listing(run) == before
+
+
+# Processes of their own
+
+
+def started(*arguments: str | Path) -> subprocess.Popen[str]:
+    """The command as the shell starts it."""
+    command = [sys.executable, "-c", "from nerfcli.cli import main; main()", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(capture):
+    run = capture.with_name("spheres-run")
+    process = started("train", capture, "--budget", "10m", "--downscale", "8", "--threads", "1")
+    deadline = time.monotonic() + 120
+    while not (run / "log.jsonl").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == INTERRUPTED, stderr
+    assert stdout == ""
+    assert "Traceback" not in stderr
+    assert f"go on with: nerfcli train {shlex.quote(str(capture))} -o {shlex.quote(str(run))} --resume" in stderr
+    assert {path.name for path in run.iterdir()} >= {"config.json", "field.safetensors", "state.safetensors"}
+    assert not list(run.rglob("*partial*"))
+
+
+def test_errors_and_results_go_to_their_own_streams(tmp_path):
+    process = started("info", tmp_path / "missing")
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == BAD_INPUT
+    assert stdout == ""
+    assert [line.split(":")[0] for line in stderr.splitlines()] == ["Error", "Hint"]
+
+
+def test_a_reader_that_goes_away_ends_the_command_quietly(capture):
+    process = started("info", capture, "--json")
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    with process:
+        assert process.stderr.read() == ""
+    assert process.returncode == 0

@@ -1,0 +1,164 @@
+"""Metrics against closed forms and a direct call of scikit-image; the protocol on a model that is known exactly."""
+
+import hashlib
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from fog import fog, foggy_cells
+from skimage.metrics import structural_similarity
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
+from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
+
+EVERYTHING = np.ones((24, 32), dtype=bool)
+# Full coverage of the picture by an empty grid: what is seen is the background.
+NOWHERE = torch.zeros(4, 4, 4, dtype=torch.bool)
+
+
+def noise(seed: int, shape: tuple[int, ...] = (24, 32, 3)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
+
+
+def test_psnr_of_a_constant_error_in_closed_form():
+    black = np.zeros((24, 32, 3), dtype=np.uint8)
+    for level in (1, 51, 255):
+        assert psnr(black + np.uint8(level), black, used=EVERYTHING) == pytest.approx(-20 * math.log10(level / 255))
+
+
+def test_psnr_of_identical_pictures_is_100():
+    assert psnr(noise(0), noise(0), used=EVERYTHING) == 100
+
+
+def test_psnr_does_not_wrap_around_at_0():
+    white, black = np.full((1, 1, 3), 255, np.uint8), np.zeros((1, 1, 3), np.uint8)
+    one = np.ones((1, 1), dtype=bool)
+    assert psnr(white, black, used=one) == psnr(black, white, used=one) == 0
+
+
+def test_psnr_counts_used_pixels_only():
+    picture, used = noise(0), np.zeros((24, 32), dtype=bool)
+    used[3:5, 7] = True
+    photo = noise(1)
+    photo[used] = picture[used]
+    photo[3, 7, 0] ^= 1
+    assert psnr(picture, photo, used=used) == pytest.approx(10 * math.log10(255**2 * 6))
+
+
+def test_ssim_of_identical_pictures_is_1():
+    assert ssim(noise(0), noise(0), used=EVERYTHING) == 1
+
+
+def test_ssim_is_scikit_images_with_the_papers_window():
+    picture, photo = noise(0), (noise(0) // 2 + noise(1) // 2).astype(np.uint8)
+    mean: Any = structural_similarity(
+        picture, photo, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
+    )
+    # scikit-image's own mean leaves out a border of 5 pixels, where the window hangs over; the map is the same.
+    inside = np.zeros_like(EVERYTHING)
+    inside[5:-5, 5:-5] = True
+    assert ssim(picture, photo, used=inside) == pytest.approx(float(mean), abs=1e-12)
+
+
+def test_ssim_of_two_flat_pictures_in_closed_form():
+    # No variance anywhere: (2 a b + C1) / (a^2 + b^2 + C1), C1 = 0.01^2.
+    flat = [np.full((24, 32, 3), level, dtype=np.uint8) for level in (51, 102)]
+    expected = (2 * 0.2 * 0.4 + 1e-4) / (0.2**2 + 0.4**2 + 1e-4)
+    assert ssim(*flat, used=EVERYTHING) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (2, 5, 3), (3, 3, 3), (4, 9, 3), (10, 40, 3), (11, 11, 3)])
+def test_ssim_of_pictures_smaller_than_its_window(shape):
+    used = np.ones(shape[:2], dtype=bool)
+    assert ssim(noise(0, shape), noise(0, shape), used=used) == 1
+    assert -1 <= ssim(noise(0, shape), noise(1, shape), used=used) < 1
+
+
+def test_8_bit_rounds_to_the_nearest_level_and_clips():
+    levels = np.arange(256)
+    assert np.array_equal(to_8_bit(levels / 255), levels)
+    assert np.array_equal(to_8_bit(np.array([-1.0, 0.4999 / 255, 0.5001 / 255, 1.5])), [0, 0, 1, 255])
+
+
+def test_rgba_over_white_in_closed_form():
+    pixels = np.array([[[10, 20, 30, 255], [10, 20, 30, 0], [0, 100, 255, 51]]], dtype=np.uint8)
+    # 0.2 of the colour and 0.8 of 255 = 204.
+    assert over_white(pixels).tolist() == [[[10, 20, 30], [255, 255, 255], [204, 224, 255]]]
+    rgb = noise(0)
+    assert np.array_equal(over_white(rgb), rgb)
+
+
+def frame(name: str, width: int = 16, height: int = 12) -> Frame:
+    pose = look_at(np.array([0.0, 0.0, -3.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
+    return Frame(name, Camera.pinhole(width, height, 16.0), pose)
+
+
+def test_evaluation_of_an_empty_model_is_the_distance_to_its_background():
+    # Photos without alpha are compared on the model's background (0.2 grey), photos with alpha on white.
+    model = fog(NOWHERE, Similarity.identity(), background=(0.2, 0.2, 0.2))
+    opaque = HeldOut(frame("a.png"), np.full((12, 16, 3), 102, dtype=np.uint8), None)
+    clear = HeldOut(frame("b.png"), np.zeros((12, 16, 4), dtype=np.uint8), None)
+    calls: list[tuple[int, int]] = []
+    metrics = evaluate_model(model, [opaque, clear], on_image=lambda done, total: calls.append((done, total)))
+    first, second = metrics["images"]
+    assert (first["name"], second["name"]) == ("a.png", "b.png")
+    assert first["psnr"] == pytest.approx(-20 * math.log10(0.2))
+    assert (second["psnr"], second["ssim"]) == (100, 1)
+    assert first["pixels"] == 12 * 16
+    assert metrics["mean"]["psnr"] == pytest.approx((first["psnr"] + 100) / 2)
+    assert metrics["mean"]["ssim"] == pytest.approx((first["ssim"] + 1) / 2)
+    assert calls[-1] == (2 * 12 * 16, 2 * 12 * 16)
+    assert metrics["render"]["seconds_per_image"] > 0
+
+
+def test_evaluation_of_fog_in_closed_form():
+    # Straight through a cube of side 2 with density 1: opacity 1 - exp(-2) of colour 1/2 on white.
+    model = fog(foggy_cells((-1, -1, -1), (1, 1, 1)), Similarity.identity())
+    seen = 0.5 * (1 - math.exp(-2)) + math.exp(-2)
+    narrow = Frame("a", Camera.pinhole(3, 3, 3000.0), frame("a").world_from_cam)
+    photo = HeldOut(narrow, np.zeros((3, 3, 4), dtype=np.uint8), None)  # white
+    error = 1 - round(255 * seen) / 255
+    metrics = evaluate_model(model, [photo], on_image=lambda done, total: None)
+    assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(error))
+
+
+def test_masked_pixels_do_not_count():
+    model = fog(NOWHERE, Similarity.identity(), background=(0.0, 0.0, 0.0))
+    pixels, used = noise(0, (12, 16, 3)), np.zeros((12, 16), dtype=bool)
+    used[4, 5] = True
+    pixels[4, 5] = 51
+    metrics = evaluate_model(model, [HeldOut(frame("a"), pixels, used)], on_image=lambda done, total: None)
+    assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(0.2))
+    assert metrics["images"][0]["pixels"] == 1
+
+
+def test_a_mask_that_hides_a_whole_photo_is_told():
+    hidden = HeldOut(frame("a.png"), noise(0, (12, 16, 3)), np.zeros((12, 16), dtype=bool))
+    with pytest.raises(UserError, match=r"no pixel of a\.png is left to compare"):
+        evaluate_model(fog(NOWHERE, Similarity.identity()), [hidden], on_image=lambda done, total: None)
+
+
+def test_protocol_says_what_was_measured():
+    model = fog(NOWHERE, Similarity.identity())
+    photos = [HeldOut(frame(name), np.zeros((12, 16, 4), dtype=np.uint8), None) for name in ("x.png", "y.png")]
+    protocol = evaluate_model(model, photos, on_image=lambda done, total: None)["protocol"]
+    names = hashlib.sha256(b"x.png\ny.png").hexdigest()[:12]
+    assert protocol.startswith(f"nerfcli-1: 2 held-out photos (names sha256 {names}) at 16x12, area-averaged")
+    assert "RGBA on white" in protocol
+    small = HeldOut(frame("x.png", 8, 6), np.zeros((6, 8, 3), dtype=np.uint8), None)
+    protocol = evaluate_model(model, [small], on_image=lambda done, total: None)["protocol"]
+    assert "1 held-out photos" in protocol
+    assert "at 8x6" in protocol
+    assert "RGBA" not in protocol
+
+
+def test_nothing_held_out_is_told():
+    with pytest.raises(UserError, match="no held-out photo to evaluate on") as caught:
+        evaluate_model(fog(NOWHERE, Similarity.identity()), [], on_image=lambda done, total: None)
+    assert caught.value.exit_code == BAD_INPUT

@@ -1,0 +1,173 @@
+"""What `export_frames` leaves on disk: files, their meaning, names, one range over all frames; all or nothing."""
+
+import json
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from fog import fog, foggy_cells
+from PIL import Image
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.errors import UserError
+from nerfcli.export import ExportSettings, effective_floor, export_frames, file_names
+from nerfcli.media.depth import depth_range, preview, read_tiff
+from nerfcli.media.images import read_image
+from nerfcli.render.model import Model
+from nerfcli.render.pictures import DepthRequest, render_picture
+
+CAMERA = Camera.pinhole(10, 8, 8.0)
+DEPTH = DepthRequest("conditional", "z", opacity_floor=0.1)
+
+
+def frame(name: str, distance: float = 2.0) -> Frame:
+    """A camera that looks at the middle of the cube from `distance` training units."""
+    return Frame(name, CAMERA, look_at(np.array([0.0, 0.0, -distance]), np.zeros(3), np.array([0.0, -1.0, 0.0])))
+
+
+@pytest.fixture
+def model() -> Model:
+    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    return fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32, unit="metre")
+
+
+def export(
+    model: Model, frames: list[Frame], folder: Path, *, outputs: tuple[str, ...] = ("rgb", "depth", "opacity"),
+    npy: bool = False, video: bool = False, depth: DepthRequest = DEPTH,
+) -> list[Path]:  # fmt: skip
+    settings = ExportSettings(outputs=outputs, depth=depth, npy=npy, video=video, fps=12)
+    return export_frames(model, frames, folder, settings, provenance={"run": "a run"}, on_rays=lambda rays: None)
+
+
+def listing(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_files_hold_what_was_rendered(model, tmp_path):
+    written = export(model, [frame("a.png")], tmp_path / "views", npy=True)
+    assert written == [tmp_path / "views" / name for name in ("rgb", "depth", "opacity")]
+    assert listing(tmp_path / "views") == [
+        *("depth/a.json", "depth/a.npy", "depth/a.png", "depth/a.tiff"),
+        *("opacity/a.png", "render.json", "rgb/a.png"),
+    ]
+    picture = render_picture(model, frame("a.png"), background=model.background, depth=DEPTH)
+    assert picture.depth is not None
+    depth, meta = read_tiff(tmp_path / "views/depth/a.tiff")
+    np.testing.assert_array_equal(depth, picture.depth)
+    np.testing.assert_array_equal(np.load(tmp_path / "views/depth/a.npy"), picture.depth)
+    np.testing.assert_array_equal(read_image(tmp_path / "views/rgb/a.png"), np.round(picture.rgb * 255))
+    grey = np.round(picture.opacity * 255)[..., None]
+    np.testing.assert_array_equal(read_image(tmp_path / "views/opacity/a.png"), np.repeat(grey, 3, axis=-1))
+    assert (meta.convention, meta.axis, meta.unit, meta.opacity_floor) == ("conditional", "z", "metre", 0.1)
+    assert json.loads((tmp_path / "views/depth/a.json").read_text())["convention"] == "conditional"
+
+
+def test_pictures_say_what_they_are(model, tmp_path):
+    export(model, [frame("a.png")], tmp_path / "views")
+    with Image.open(tmp_path / "views/rgb/a.png") as rgb, Image.open(tmp_path / "views/depth/a.png") as depth:
+        assert rgb.info["colour"] == "sRGB"
+        assert rgb.info["background"] == "(0.2, 0.4, 0.6)"
+        assert (depth.info["convention"], depth.info["axis"], depth.info["unit"]) == ("conditional", "z", "metre")
+    with Image.open(tmp_path / "views/opacity/a.png") as opacity:
+        assert opacity.info["quantity"].startswith("opacity")
+    description = json.loads((tmp_path / "views/render.json").read_text())
+    assert description["depth_meaning"]["convention"] == "conditional"
+    assert description["settings"]["outputs"] == ["rgb", "depth", "opacity"]
+    assert description["run"] == "a run"
+    (listed,) = description["frames"]
+    assert listed["file"] == "a"
+    assert Camera.from_json(listed["camera"]) == CAMERA
+    np.testing.assert_array_equal(listed["world_from_cam"], frame("a").world_from_cam)
+
+
+def test_only_what_is_asked_for_is_written(model, tmp_path):
+    export(model, [frame("a.png")], tmp_path / "views", outputs=("opacity",))
+    assert listing(tmp_path / "views") == ["opacity/a.png", "render.json"]
+    assert "depth_meaning" not in json.loads((tmp_path / "views/render.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("convention", "floor"),
+    [("conditional", 0.1), ("max-weight", 0.1), ("moment", 0.0), ("background", 0.0), ("median", 0.5)],
+)
+def test_each_convention_states_its_own_floor_and_background(convention, floor, model, tmp_path):
+    request = DepthRequest(convention, "ray", opacity_floor=0.1, background_distance=9.0)
+    assert effective_floor(request) == floor
+    export(model, [frame("a")], tmp_path / "views", outputs=("depth",), depth=request)
+    _, meta = read_tiff(tmp_path / "views/depth/a.tiff")
+    assert (meta.convention, meta.axis, meta.opacity_floor) == (convention, "ray", floor)
+    assert meta.background_distance == (9.0 if convention == "background" else None)
+
+
+def test_names_keep_folders_and_stay_apart():
+    names = ["left/a.png", "right/a.png", "b.jpg", "b.png", "c.2.jpg", "Küche 1.JPG", "view_0001"]
+    expected = ["left/a", "right/a", "b.jpg", "b.png", "c.2", "Küche 1", "view_0001"]
+    assert file_names([frame(name) for name in names]) == expected
+
+
+def test_a_stem_that_is_another_frames_full_name_stays_apart():
+    # "b" and "b.png" and "b.jpg": the whole name of the first is the stem of the others.
+    names = file_names([frame(name) for name in ("b", "b.png", "b.jpg", "b.png.jpg")])
+    assert len(set(names)) == 4
+
+
+def test_names_stay_inside_the_folder():
+    assert file_names([frame(name) for name in ("../images/a.png", "a.png", "../b.png")]) == [
+        "up/images/a",
+        "a",
+        "up/b",
+    ]
+
+
+def test_frames_in_subfolders_with_equal_names(model, tmp_path):
+    frames = [frame(name) for name in ("left/a.png", "right/a.png", "b.jpg", "b.png")]
+    export(model, frames, tmp_path / "views", npy=True)
+    for output, suffix in (("rgb", "png"), ("depth", "tiff"), ("depth", "npy"), ("depth", "png"), ("opacity", "png")):
+        found = [name for name in listing(tmp_path / "views" / output) if name.endswith(suffix)]
+        assert sorted(f"{name}.{suffix}" for name in ("left/a", "right/a", "b.jpg", "b.png")) == found, output
+
+
+def test_previews_share_one_range_over_all_frames(model, tmp_path):
+    frames = [frame("near", 1.0), frame("far", 3.0)]
+    export(model, frames, tmp_path / "views", outputs=("depth",))
+    depths = [read_tiff(tmp_path / f"views/depth/{name}.tiff") for name in ("near", "far")]
+    lo, hi = depth_range(depth for depth, _ in depths)
+    assert hi - lo > 1.5
+    for name, (depth, meta) in zip(("near", "far"), depths, strict=True):
+        expected = preview(depth, meta, lo=lo, hi=hi)
+        np.testing.assert_array_equal(read_image(tmp_path / f"views/depth/{name}.png"), expected)
+
+
+def test_one_video_per_output_with_every_frame_in_it(model, tmp_path):
+    frames = [frame(f"view_{index:04d}", 1.5 + 0.1 * index) for index in range(5)]
+    written = export(model, frames, tmp_path / "views", outputs=("rgb", "depth"), video=True)
+    assert written == [tmp_path / "views/rgb.mp4", tmp_path / "views/depth.mp4"]
+    for path in written:
+        count, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
+        assert count == 5
+        assert seconds == pytest.approx(5 / 12, abs=0.05)
+    assert len(listing(tmp_path / "views/rgb")) == 5
+
+
+def test_an_export_that_is_stopped_leaves_the_old_one(model, tmp_path):
+    export(model, [frame("old")], tmp_path / "views", outputs=("rgb",))
+
+    def stop(rays: int) -> None:
+        raise KeyboardInterrupt
+
+    settings = ExportSettings(outputs=("rgb",), depth=DEPTH, npy=False, video=False, fps=24)
+    with pytest.raises(KeyboardInterrupt):
+        export_frames(model, [frame("new")], tmp_path / "views", settings, provenance={}, on_rays=stop)
+    assert listing(tmp_path) == ["views/render.json", "views/rgb/old.png"]
+    export(model, [frame("new")], tmp_path / "views", outputs=("rgb",))
+    assert listing(tmp_path) == ["views/render.json", "views/rgb/new.png"]
+
+
+def test_a_file_in_the_folders_place_is_told(model, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write .*views"):
+        export(model, [frame("a")], tmp_path / "file" / "views")
+    assert listing(tmp_path) == ["file"]

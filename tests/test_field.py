@@ -1,0 +1,230 @@
+"""Encodings, activations and the field: closed forms, SciPy, quadrature; what stands on disk comes back bit for bit."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from scipy.special import sph_harm_y
+
+from nerfcli import kernels
+from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
+from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.field.contraction import training_points, uncontract
+from nerfcli.field.cost import field_bytes
+from nerfcli.field.encodings import fourier_features, spherical_harmonics
+from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log
+from nerfcli.render.model import Marching, Model, load_model, save_model
+
+TINY = HashFieldSettings(unbounded=False, levels=3, log2_rows=8, coarsest=4, finest=32, width=16)
+
+
+def directions_of(polar: np.ndarray, azimuth: np.ndarray) -> torch.Tensor:
+    """Unit vectors (..., 3) of spherical angles."""
+    xyz = (np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar))
+    return torch.from_numpy(np.stack(np.broadcast_arrays(*xyz), axis=-1))
+
+
+def test_spherical_harmonics_are_scipys_real_combinations():
+    # Y_l^m from SciPy has the Condon-Shortley phase (-1)^m, which the real ones leave out.
+    rng = np.random.default_rng(0)
+    polar, azimuth = np.arccos(rng.uniform(-1, 1, 200)), rng.uniform(0, 2 * math.pi, 200)
+    columns = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            y = np.asarray(sph_harm_y(degree, abs(order), polar, azimuth)) * (-1) ** order
+            columns.append(y.real if order == 0 else math.sqrt(2) * (y.real if order > 0 else y.imag))
+    ours = spherical_harmonics(directions_of(polar, azimuth))
+    np.testing.assert_allclose(ours.numpy(), np.stack(columns, axis=-1), atol=1e-14)
+
+
+def test_spherical_harmonics_are_orthonormal_by_quadrature():
+    # Gauss-Legendre in cos(polar) and equal steps in azimuth are exact for products of degree 3.
+    cosine, weight = np.polynomial.legendre.leggauss(8)
+    azimuth = np.arange(16) * 2 * math.pi / 16
+    y = spherical_harmonics(directions_of(np.arccos(cosine)[:, None], azimuth[None])).numpy()
+    gram = np.einsum("pai,paj,p->ij", y, y, weight) * 2 * math.pi / 16
+    np.testing.assert_allclose(gram, np.eye(16), atol=1e-13)
+
+
+def test_spherical_harmonics_at_the_poles_have_finite_gradients():
+    poles = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(spherical_harmonics, poles)
+
+
+def test_fourier_features_in_their_order_by_a_loop():
+    x = np.random.default_rng(0).uniform(-1, 1, (5, 3))
+    expected = [
+        [f(2**octave * math.pi * value) for value in row for octave in range(4) for f in (math.sin, math.cos)]
+        for row in x
+    ]
+    np.testing.assert_allclose(fourier_features(torch.from_numpy(x), 4).numpy(), expected, atol=1e-13)
+
+
+def test_fourier_features_gradcheck():
+    x = torch.tensor([[0.0, 0.3], [-0.7, 0.5]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: fourier_features(x, 3), x)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_density_is_the_exponential_and_so_is_its_gradient(dtype):
+    x = torch.linspace(-10, 10, 61, dtype=dtype, requires_grad=True)
+    density = density_from_log(x)
+    (gradient,) = torch.autograd.grad(density.sum(), x)
+    expected = x.detach().exp()
+    torch.testing.assert_close(density.detach(), expected, rtol=1e-6, atol=0)
+    torch.testing.assert_close(gradient, expected, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("beyond", [25.0, 100.0, 1e30])
+def test_density_beyond_the_limits_stays_and_keeps_a_gradient(beyond):
+    x = torch.tensor([-beyond, beyond], requires_grad=True)
+    density = density_from_log(x)
+    (gradient,) = torch.autograd.grad(density.sum(), x)
+    limits = torch.tensor([-LOG_DENSITY_LIMIT, LOG_DENSITY_LIMIT]).exp()
+    assert torch.equal(density.detach(), limits)
+    assert torch.equal(gradient, limits)
+
+
+def test_uncontract_is_the_inverse_of_contract_across_magnitudes():
+    g = torch.Generator().manual_seed(0)
+    unit = torch.nn.functional.normalize(torch.randn(500, 3, generator=g, dtype=torch.float64), dim=-1)
+    points = unit * torch.logspace(-12, 5, 500, dtype=torch.float64)[:, None]
+    # The contracted radius 2 - 1/r carries r with a relative error of r * eps.
+    torch.testing.assert_close(uncontract(kernels.contract(points)), points, rtol=1e-10, atol=0)
+    assert torch.equal(uncontract(torch.zeros(1, 3)), torch.zeros(1, 3))
+    assert uncontract(torch.tensor([[2.0, 2.0, 2.0]])).norm().item() == pytest.approx(1e6, rel=1e-6)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_grid_coordinates_and_back(unbounded):
+    g = torch.Generator().manual_seed(0)
+    points = torch.rand(100, 3, generator=g, dtype=torch.float64) * 2 - 1
+    there = kernels.grid_coordinates(points, unbounded)
+    assert (there >= 0).all()
+    assert (there <= 1).all()
+    torch.testing.assert_close(training_points(there, unbounded), points, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 123])
+def test_field_shapes_and_ranges(unbounded, count):
+    field = HashField(HashFieldSettings(unbounded=unbounded, levels=3, log2_rows=8, coarsest=4, finest=32, width=16))
+    g = torch.Generator().manual_seed(0)
+    coordinates = torch.rand(count, 3, generator=g)
+    directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=g), dim=-1)
+    density, rgb = field.radiance(coordinates, directions, torch.arange(count) * 7 // max(count, 1))
+    assert density.shape == (count,)
+    assert rgb.shape == (count, 3)
+    assert (density > 0).all()
+    assert ((rgb > 0) & (rgb < 1)).all()
+    torch.testing.assert_close(field.density(coordinates), density, rtol=1e-5, atol=0)
+
+
+def test_a_fresh_field_is_a_thin_grey_fog():
+    torch.manual_seed(0)
+    field = HashField(HashFieldSettings(unbounded=True, log2_rows=12))
+    g = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=g), dim=-1)
+    density, rgb = field.radiance(torch.rand(1000, 3, generator=g), directions, torch.arange(1000))
+    torch.testing.assert_close(density, torch.full((1000,), 1.0), rtol=0.01, atol=0)
+    # Grey on the mean: the colour depends on the direction from the start, by random weights.
+    assert (rgb.mean(0) - 0.5).abs().max() < 0.25
+
+
+def test_resolutions_run_from_coarsest_to_finest_in_geometric_progression():
+    sides = HashFieldSettings(unbounded=False, levels=5, coarsest=16, finest=256).resolutions
+    assert sides == (16, 32, 64, 128, 256)
+    assert HashFieldSettings(unbounded=False, levels=1, coarsest=16).resolutions == (16,)
+
+
+def test_field_bytes_are_those_of_the_checkpoint():
+    field = HashField(TINY)
+    assert field_bytes(field) == sum(4 * tensor.numel() for tensor in field.state_dict().values())
+
+
+def awkward_tensors() -> dict[str, torch.Tensor]:
+    """All that could be lost on the way: signed zero, NaN, subnormals, flags, 64-bit integers, empty, transposed."""
+    return {
+        "floats": torch.tensor([0.0, -0.0, math.nan, math.inf, -math.inf, 1e-45, 3.4e38]),
+        "doubles": torch.tensor([math.pi, 5e-324], dtype=torch.float64),
+        "flags": torch.tensor([[True, False], [False, True]]),
+        "integers": torch.tensor([2**62 + 1, -1]),
+        "empty": torch.zeros(0, 3),
+        "transposed": torch.arange(6.0).reshape(2, 3).T,
+    }
+
+
+def test_checkpoint_round_trip_is_bit_exact(tmp_path):
+    path = tmp_path / "Ordner mit Ümlaut" / "a.safetensors"
+    description = {"name": "Küche", "numbers": [1, 0.1, 1e-300], "nothing": None}
+    save_tensors(path, awkward_tensors(), description)
+    loaded, told = load_tensors(path, "cpu")
+    assert told == description
+    assert set(loaded) == set(awkward_tensors())
+    for name, tensor in awkward_tensors().items():
+        assert loaded[name].dtype == tensor.dtype
+        assert loaded[name].shape == tensor.shape
+        assert loaded[name].contiguous().numpy().tobytes() == tensor.contiguous().numpy().tobytes(), name
+
+
+def test_checkpoint_that_is_missing_cut_short_or_foreign(tmp_path):
+    missing, short, text, foreign = (tmp_path / f"{name}.safetensors" for name in ("missing", "short", "text", "other"))
+    save_tensors(short, awkward_tensors(), {})
+    short.write_bytes(short.read_bytes()[:-5])
+    text.write_text("no tensors at all")
+    save_file({"a": torch.zeros(3)}, foreign)  # by another program, without our description
+    for path, message in (
+        (missing, "missing.safetensors does not exist"),
+        (short, "short.safetensors is not a readable checkpoint"),
+        (text, "text.safetensors is not a readable checkpoint"),
+        (foreign, "other.safetensors is not a readable checkpoint"),
+        (tmp_path, "is not a readable checkpoint"),
+    ):
+        with pytest.raises(UserError, match=message) as caught:
+            load_tensors(path, "cpu")
+        assert caught.value.exit_code == BAD_INPUT
+
+
+def test_checkpoint_under_a_file_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"cannot write .*a\.safetensors"):
+        save_tensors(tmp_path / "file" / "a.safetensors", {"a": torch.zeros(1)}, {})
+
+
+def some_model() -> Model:
+    torch.manual_seed(3)
+    return Model(
+        field=HashField(TINY),
+        occupied=torch.rand(8, 8, 8) > 0.5,
+        marching=Marching(near=0.1, far=4.0, shortest_step=0.01, growth=1 / 128),
+        background=(0.1, 0.2, 1 / 3),
+        training_from_scene=Similarity(
+            1 / 3, rotation_from_quaternion(np.array([0.9, 0.1, -0.3, 0.2])), np.array([1.0, -2.0, 0.1])
+        ),
+        unit="metre",
+    )
+
+
+def test_model_round_trip_is_bit_exact(tmp_path):
+    model = some_model()
+    save_model(tmp_path / "field.safetensors", model)
+    loaded = load_model(tmp_path / "field.safetensors", "cpu")
+    assert loaded.field.settings == model.field.settings
+    for name, tensor in model.field.state_dict().items():
+        assert torch.equal(loaded.field.state_dict()[name], tensor), name
+    assert torch.equal(loaded.occupied, model.occupied)
+    assert (loaded.marching, loaded.background, loaded.unit) == (model.marching, model.background, model.unit)
+    assert loaded.training_from_scene.scale == model.training_from_scene.scale
+    np.testing.assert_array_equal(loaded.training_from_scene.rotation, model.training_from_scene.rotation)
+    np.testing.assert_array_equal(loaded.training_from_scene.translation, model.training_from_scene.translation)
+
+
+def test_model_of_another_format_is_named(tmp_path):
+    path = tmp_path / "state.safetensors"
+    save_tensors(path, {"a": torch.zeros(1)}, {"format": "another field 9"})
+    with pytest.raises(UserError, match="holds 'another field 9', expected 'nerfcli field 1'"):
+        load_model(path, "cpu")

@@ -1,0 +1,217 @@
+"""The compiled kernels against the reference in float64: value and gradient, across magnitudes, on odd sizes.
+
+Gradients are compared as vectors (relative L2) and per element against the largest one.
+"""
+
+import numpy as np
+import pytest
+import torch
+
+from nerfcli.kernels import numba_cpu, reference
+
+SIZES = [0, 1, 5, 123, 3000]
+RELATIVE = 1e-5
+
+
+def assert_close(actual, expected, name, relative=RELATIVE, floor=1e-30):
+    assert actual is not None, name
+    actual, expected = actual.double(), expected.double()
+    assert actual.shape == expected.shape, name
+    if actual.numel() == 0:
+        return
+    assert torch.isfinite(actual).all(), name
+    error = actual - expected
+    assert error.norm() <= relative * expected.norm() + floor, (name, error.norm() / expected.norm())
+    assert error.abs().max() <= relative * expected.abs().max() + floor, name
+
+
+def offsets_of(samples, generator):
+    """Rays of random sizes, empty ones among them."""
+    cuts = torch.randint(0, samples + 1, (max(1, samples // 7),), generator=generator).sort()[0]
+    return torch.cat([torch.tensor([0]), cuts, cuts[-1:], torch.tensor([samples])])
+
+
+@pytest.fixture(params=[1, 2], ids=["1 thread", "2 threads"], autouse=True)
+def threads(request):
+    torch.set_num_threads(request.param)
+    yield
+    torch.set_num_threads(2)
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("magnitude", [1e-6, 1.0, 1e6])
+def test_hash_encode(samples, magnitude, generator):
+    resolutions = (4, 9, 40, 700)
+    table = torch.randn(4, 512, 4, generator=generator) * magnitude
+    points = torch.rand(samples, 3, generator=generator) * 1.2 - 0.1  # some are clamped
+    gradient = torch.randn(samples, 16, generator=generator)
+    fast, exact = table.clone().requires_grad_(), table.double().requires_grad_()
+    encoded = numba_cpu.hash_encode(points, fast, resolutions, None, None)
+    encoded.backward(gradient)
+    # The oracle gets the coordinates as the kernel sees them: scaled in float32, where 700 cells cost 3 digits.
+    assert_close(encoded, reference.hash_encode(points, table, resolutions), "encoded")
+    reference.hash_encode(points.double(), exact, resolutions).backward(gradient.double())
+    same_precision = table.clone().requires_grad_()
+    reference.hash_encode(points, same_precision, resolutions).backward(gradient)
+    assert_close(fast.grad, same_precision.grad, "table gradient")
+    if samples and fast.grad is not None and exact.grad is not None:
+        # Against float64 the place inside a cell is off by 700 * eps; so are weights and gradients.
+        assert (fast.grad.double() - exact.grad).norm() <= 700 * 2e-7 * exact.grad.norm()
+
+
+def test_hash_encode_takes_a_sink_and_known_values(generator):
+    table = torch.randn(2, 64, 4, generator=generator, requires_grad=True)
+    points = torch.rand(50, 3, generator=generator)
+    plain = numba_cpu.hash_encode(points, table, (3, 30), None, None)
+    plain.sum().backward()
+    sink = torch.ones_like(table)
+    known = numba_cpu.hash_encode(points, table, (3, 30), sink, plain.detach())
+    assert torch.equal(known, plain)
+    assert table.grad is not None
+    expected = 1 + table.grad
+    table.grad = None
+    known.sum().backward()
+    assert table.grad is None
+    assert_close(sink, expected, "sink")
+
+
+WEIGHTS = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
+
+
+@pytest.mark.parametrize("samples", SIZES)
+# At 0.4 what goes into the sigmoid reaches 20 to 40, whose float32 rounding of 2e-6 the sigmoid passes on.
+@pytest.mark.parametrize("magnitude", [1e-4, 0.2, 0.4])
+def test_radiance_and_density(samples, magnitude, generator):
+    encoded = torch.randn(samples, 32, generator=generator)
+    harmonics = torch.randn(9, 16, generator=generator)
+    rays = torch.randint(9, (samples,), generator=generator).sort()[0]
+    weights = [torch.randn(shape, generator=generator) * magnitude for shape in WEIGHTS]
+    by_density, by_rgb = torch.randn(samples, generator=generator), torch.randn(samples, 3, generator=generator)
+
+    def run(function, dtype):
+        inputs = [x.to(dtype).clone().requires_grad_() for x in (encoded, *weights)]
+        density, rgb = function(inputs[0], harmonics.to(dtype), rays, tuple(inputs[1:]))
+        (density @ by_density.to(dtype) + (rgb * by_rgb.to(dtype)).sum()).backward()
+        return density.detach(), rgb.detach(), *(x.grad for x in inputs)
+
+    fast, exact = run(numba_cpu.radiance, torch.float32), run(reference.radiance, torch.float64)
+    names = ("density", "rgb", "encoded", *(f"weights {i}" for i in range(5)))
+    for name, actual, expected in zip(names, fast, exact, strict=True):
+        if name in ("density", "rgb") or samples == 0:
+            assert_close(actual, expected, name)
+        else:
+            # exp(log density) turns the rounding of a logarithm of up to 15 into a relative error 15 times as large,
+            # and a hidden value that rounds to the other side of 0 moves one term of a sum.
+            # Where a sigmoid saturates, float64's own 1 - value ends at 1e-16; the kernel goes on.
+            assert_close(actual, expected, name, relative=5 * RELATIVE, floor=1e-15)
+    assert_close(numba_cpu.density(encoded, tuple(weights)), exact[0], "density alone")
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("magnitude", [1e-10, 1e-3, 1.0, 30.0, 1e10])
+def test_composite(samples, magnitude, generator):
+    offsets = offsets_of(samples, generator)
+    density = torch.rand(samples, generator=generator) * magnitude
+    density[::3] = 0.0
+    lengths = torch.rand(samples, generator=generator)
+    rgb = torch.rand(samples, 3, generator=generator)
+    background = torch.rand(len(offsets) - 1, 3, generator=generator)
+    shapes = ((len(offsets) - 1, 3), (len(offsets) - 1,), (samples,))
+    back = [torch.randn(shape, generator=generator) for shape in shapes]
+
+    def run(function, dtype):
+        d, c = density.to(dtype).requires_grad_(), rgb.to(dtype).requires_grad_()
+        out = function(d, c, lengths.to(dtype), offsets=offsets, background=background.to(dtype))
+        torch.autograd.backward(out, [g.to(dtype) for g in back])
+        return *(x.detach() for x in out), d.grad, c.grad
+
+    fast, exact = run(numba_cpu.composite, torch.float32), run(reference.composite, torch.float64)
+    for name, actual, expected in zip(
+        ("colour", "transmittance", "weights", "density gradient", "rgb gradient"), fast, exact, strict=True
+    ):
+        assert_close(actual, expected, name)
+    weights, behind = numba_cpu.interval_weights(density, lengths, offsets)
+    assert_close(weights, exact[2], "weights alone")
+    assert_close(behind, exact[1], "transmittance alone")
+    before = numba_cpu.optical_depth_before(density, lengths, offsets)
+    assert_close(before, reference.optical_depth_before(density.double(), lengths.double(), offsets), "before")
+
+
+@pytest.mark.parametrize("rays", [0, 1, 5, 123])
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_march_and_coordinates(rays, unbounded, generator):
+    origins = torch.randn(rays, 3, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
+    edges = torch.rand(60, generator=generator).cumsum(0) * 0.2
+    jitter = torch.rand(rays, generator=generator)
+    occupied = torch.rand(8, 8, 8, generator=generator) > 0.4
+    settings = {"jitter": jitter, "occupied": occupied, "unbounded": unbounded}
+    fast = numba_cpu.march(origins, directions, edges, **settings)
+    exact = reference.march(origins, directions, edges, **settings)
+    # A middle that rounds into the neighbouring cell is kept by one and not by the other; none is for these seeds.
+    assert torch.equal(fast[2], exact[2])
+    assert_close(fast[0], exact[0], "starts")
+    assert_close(fast[1], exact[1], "ends")
+    points = numba_cpu.sample_coordinates(origins, directions, *fast[:2], offsets=fast[2], unbounded=unbounded)
+    wanted = reference.sample_coordinates(
+        origins.double(), directions.double(), *(x.double() for x in fast[:2]), offsets=fast[2], unbounded=unbounded
+    )
+    assert_close(points, wanted, "coordinates")
+    assert torch.equal(numba_cpu.ray_indices(fast[2]), reference.ray_indices(fast[2]))
+
+
+@pytest.mark.parametrize("rows", [0, 1, 5, 123])
+@pytest.mark.parametrize("magnitude", [1e-12, 1.0, 1e6])
+def test_adam_rows(rows, magnitude, generator):
+    values = [torch.randn(2, rows, 4, generator=generator) for _ in range(4)]
+    values[1] *= magnitude
+    values[1][:, ::2] = 0.0
+    values[2] *= magnitude
+    values[3] = values[3].square() * magnitude**2
+    fast, exact = [v.clone() for v in values], [v.double() for v in values]
+    for arrays, function in ((fast, numba_cpu.adam_rows), (exact, reference.adam_rows)):
+        for step in (1, 2):
+            function(*arrays, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15)
+            if step == 1:
+                arrays[1] += values[1].to(arrays[1].dtype)
+    for name, actual, expected in zip(("table", "gradient", "first", "second"), fast, exact, strict=True):
+        assert_close(actual, expected, name)
+    assert torch.equal(fast[0][:, ::2], values[0][:, ::2])  # untouched rows stay
+
+
+def test_adam_rows_is_adam_where_every_row_is_touched(generator):
+    # Against torch's own Adam over five steps.
+    parameter = torch.nn.Parameter(torch.randn(1, 20, 4, generator=generator))
+    ours = [parameter.detach().clone(), torch.zeros(1, 20, 4), torch.zeros(1, 20, 4), torch.zeros(1, 20, 4)]
+    optimiser = torch.optim.Adam([parameter], lr=0.01, betas=(0.9, 0.99), eps=1e-15)
+    for step in range(1, 6):
+        gradient = torch.randn(1, 20, 4, generator=generator)
+        parameter.grad = gradient.clone()
+        optimiser.step()
+        ours[1].copy_(gradient)
+        numba_cpu.adam_rows(*ours, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15)
+    assert_close(ours[0], parameter.detach(), "table")
+
+
+def test_scatter_max(generator):
+    coordinates, values = torch.rand(500, 3, generator=generator), torch.rand(500, generator=generator)
+    coordinates[0], coordinates[1] = 0.0, 1.0
+    fast, exact = torch.full((4, 4, 4), -1.0), torch.full((4, 4, 4), -1.0)
+    numba_cpu.scatter_max(fast, coordinates, values)
+    reference.scatter_max(exact, coordinates, values)
+    assert torch.equal(fast, exact)
+    by_hand = np.full((4, 4, 4), -1.0, np.float32)
+    for (x, y, z), value in zip((coordinates * 4).clamp(max=3).int().tolist(), values.tolist(), strict=True):
+        by_hand[z, y, x] = max(by_hand[z, y, x], value)
+    np.testing.assert_array_equal(fast.numpy(), by_hand)
+
+
+def test_two_runs_are_bit_identical(generator):
+    points = torch.rand(3000, 3, generator=generator)
+    gradient = torch.randn(3000, 8, generator=generator)
+    results = []
+    for _ in range(2):
+        table = torch.ones(2, 64, 4, requires_grad=True)
+        numba_cpu.hash_encode(points, table, (5, 50), None, None).backward(gradient)
+        results.append(table.grad)
+    assert torch.equal(*results)

@@ -1,0 +1,313 @@
+"""Training on a capture with known geometry: it learns, it repeats bit for bit, it goes on, it stops as asked."""
+
+import math
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import SPHERES
+
+from nerfcli import scene as scenes
+from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
+from nerfcli.errors import BAD_INPUT, NON_FINITE, UserError
+from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
+from nerfcli.field.checkpoint import load_tensors
+from nerfcli.media.depth import read_tiff
+from nerfcli.media.images import read_image, write_png
+from nerfcli.render.model import load_model, save_model
+from nerfcli.render.pictures import DepthRequest, render_picture
+from nerfcli.scene import Scene
+from nerfcli.train.loop import Progress, train
+from nerfcli.train.photos import load_photos
+from nerfcli.train.run_folder import (
+    append_log,
+    is_complete,
+    is_same_run,
+    read_cameras,
+    read_config,
+    read_log,
+    write_cameras,
+)
+from nerfcli.train.settings import TrainSettings, automatic_downscale
+
+# A step of a few rays is enough where bits are compared, not pictures.
+FEW = TrainSettings(budget_seconds=None, steps=24, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
+# Enough samples that the number of rays follows what the rays before had.
+ADAPTIVE = replace(FEW, first_samples_per_step=2**15, samples_per_step=2**15)
+
+
+@pytest.fixture(scope="module")
+def views(spheres: Scene) -> Scene:
+    """Some of the views, none held out: checks on held-out pixels take longer than steps."""
+    return replace(spheres, frames=spheres.frames[:4], test_names=frozenset())
+
+
+def fit(
+    scene: Scene, run: Path, settings: TrainSettings, *,
+    resume: bool = False, on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> list[Progress]:  # fmt: skip
+    """Train, and return the progress of every step."""
+    steps: list[Progress] = []
+
+    def record(progress: Progress) -> None:
+        steps.append(progress)
+        on_progress(progress)
+
+    train(scene, run, settings, resume=resume, notify=lambda text: None, on_progress=record)
+    return steps
+
+
+def weights(run: Path) -> dict[str, bytes]:
+    """Every tensor of a run's checkpoint, as bytes."""
+    tensors, _ = load_tensors(run / "field.safetensors", "cpu")
+    return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+
+
+def held_out_photos(scene: Scene) -> list[HeldOut]:
+    photos = load_photos(scene.test_frames, factor=1, threads=1)
+    return [HeldOut(photo.frame, photo.pixels, photo.used) for photo in photos]
+
+
+def test_held_out_views_are_far_better_than_one_colour(spheres, spheres_run):
+    # The yardstick: the best single colour, the mean of the training photos on white.
+    photos = held_out_photos(spheres)
+    mean = np.mean([over_white(p.pixels) for p in load_photos(spheres.train_frames, factor=1, threads=1)], (0, 1, 2))
+    errors = [np.square((over_white(photo.pixels) - mean) / 255).mean() for photo in photos]
+    one_colour = np.mean([-10 * math.log10(error) for error in errors])
+    metrics = evaluate_model(load_model(spheres_run / "field.safetensors", "cpu"), photos, on_image=lambda a, b: None)
+    assert 9 < one_colour < 11
+    assert metrics["mean"]["psnr"] > one_colour + 8
+    assert metrics["mean"]["ssim"] > 0.7
+    # What the log said during training is the same quantity, pooled over some pixels.
+    assert read_log(spheres_run)[-1]["heldout_psnr"] == pytest.approx(metrics["mean"]["psnr"], abs=1.0)
+
+
+@pytest.mark.parametrize(("axis", "truth"), [("z", "z"), ("ray", "distance")])
+def test_trained_depth_is_the_true_depth_of_the_balls(axis, truth, spheres, spheres_run):
+    # Truth: rays intersected with the balls and the box in closed form, by the script that made the capture.
+    model = load_model(spheres_run / "field.safetensors", "cpu")
+    for index, frame in enumerate(spheres.test_frames):
+        expected, _ = read_tiff(SPHERES / "truth" / f"r_{index:03d}_{truth}.tiff")
+        request = DepthRequest("median", axis)
+        depth = render_picture(model, frame, background=model.background, depth=request).depth
+        assert depth is not None
+        both = np.isfinite(expected) & np.isfinite(depth)
+        assert (np.isfinite(expected) == np.isfinite(depth)).mean() > 0.95
+        # 0.15 of 4: the fog of a short training is that thick.
+        assert np.median(np.abs(depth - expected)[both]) < 0.15
+
+
+def test_occupancy_keeps_the_surfaces_and_little_else(spheres, spheres_run):
+    # Points just inside of the surfaces that the held-out views see, by the true distances along their rays.
+    model = load_model(spheres_run / "field.safetensors", "cpu")
+    for index, frame in enumerate(spheres.test_frames):
+        distance, _ = read_tiff(SPHERES / "truth" / f"r_{index:03d}_distance.tiff")
+        hit = np.isfinite(distance).ravel()
+        bearings, _ = frame.camera.pixel_bearings()
+        surface = frame.centre + (0.02 + distance.reshape(-1, 1)[hit]) * (
+            bearings[hit] @ frame.world_from_cam[:3, :3].T
+        )
+        unit = model.training_from_scene.apply(surface) / 2 + 0.5
+        x, y, z = (unit * len(model.occupied)).astype(int).T
+        assert model.occupied[z, y, x].float().mean() > 0.85
+    assert model.occupied.float().mean() < 0.2
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(views, tmp_path):
+    settings = replace(FEW, steps=10)
+    for name, seed in (("one", 3), ("two", 3), ("other", 4)):
+        fit(views, tmp_path / name, replace(settings, seed=seed))
+    assert weights(tmp_path / "one") == weights(tmp_path / "two")
+    assert weights(tmp_path / "one") != weights(tmp_path / "other")
+
+
+def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, tmp_path):
+    def stop(progress: Progress) -> None:
+        if progress.step == 11:
+            raise KeyboardInterrupt
+
+    straight = fit(views, tmp_path / "straight", ADAPTIVE)
+    with pytest.raises(KeyboardInterrupt):
+        fit(views, tmp_path / "parts", ADAPTIVE, on_progress=stop)
+    halfway = load_model(tmp_path / "parts" / "field.safetensors", "cpu")  # what Ctrl-C left can be looked at
+    assert all(torch.isfinite(tensor).all() for tensor in halfway.field.state_dict().values())
+    assert not is_complete(tmp_path / "parts", ADAPTIVE)
+    second = fit(views, tmp_path / "parts", ADAPTIVE, resume=True)
+    assert [progress.step for progress in second] == list(range(12, 25))
+    assert [progress.loss for progress in second] == [progress.loss for progress in straight[11:]]
+    assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
+    assert is_complete(tmp_path / "parts", ADAPTIVE)
+    log = read_log(tmp_path / "parts")
+    assert [entry["step"] for entry in log] == sorted(entry["step"] for entry in log)
+    assert log[-1]["samples"] == read_log(tmp_path / "straight")[-1]["samples"]
+
+
+def test_resume_goes_on_to_a_larger_total(views, tmp_path):
+    fit(views, tmp_path / "run", replace(FEW, steps=3))
+    second = fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True)
+    assert [progress.step for progress in second] == [4, 5]
+    assert second[0].seconds > read_log(tmp_path / "run")[0]["seconds"]  # the clock goes on too
+    assert read_config(tmp_path / "run")["settings"]["steps"] == 5
+    assert fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True) == []
+
+
+def test_resume_without_a_checkpoint_is_told(views, tmp_path):
+    with pytest.raises(UserError, match=r"field\.safetensors does not exist"):
+        fit(views, tmp_path / "run", FEW, resume=True)
+
+
+def test_the_time_budget_is_kept_within_a_step(views, tmp_path):
+    progress = fit(views, tmp_path / "run", replace(FEW, budget_seconds=0.5, steps=None))
+    assert progress[-2].seconds < 0.5 <= progress[-1].seconds
+    assert progress[-1].share == 1
+    assert [p.share for p in progress] == sorted(p.share for p in progress)
+
+
+def test_the_first_limit_that_is_reached_ends_the_training(views, tmp_path):
+    progress = fit(views, tmp_path / "run", replace(FEW, budget_seconds=1000.0, steps=2))
+    assert [p.step for p in progress] == [1, 2]
+
+
+def test_the_log_tells_speed_memory_and_held_out_psnr(spheres, tmp_path):
+    progress = fit(spheres, tmp_path / "run", replace(FEW, steps=2))
+    log = read_log(tmp_path / "run")
+    assert [entry["step"] for entry in log if "heldout_psnr" in entry] == [1, 2]
+    last = log[-1]
+    assert last["loss"] == progress[-1].loss
+    assert last["seconds"] == pytest.approx(progress[-1].seconds, abs=1e-3)
+    assert last["samples_per_second"] > 0
+    assert last["rays_per_second"] > 0
+    assert 2**26 < last["peak_memory_bytes"] < 2**34
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf])
+def test_numbers_that_are_not_finite_are_named_and_never_written(poison, views, tmp_path):
+    run = tmp_path / "run"
+    fit(views, run, replace(FEW, steps=1))
+    model = load_model(run / "field.safetensors", "cpu")
+    with torch.no_grad():
+        next(iter(model.field.state_dict().values()))[...] = poison
+    save_model(run / "field.safetensors", model)
+    before = weights(run)
+    with pytest.raises(UserError, match=r"(loss|gradient of .*) is not finite at step 1") as caught:
+        fit(views, run, replace(FEW, steps=2), resume=True)
+    assert caught.value.exit_code == NON_FINITE
+    assert weights(run) == before
+
+
+def test_a_scene_without_training_photos_is_told(spheres, tmp_path):
+    names = frozenset(frame.name for frame in spheres.frames)
+    with pytest.raises(UserError, match="has no training photo"):
+        fit(replace(spheres, test_names=names), tmp_path / "run", FEW)
+
+
+def test_a_scene_without_held_out_photos_trains(views, tmp_path):
+    fit(views, tmp_path / "run", replace(FEW, steps=1))
+    assert "heldout_psnr" not in read_log(tmp_path / "run")[-1]
+
+
+def test_photos_without_alpha_train_an_unbounded_scene(spheres, tmp_path):
+    # The same views on white, as photos that fill the frame.
+    frames = []
+    for frame in spheres.frames[:2]:
+        image = tmp_path / f"{frame.name.replace('/', '_')}"
+        write_png(image, over_white(read_image(frame.image)))
+        frames.append(replace(frame, image=image))
+    scene = replace(spheres, frames=tuple(frames), test_names=frozenset())
+    fit(scene, tmp_path / "run", replace(FEW, steps=2))
+    model = load_model(tmp_path / "run" / "field.safetensors", "cpu")
+    assert model.field.settings.unbounded
+    assert model.marching.far > 100
+    picture = render_picture(model, frames[0], background=model.background)
+    assert np.isfinite(picture.rgb).all()
+
+
+def test_a_fresh_training_replaces_all_of_an_old_one(views, tmp_path):
+    fit(views, tmp_path / "run", replace(FEW, steps=3))
+    fit(views, tmp_path / "run", replace(FEW, steps=1, seed=1))
+    assert [entry["step"] for entry in read_log(tmp_path / "run")] == [1]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"budget_seconds": None, "steps": None}, "training without an end"),
+        ({"budget_seconds": -1.0}, "budget is not positive"),
+        ({"steps": -3}, "budget is not positive"),
+        ({"downscale": 3}, "downscale 3 is not possible"),
+    ],
+)
+def test_impossible_settings_are_refused(wrong, message):
+    with pytest.raises(UserError, match=message) as caught:
+        TrainSettings(**wrong)
+    assert caught.value.exit_code == BAD_INPUT
+
+
+def test_automatic_downscale_is_the_smallest_that_fits():
+    sides = [(800, 600), (801, 600), (600, 1600), (1601, 10), (3200, 3200), (3201, 10), (6400, 9), (20000, 1)]
+    assert [automatic_downscale(*size) for size in sides] == [1, 2, 2, 4, 4, 8, 8, 8]
+
+
+def test_cameras_of_a_run_come_back_exactly_and_move_with_it(tmp_path, spheres):
+    shutil.copytree(SPHERES / "test", tmp_path / "here" / "photos")
+    frames = tuple(
+        replace(frame, image=tmp_path / "here" / "photos" / Path(frame.name).name) for frame in spheres.test_frames
+    )
+    masked = replace(frames[0], mask=frames[0].image)
+    run = tmp_path / "here" / "runs" / "one"
+    run.mkdir(parents=True)
+    write_cameras(run, frames[1:], [masked])
+    os.rename(tmp_path / "here", tmp_path / "there")
+    moved = tmp_path / "there" / "runs" / "one"
+    read = read_cameras(moved)
+    for name, expected in (("train", frames[1:]), ("test", (masked,))):
+        for ours, theirs in zip(read[name], expected, strict=True):
+            assert (ours.name, ours.camera) == (theirs.name, theirs.camera)
+            np.testing.assert_array_equal(ours.world_from_cam, theirs.world_from_cam)
+            assert ours.image is not None
+            assert ours.image.is_file()
+    assert read["test"][0].mask is not None
+    assert read["train"][0].mask is None
+
+
+def test_a_folder_that_is_no_run_is_told(tmp_path):
+    with pytest.raises(UserError, match=r"is not a run: it has no cameras\.json"):
+        read_cameras(tmp_path)
+    with pytest.raises(UserError, match=r"is not a run: it has no config\.json"):
+        read_config(tmp_path)
+    (tmp_path / "cameras.json").write_text('{"train": [{"name": "a"}], "test": []}')
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(UserError, match=r"cameras\.json cannot be read"):
+        read_cameras(tmp_path)
+    with pytest.raises(UserError, match=r"config\.json cannot be read"):
+        read_config(tmp_path)
+
+
+def test_a_log_line_that_a_kill_cut_short_is_left_out(tmp_path):
+    assert read_log(tmp_path) == []
+    append_log(tmp_path, {"step": 1})
+    append_log(tmp_path, {"step": 2})
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"step": 3, "sec')
+    assert read_log(tmp_path) == [{"step": 1}, {"step": 2}]
+
+
+def test_what_counts_as_the_same_run(views, tmp_path):
+    settings = replace(FEW, steps=1, downscale=4)
+    fit(views, tmp_path / "run", settings)
+    same = [settings, replace(settings, threads=1), replace(settings, device="cuda"), replace(settings, downscale=None)]
+    assert all(is_same_run(tmp_path / "run", views, other) for other in same)
+    other_settings = [replace(settings, seed=1), replace(settings, downscale=2), replace(settings, steps=2)]
+    assert not any(is_same_run(tmp_path / "run", views, other) for other in other_settings)
+    turned = Similarity(1.0, rotation_from_quaternion(np.array([1.0, 0.01, 0.0, 0.0])), np.zeros(3))
+    frames = tuple(replace(f, world_from_cam=turned.apply_pose(f.world_from_cam)) for f in views.frames)
+    assert not is_same_run(tmp_path / "run", replace(views, frames=frames), settings)
+    config = read_config(tmp_path / "run")
+    assert config["settings"]["downscale"] == 4
+    assert config["scene_fingerprint"] == scenes.fingerprint(views)
+    assert set(config["versions"]) >= {"nerfcli", "python", "torch", "numpy"}

@@ -1,0 +1,248 @@
+"""What training is fed: the normalised frame, photos at the size they are trained on, pixels with their rays."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
+from nerfcli.errors import UserError
+from nerfcli.media.images import downscale, write_png
+from nerfcli.render.rays import frame_rays
+from nerfcli.scene import Scene
+from nerfcli.train.losses import colour_loss, over_background
+from nerfcli.train.normalisation import training_frame
+from nerfcli.train.photos import Photo, PixelPool, downscaled_camera, load_photos
+
+CPU = torch.device("cpu")
+CAMERA = Camera.pinhole(40, 30, 50.0)
+MOVED = Similarity(250.0, rotation_from_quaternion(np.array([0.7, -0.1, 0.5, 0.5])), np.array([1e4, -2e4, 300.0]))
+
+
+def ring(count: int = 12, radius: float = 3.0, moved: Similarity | None = None) -> list[Frame]:
+    """Cameras at distances radius and 2 radius in turn about the point (1, 2, 3), looking at it."""
+    frames = []
+    for index in range(count):
+        angle = 2 * math.pi * index / count
+        distance = radius * (1 + index % 2)
+        centre = np.array([1.0, 2.0, 3.0]) + distance * np.array([math.cos(angle), math.sin(angle), 0.5]) / 1.25**0.5
+        pose = look_at(centre, np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 1.0]))
+        frames.append(Frame(f"{index:02d}.png", CAMERA, pose if moved is None else moved.apply_pose(pose)))
+    return frames
+
+
+def scene_of(frames: list[Frame], points: np.ndarray | None = None) -> Scene:
+    return Scene(
+        root=Path("."),
+        kind="transforms",
+        frames=tuple(frames),
+        test_names=frozenset(),
+        points=np.zeros((0, 3)) if points is None else points,
+        missing=(),
+    )
+
+
+def training_centres(scene: Scene, similarity: Similarity) -> np.ndarray:
+    return np.array([similarity.apply(frame.centre) for frame in scene.frames])
+
+
+def test_unbounded_scenes_are_centred_where_cameras_look_and_reach_to_the_median_camera():
+    scene = scene_of(ring())
+    similarity, marching = training_frame(scene, unbounded=True)
+    np.testing.assert_allclose(similarity.apply(np.array([1.0, 2.0, 3.0])), 0, atol=1e-9)
+    distances = np.linalg.norm(training_centres(scene, similarity), axis=1)
+    assert np.median(distances) == pytest.approx(1, abs=1e-9)
+    assert marching.far > 100 * distances.max()
+    assert 0 < marching.near < distances.min()
+
+
+def test_bounded_scenes_are_as_wide_as_the_widest_picture():
+    scene = scene_of(ring())
+    similarity, marching = training_frame(scene, unbounded=False)
+    centres = training_centres(scene, similarity)
+    distances = np.linalg.norm(centres, axis=1)
+    half_width = distances * math.tan(math.radians(max(CAMERA.fov_deg)) / 2)
+    assert half_width.max() == pytest.approx(1, abs=1e-9)
+    # All of the cube is between near and far of every camera.
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    to_corners = np.linalg.norm(centres[:, None] - corners, axis=-1)
+    assert marching.far >= to_corners.max()
+    assert marching.near <= to_corners.min()
+
+
+@pytest.mark.parametrize("unbounded", [True, False])
+def test_the_training_frame_can_be_undone_and_does_not_depend_on_where_the_capture_lies(unbounded):
+    points = np.random.default_rng(0).normal((1, 2, 3), size=(50, 3))
+    here, there = scene_of(ring(), points), scene_of(ring(moved=MOVED), MOVED.apply(points))
+    first, marching = training_frame(here, unbounded=unbounded)
+    second, marching_there = training_frame(there, unbounded=unbounded)
+    np.testing.assert_allclose(first.inverse().apply(first.apply(points)), points, atol=1e-12)
+    np.testing.assert_allclose(second.inverse().apply(second.apply(there.points)), there.points, rtol=1e-12)
+    # Up to a rotation, which the normalisation leaves alone, the two training frames are the same.
+    rotated = Similarity(1.0, MOVED.rotation, np.zeros(3))
+    np.testing.assert_allclose(second.apply(there.points), rotated.apply(first.apply(points)), atol=1e-8)
+    for name in ("near", "far", "shortest_step", "growth"):
+        assert getattr(marching_there, name) == pytest.approx(getattr(marching, name), rel=1e-8)
+
+
+def test_near_is_before_what_the_cameras_see():
+    # Points on a ball of radius 2 about the focus; the nearest of what each camera sees is 1 or more away.
+    normals = np.random.default_rng(0).normal(size=(4000, 3))
+    points = np.array([1.0, 2.0, 3.0]) + 2 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    scene = scene_of(ring(), points)
+    similarity, marching = training_frame(scene, unbounded=True)
+    nearest = min(np.linalg.norm(points - frame.centre, axis=1).min() for frame in scene.frames)
+    assert marching.near < nearest * similarity.scale
+
+
+def test_depth_bounds_of_forward_facing_captures_set_the_focus():
+    # Parallel cameras have no point that all look at: it lies at the harmonic mean of the bounds, 1.6, before them.
+    frames = [replace(f, world_from_cam=np.eye(4)) for f in ring(5)]
+    for index, frame in enumerate(frames):
+        frame.world_from_cam[:3, 3] = (index - 2, 0, 0)
+    scene = replace(scene_of(frames), depth_bounds=np.tile([1.0, 4.0], (5, 1)))
+    similarity, marching = training_frame(scene, unbounded=True)
+    np.testing.assert_allclose(similarity.inverse().apply(np.zeros(3)), [0, 0, 1.6], atol=1e-6)
+    assert marching.near == pytest.approx(0.5 * similarity.scale, rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [(96, 64), (97, 71), (95, 66)])
+@pytest.mark.parametrize("factor", [1, 2, 4, 8])
+def test_a_downscaled_camera_fits_the_area_averaged_picture(size, factor):
+    # Colours that are linear in the direction survive averaging exactly; the small camera must see the same ones.
+    width, height = size
+    camera = Camera("PINHOLE", width, height, (90.0, 88.0, width / 2 + 3, height / 2 - 2))
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    picture = np.stack([x * 2, y * 3, np.zeros_like(x)], axis=-1)
+    small = downscale(np.round(picture).astype(np.uint8), factor)
+    shrunk = downscaled_camera(camera, factor)
+    assert small.shape[:2] == (shrunk.height, shrunk.width)
+    bearings, valid = shrunk.pixel_bearings()
+    assert valid.all()
+    pixels, _ = camera.project(bearings)
+    # Half a level of rounding when the picture is made, half a level when it is averaged.
+    np.testing.assert_allclose(small[..., 0].ravel(), pixels[:, 0] * 2, atol=1.0)
+    np.testing.assert_allclose(small[..., 1].ravel(), pixels[:, 1] * 3, atol=1.0)
+
+
+def numbered_photo(index: int, camera: Camera, frame: Frame, channels: int = 3) -> Photo:
+    """A photo whose colours say which pixel of which photo it is: (photo, row, column)."""
+    rows, columns = np.indices((camera.height, camera.width))
+    layers = [np.full_like(rows, index), rows, columns, np.full_like(rows, 255)][:channels]
+    return Photo(replace(frame, camera=camera), np.stack(layers, axis=-1).astype(np.uint8), None)
+
+
+FISHEYE = Camera("OPENCV_FISHEYE", 33, 21, (20.0, 21.0, 16.0, 11.0, 0.1, -0.02, 0.0, 0.0))
+# The radius r (1 - 0.4 r^2) turns back before the corners: these pixels have no ray.
+BARREL = Camera("OPENCV", 24, 18, (16.0, 16.0, 12.0, 9.0, -0.4, 0.0, 0.0, 0.0))
+SIMILARITY = Similarity(0.3, rotation_from_quaternion(np.array([0.8, 0.2, -0.4, 0.4])), np.array([0.3, -0.2, 0.1]))
+
+
+def drawn(pool: PixelPool, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Origins, directions, and (count, 3) numbers (photo, row, column) of random pixels."""
+    origins, directions, colours = pool.draw(count, torch.Generator().manual_seed(0))
+    assert colours.dtype == torch.float32
+    return origins.numpy(), directions.numpy(), np.round(colours[:, :3].numpy() * 255).astype(int)
+
+
+def test_drawn_rays_are_those_of_whole_pictures():
+    cameras = (CAMERA, FISHEYE, CAMERA, BARREL, FISHEYE)
+    photos = [numbered_photo(i, camera, ring()[i]) for i, camera in enumerate(cameras)]
+    origins, directions, numbers = drawn(PixelPool(photos, SIMILARITY, CPU), 5000)
+    assert set(numbers[:, 0]) == {0, 1, 2, 3, 4}
+    for index, photo in enumerate(photos):
+        rays = frame_rays(photo.frame, SIMILARITY, CPU)
+        mine = numbers[:, 0] == index
+        flat = numbers[mine, 1] * photo.frame.camera.width + numbers[mine, 2]
+        assert rays.valid[flat].all()
+        np.testing.assert_allclose(directions[mine], rays.directions[flat].numpy(), atol=5e-7)
+        np.testing.assert_allclose(origins[mine], np.tile(rays.origin.numpy(), (mine.sum(), 1)), atol=1e-6)
+
+
+def test_every_usable_pixel_is_drawn_equally_often():
+    # Chi-squared over the pixels of two photos of different size: mean n - 1, standard deviation sqrt(2 n).
+    photos = [numbered_photo(0, BARREL, ring()[0]), numbered_photo(1, FISHEYE, ring()[1])]
+    usable = int(BARREL.pixel_bearings()[1].sum() + FISHEYE.pixel_bearings()[1].sum())
+    _, _, numbers = drawn(PixelPool(photos, SIMILARITY, CPU), 100 * usable)
+    counts = np.unique(numbers, axis=0, return_counts=True)[1]
+    assert len(counts) == usable
+    assert np.square(counts - 100).sum() / 100 < usable + 5 * math.sqrt(2 * usable)
+
+
+def test_masked_pixels_are_never_drawn():
+    photo = numbered_photo(0, CAMERA, ring()[0])
+    used = np.zeros((30, 40), dtype=bool)
+    used[7, 31] = used[29, 0] = True
+    _, _, numbers = drawn(PixelPool([replace(photo, used=used)], SIMILARITY, CPU), 200)
+    assert {tuple(row) for row in numbers} == {(0, 7, 31), (0, 29, 0)}
+    with pytest.raises(UserError, match="no pixel is left to train on"):
+        PixelPool([replace(photo, used=np.zeros_like(used))], SIMILARITY, CPU)
+
+
+def test_photos_with_and_without_alpha_go_together():
+    photos = [numbered_photo(0, CAMERA, ring()[0]), numbered_photo(1, CAMERA, ring()[1], channels=4)]
+    assert not PixelPool(photos[:1], SIMILARITY, CPU).has_alpha
+    pool = PixelPool(photos, SIMILARITY, CPU)
+    assert pool.has_alpha
+    _, _, colours = pool.draw(500, torch.Generator().manual_seed(0))
+    assert (colours[:, 3] == 1).all()
+
+
+def test_masks_shrink_to_pixels_that_are_used_whole(tmp_path):
+    write_png(tmp_path / "photo.png", np.full((30, 40, 3), 90, dtype=np.uint8))
+    mask = np.full((30, 40, 3), 255, dtype=np.uint8)
+    mask[5, 9] = 0
+    write_png(tmp_path / "mask.png", mask)
+    frame = replace(ring()[0], image=tmp_path / "photo.png", mask=tmp_path / "mask.png")
+    (photo,) = load_photos([frame], factor=2, threads=1)
+    assert photo.used is not None
+    expected = np.ones((15, 20), dtype=bool)
+    expected[2, 4] = False
+    np.testing.assert_array_equal(photo.used, expected)
+
+
+def test_photos_that_do_not_fit_their_camera_are_told(tmp_path):
+    write_png(tmp_path / "photo.png", np.zeros((30, 40, 3), dtype=np.uint8))
+    write_png(tmp_path / "small.png", np.zeros((15, 20, 3), dtype=np.uint8))
+    frame = ring()[0]
+    for wrong, message in (
+        (frame, r"00\.png has no photo"),
+        (replace(frame, image=tmp_path / "small.png"), r"small\.png is 20x15, its camera says 40x30"),
+        (
+            replace(frame, image=tmp_path / "photo.png", mask=tmp_path / "small.png"),
+            r"small\.png is 20x15, its photo is 40x30",
+        ),
+        (replace(frame, image=tmp_path / "gone.png"), r"cannot read .*gone\.png"),
+    ):
+        with pytest.raises(UserError, match=message):
+            load_photos([wrong], factor=1, threads=2)
+
+
+def test_photos_come_in_the_order_of_their_frames(tmp_path):
+    frames = []
+    for index, frame in enumerate(ring()):
+        write_png(tmp_path / frame.name, np.full((30, 40, 3), 10 * index, dtype=np.uint8))
+        frames.append(replace(frame, image=tmp_path / frame.name))
+    photos = load_photos(frames, factor=2, threads=4)
+    assert [int(photo.pixels[0, 0, 0]) for photo in photos] == [10 * index for index in range(12)]
+    assert {photo.pixels.shape for photo in photos} == {(15, 20, 3)}
+
+
+def test_colours_over_a_background():
+    background = torch.tensor([[1.0, 0.5, 0.0], [0.2, 0.2, 0.2]])
+    rgb = torch.tensor([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    assert torch.equal(over_background(rgb, background), rgb)
+    rgba = torch.cat([rgb, torch.tensor([[0.25], [1.0]])], dim=1)
+    expected = torch.tensor([[0.25 * 0.1 + 0.75, 0.25 * 0.2 + 0.375, 0.25 * 0.3], [0.4, 0.5, 0.6]])
+    torch.testing.assert_close(over_background(rgba, background), expected)
+
+
+def test_colour_loss_is_quadratic_for_noise_and_linear_for_outliers():
+    measured = torch.zeros(1, 3)
+    for error, expected in ((0.0, 0.0), (0.02, 0.5 * 0.02**2 / 0.1), (0.8, 0.8 - 0.05)):
+        assert colour_loss(measured + error, measured).item() == pytest.approx(expected, rel=1e-5)
