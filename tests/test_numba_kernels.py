@@ -120,7 +120,7 @@ def test_composite(samples, magnitude, generator):
     back = [torch.randn(shape, generator=generator) for shape in shapes]
 
     def run(function, dtype):
-        d, c = density.to(dtype).requires_grad_(), rgb.to(dtype).requires_grad_()
+        d, c = (x.detach().clone().to(dtype).requires_grad_() for x in (density, rgb))
         out = function(d, c, lengths.to(dtype), offsets=offsets, background=background.to(dtype))
         torch.autograd.backward(out, [g.to(dtype) for g in back])
         return *(x.detach() for x in out), d.grad, c.grad

@@ -1,5 +1,6 @@
 """Training on a capture with known geometry: it learns, it repeats bit for bit, it goes on, it stops as asked."""
 
+import json
 import math
 import os
 import shutil
@@ -13,7 +14,9 @@ import torch
 from conftest import SPHERES
 
 from nerfcli import scene as scenes
-from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
 from nerfcli.errors import BAD_INPUT, NON_FINITE, UserError
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
 from nerfcli.field.checkpoint import load_tensors
@@ -85,6 +88,33 @@ def test_held_out_views_are_far_better_than_one_colour(spheres, spheres_run):
     assert metrics["mean"]["ssim"] > 0.7
     # What the log said during training is the same quantity, pooled over some pixels.
     assert read_log(spheres_run)[-1]["heldout_psnr"] == pytest.approx(metrics["mean"]["psnr"], abs=1.0)
+
+
+@pytest.mark.slow
+def test_photos_of_a_desk_are_learned_too(tmp_path):
+    # Photos without alpha, of a scene without an end, with the cameras that they were rendered with, and points as
+    # structure from motion would give them, from the true depth of the held-out views.
+    desk = SPHERES.with_name("desk")
+    known = json.loads((desk / "truth" / "cameras.json").read_text())
+    camera = Camera.from_json(known["camera"])
+    frames = tuple(
+        Frame(view["name"], camera, np.array(view["world_from_cam"]), desk / "images" / view["name"])
+        for view in known["images"]
+    )
+    names = scenes.default_split(frame.name for frame in frames)
+    points = []
+    for frame in (frame for frame in frames if frame.name in names):
+        depth, _ = read_tiff(desk / "truth" / "depth" / f"{Path(frame.name).stem}.tiff")
+        bearings, _ = camera.pixel_bearings()
+        in_camera = (bearings / bearings[:, 2:] * depth.reshape(-1, 1))[::400]
+        points.append(apply(frame.world_from_cam, in_camera))
+    scene = Scene(desk, "transforms", frames, names, np.concatenate(points), ())
+    settings = TrainSettings(budget_seconds=None, steps=400, downscale=8, samples_per_step=2**14, threads=2)
+    fit(scene, tmp_path / "run", settings)
+    photos = load_photos(scene.test_frames, factor=8, threads=1)
+    mean = np.mean([p.pixels for p in load_photos(scene.train_frames, factor=8, threads=1)], (0, 1, 2))
+    one_colour = np.mean([-10 * math.log10(np.square((photo.pixels - mean) / 255).mean()) for photo in photos])
+    assert read_log(tmp_path / "run")[-1]["heldout_psnr"] > one_colour + 3
 
 
 @pytest.mark.parametrize(("axis", "truth"), [("z", "z"), ("ray", "distance")])

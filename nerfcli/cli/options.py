@@ -18,6 +18,7 @@ Output = Annotated[
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
 Threads = Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)]
+Downscale = Annotated[str, typer.Option(help="Average photos over squares: auto, 1, 2, 4 or 8.")]
 Json = Annotated[bool, typer.Option("--json", help="Results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No notes and no progress; warnings and errors stay.")]
@@ -36,6 +37,17 @@ def seconds_from_text(text: str) -> float:
     if not seconds > 0:
         raise typer.BadParameter(f"{text!r} is not a time; write 90s, 5m or 1h")
     return seconds
+
+
+def downscale_factor(downscale: str) -> int | None:
+    """1, 2, 4 or 8; None for auto.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    if downscale not in ("auto", "1", "2", "4", "8"):
+        raise typer.BadParameter(f"{downscale!r}; choose auto, 1, 2, 4 or 8", param_hint="--downscale")
+    return None if downscale == "auto" else int(downscale)
 
 
 def thread_count(threads: int) -> int:

@@ -9,6 +9,7 @@ from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Device,
+    Downscale,
     Json,
     Output,
     Overwrite,
@@ -16,6 +17,7 @@ from nerfcli.cli.options import (
     Seed,
     Threads,
     device_name,
+    downscale_factor,
     seconds_from_text,
     thread_count,
 )
@@ -26,6 +28,7 @@ def run(
     photos: Annotated[str, typer.Argument(help="A folder of photos, or - for folders on standard input.")],
     output: Output = None,
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
+    downscale: Downscale = "auto",
     frames: Annotated[int, typer.Option(help="Frames of the orbit video.", min=2)] = 60,
     max_size: Annotated[
         int | None, typer.Option(help="Longer side of the video at most, pixels.  [default: as trained]", min=8)
@@ -60,7 +63,11 @@ def run(
     cores, torch_device = thread_count(threads), device_name(device)
     pose_settings = PoseSettings(seed=seed, threads=cores)
     train_settings = TrainSettings(
-        budget_seconds=seconds_from_text(budget), seed=seed, device=torch_device, threads=cores
+        budget_seconds=seconds_from_text(budget),
+        downscale=downscale_factor(downscale),
+        seed=seed,
+        device=torch_device,
+        threads=cores,
     )
     depth = DepthRequest(convention="conditional", axis="z")
 

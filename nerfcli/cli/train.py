@@ -10,6 +10,7 @@ from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Device,
+    Downscale,
     Json,
     Output,
     Overwrite,
@@ -17,6 +18,7 @@ from nerfcli.cli.options import (
     Seed,
     Threads,
     device_name,
+    downscale_factor,
     seconds_from_text,
     thread_count,
 )
@@ -37,7 +39,7 @@ def train(
         str | None, typer.Option(help="Training time: 90s, 5m, 1h.  [default: 2m, or none with --steps]")
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Optimiser steps in all; repeatable bit for bit.", min=1)] = None,
-    downscale: Annotated[str, typer.Option(help="Average photos over squares: auto, 1, 2, 4 or 8.")] = "auto",
+    downscale: Downscale = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint to the new total.")] = False,
     device: Device = "auto",
     seed: Seed = 0,
@@ -60,15 +62,13 @@ def train(
     """
     from nerfcli.train.settings import TrainSettings
 
-    if downscale not in ("auto", "1", "2", "4", "8"):
-        raise typer.BadParameter(f"{downscale!r}; choose auto, 1, 2, 4 or 8", param_hint="--downscale")
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
     console = Console(quiet=quiet, json_lines=json)
     settings = TrainSettings(
         budget_seconds=None if budget is None else seconds_from_text(budget),
         steps=steps,
-        downscale=None if downscale == "auto" else int(downscale),
+        downscale=downscale_factor(downscale),
         seed=seed,
         device=device_name(device),
         threads=thread_count(threads),
@@ -91,6 +91,7 @@ def train_scene(
         UserError: see `nerfcli.train.loop.train`; or a different run stands at `run`.
     """
     from nerfcli import scene as scenes
+    from nerfcli.evaluate.protocol import METRICS
     from nerfcli.train.loop import Progress
     from nerfcli.train.loop import train as fit
     from nerfcli.train.run_folder import CONFIG, FIELD, is_complete, is_same_run, read_config
@@ -115,6 +116,8 @@ def train_scene(
     if run.is_file() or (run.is_dir() and not (run / CONFIG).exists() and any(run.iterdir())):
         raise UserError(f"{run} is not a run, but something else", "choose another place with -o")
 
+    if overwrite:
+        (run / METRICS).unlink(missing_ok=True)  # they belong to the field that goes
     with console.progress(f"train {folder.name}") as update:
 
         def on_progress(progress: Progress) -> None:

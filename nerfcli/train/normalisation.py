@@ -23,8 +23,8 @@ def training_frame(scene: Scene, *, unbounded: bool) -> tuple[Similarity, Marchi
     """The similarity from the scene's frame, and the steps along rays in the training frame.
 
     Unbounded scenes: the unit ball is centred where the cameras look and reaches to the median camera. Bounded ones
-    (photos with alpha): the unit ball is the largest that every camera sees whole, and the cube around it is all
-    there is.
+    (photos with alpha): the unit ball is the smallest that reaches out of every camera's view, and the cube around it
+    is all there is.
 
     Raises:
         UserError: no camera (see `Scene`).
