@@ -22,14 +22,19 @@ class Occupancy:
     """What fills each cell, and whether light gets there: decaying maxima over what was seen of the cell lately.
 
     The optical depth of one ray step comes from asking the field at random points; a cell is full where it exceeds
-    min(0.01, its mean over the grid): the mean keeps cells open at the start, when all of space is thin fog. The
+    min(0.01, its mean over the unit ball): the mean keeps cells open at the start, when all of space is thin fog. The
     transmittance comes from the rays of the training itself, and changes only where rays have been: it closes what lies
     behind surfaces, which nothing ever tells to be empty.
     Source of the first: Müller et al. 2022, Instant NGP, arXiv:2201.05989, appendix C, with a faster decay for short
     trainings.
     """
 
-    def __init__(self, side: int, device: torch.device):
+    def __init__(self, side: int, device: torch.device, *, unbounded: bool):
+        axis = (torch.arange(side, device=device) + 0.5) / side
+        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+        radius = training_points(torch.stack([x, y, z], dim=-1), unbounded).norm(dim=-1)
+        # Steps grow without end outside the unit ball: a mean over all of space would be that of its far end.
+        self.central = (radius <= 1.0) if unbounded else torch.ones_like(radius, dtype=torch.bool)
         self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
         self.transmittance = torch.ones((side, side, side), device=device)
         self.lately = torch.full((side, side, side), -1.0, device=device)
@@ -37,7 +42,7 @@ class Occupancy:
     @property
     def occupied(self) -> Tensor:
         """(side, side, side) bool, indexed [z, y, x]; cells never looked at are occupied."""
-        known = self.optical_depth[self.optical_depth.isfinite()]
+        known = self.optical_depth[self.central & self.optical_depth.isfinite()]
         mean = known.mean() if len(known) else self.optical_depth.new_tensor(0.0)
         full = self.optical_depth > mean.clamp_max(OCCUPIED_OPTICAL_DEPTH)
         return full & (self.transmittance > VISIBLE_TRANSMITTANCE)

@@ -73,7 +73,7 @@ class Fitting:
         self.settings = settings
         self.step = 0
         self.field = HashField(HashFieldSettings(unbounded=unbounded)).to(device)
-        self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
+        self.occupancy = Occupancy(OCCUPANCY_SIDE, device, unbounded=unbounded)
         self.cells_from_points = cells_from_points(points, OCCUPANCY_SIDE, unbounded).to(device)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
