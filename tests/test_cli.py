@@ -97,7 +97,15 @@ def finished(capture: Path) -> Path:
     write_cameras(run, loaded.train_frames, loaded.test_frames)
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     save_model(run / "field.safetensors", fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32))
-    entry = {"step": 7, "seconds": 2.0, "samples": 100, "loss": 0.1, "samples_per_second": 50, "peak_memory_bytes": 9}
+    entry = {
+        "step": 7,
+        "seconds": 2.0,
+        "samples": 100,
+        "rays": 10,
+        "loss": 0.1,
+        "samples_per_second": 50,
+        "peak_memory_bytes": 9,
+    }
     append_log(run, entry)
     return run
 
@@ -376,6 +384,12 @@ def test_a_batch_goes_on_after_a_bad_path(capture, tmp_path):
     assert result.exit_code == 0
     paths = [json.loads(line)["path"] for line in result.stdout.splitlines()]
     assert paths == [f"{capture}-run/metrics.json", f"{other}-run/metrics.json"]
+
+
+def test_there_is_no_place_beside_the_root():
+    result = nerfcli("poses", "/")
+    assert result.exit_code == BAD_INPUT
+    assert error_of(result) == ("Error: there is no place beside /", "Hint:  say with -o where the result shall go")
 
 
 def test_many_inputs_share_one_output_folder(capture, tmp_path):

@@ -3,6 +3,9 @@
 Gradients are compared as vectors (relative L2) and per element against the largest one.
 """
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -160,6 +163,62 @@ def test_march_and_coordinates(rays, unbounded, generator):
     assert torch.equal(numba_cpu.ray_indices(fast[2]), reference.ray_indices(fast[2]))
 
 
+@pytest.mark.parametrize("rays", [0, 1, 5, 123, 700])
+@pytest.mark.parametrize("unbounded", [False, True])
+# Thin fog lets every ray through; at 8 the densities reach e^15, and some rays end in their first sample.
+@pytest.mark.parametrize("contrast", [0.0, 1.0, 8.0])
+def test_visible_samples(rays, unbounded, contrast, generator):
+    origins = torch.randn(rays, 3, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
+    edges = torch.rand(60, generator=generator).cumsum(0) * 0.2
+    occupied = torch.rand(8, 8, 8, generator=generator) > 0.4
+    weights = tuple(torch.randn(shape, generator=generator) * 0.3 for shape in WEIGHTS)
+    settings = {
+        "jitter": torch.rand(rays, generator=generator),
+        "occupied": occupied,
+        "unbounded": unbounded,
+        "table": torch.randn(8, 256, 4, generator=generator) * contrast,
+        "resolutions": (4, 5, 6, 7, 9, 11, 13, 16),
+        "weights": weights,
+        "deepest": 7.0,
+    }
+    fast = numba_cpu.visible_samples(origins, directions, edges, **settings)
+    exact = reference.visible_samples(origins, directions, edges, **settings)
+    # A middle that rounds into the neighbouring cell, or an optical depth that rounds across the limit, is kept by one
+    # and not by the other; none is for these seeds.
+    assert torch.equal(fast[5], exact[5])
+    names = ("starts", "ends", "density", "encoded", "coordinates")
+    for name, actual, expected in zip(names, fast[:5], exact[:5], strict=True):
+        assert_close(actual, expected, name, relative=5 * RELATIVE if name == "density" else RELATIVE)
+    if rays:
+        depth = reference.optical_depth_before(fast[2], fast[1] - fast[0], fast[5])
+        assert (depth < 7.0).all()
+
+
+def test_visible_samples_holds_many_rays_of_many_samples(generator):
+    # More samples than the buffers start with, in order of rays: through fog so thin that no ray ends early.
+    rays, edges = 200, torch.linspace(0, 2, 402)
+    origins = torch.tensor([0.0, 0.0, -1.0]).repeat(rays, 1)
+    directions = torch.tensor([0.0, 0.0, 1.0]).repeat(rays, 1)
+    starts, ends, density, _, coordinates, offsets = numba_cpu.visible_samples(
+        origins,
+        directions,
+        edges,
+        jitter=torch.zeros(rays),
+        occupied=torch.ones(2, 2, 2, dtype=torch.bool),
+        unbounded=False,
+        table=torch.zeros(8, 16, 4),
+        resolutions=(2,) * 8,
+        weights=tuple(torch.zeros(shape) for shape in WEIGHTS),
+        deepest=7.0,
+    )
+    assert torch.equal(offsets, torch.arange(rays + 1) * 400)
+    assert torch.equal(starts.view(rays, 400), edges[:400].expand(rays, 400))
+    assert torch.equal(ends.view(rays, 400), edges[1:401].expand(rays, 400))
+    assert (density == 1).all()
+    torch.testing.assert_close(coordinates[:, 2], ((starts + ends) / 2).clamp(0, 2) / 2)
+
+
 @pytest.mark.parametrize("rows", [0, 1, 5, 123])
 @pytest.mark.parametrize("magnitude", [1e-12, 1.0, 1e6])
 def test_adam_rows(rows, magnitude, generator):
@@ -204,6 +263,16 @@ def test_scatter_max(generator):
     for (x, y, z), value in zip((coordinates * 4).clamp(max=3).int().tolist(), values.tolist(), strict=True):
         by_hand[z, y, x] = max(by_hand[z, y, x], value)
     np.testing.assert_array_equal(fast.numpy(), by_hand)
+
+
+def test_starting_numba_leaves_the_thread_count_alone():
+    # Both libraries share one OpenMP: without care, the first compiled loop gave --threads 1 two threads.
+    program = (
+        "import torch; torch.set_num_threads(1); from nerfcli.kernels import numba_cpu; numba_cpu.warm_up(); "
+        "from nerfcli.kernels.numba_cpu.threads import thread_count; print(torch.get_num_threads(), thread_count())"
+    )
+    told = subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.PIPE, text=True)
+    assert told.stdout.split() == ["1", "1"]
 
 
 def test_two_runs_are_bit_identical(generator):

@@ -57,9 +57,14 @@ def result_path(source: Path, *, suffix: str, output: Path | None, one_of_many: 
 
     Beside the source with `suffix` added to its name; at `output` where that is given; inside `output` where there
     are many sources.
+
+    Raises:
+        UserError: the source is the root of the file system, beside which there is nothing.
     """
     if source.name in ("", ".."):  # "." and ".." have a name only once they are resolved
         source = source.resolve()
+    if not source.name and (output is None or one_of_many):
+        raise UserError(f"there is no place beside {source}", "say with -o where the result shall go")
     name = source.name + suffix
     if output is None:
         return source.with_name(name)

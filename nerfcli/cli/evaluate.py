@@ -81,6 +81,7 @@ def evaluate_run(
         "seconds": log[-1]["seconds"],
         "steps": log[-1]["step"],
         "samples_per_second": log[-1]["samples"] / log[-1]["seconds"],
+        "rays_per_second": log[-1]["rays"] / log[-1]["seconds"],
         "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
     }
     metrics["device"] = f"{device}, {threads} threads, {platform.machine()}"

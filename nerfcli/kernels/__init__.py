@@ -31,6 +31,7 @@ __all__ = [
     "sample_coordinates",
     "scatter_max",
     "sum_along_rays",
+    "visible_samples",
 ]
 
 
@@ -120,6 +121,41 @@ def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple
 def scatter_max(grid: Tensor, coordinates: Tensor, values: Tensor) -> None:
     """See `reference.scatter_max`."""
     _module_for(grid, coordinates, values).scatter_max(grid, coordinates, values)
+
+
+def visible_samples(
+    origins: Tensor,
+    directions: Tensor,
+    edges: Tensor,
+    *,
+    jitter: Tensor,
+    occupied: Tensor,
+    unbounded: bool,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    weights: tuple[Tensor, ...],
+    deepest: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """See `reference.visible_samples`."""
+    numba_cpu = _numba_cpu()
+    fits = (
+        numba_cpu is not None
+        and _module_for(origins, directions, edges, jitter) is numba_cpu
+        and numba_cpu.can_hash_encode(origins, table, resolutions)
+        and numba_cpu.can_radiance(table.new_empty(0, table.shape[0] * table.shape[2]), weights[:2])
+    )
+    return (numba_cpu if fits and numba_cpu is not None else reference).visible_samples(
+        origins,
+        directions,
+        edges,
+        jitter=jitter,
+        occupied=occupied,
+        unbounded=unbounded,
+        table=table,
+        resolutions=resolutions,
+        weights=weights,
+        deepest=deepest,
+    )
 
 
 def adam_rows(

@@ -277,6 +277,43 @@ def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Te
     return density_from_log(shape[:, 0]), torch.sigmoid(hidden @ weights[4].t())
 
 
+def visible_samples(
+    origins: Tensor,
+    directions: Tensor,
+    edges: Tensor,
+    *,
+    jitter: Tensor,
+    occupied: Tensor,
+    unbounded: bool,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    weights: tuple[Tensor, ...],
+    deepest: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """The samples of `march` in front of which the optical depth is below a limit, with what the field says of them.
+
+    What is left out takes at most exp(-deepest) of a ray's light.
+
+    Args:
+        origins, directions, edges, jitter, occupied, unbounded: see `march`.
+        table, resolutions: see `hash_encode`.
+        weights: see `density`.
+        deepest: > 0; each ray ends with the sample that brings its optical depth to this.
+
+    Returns:
+        starts (N,), ends (N,), density (N,), encoded (N, L * F), coordinates (N, 3) in the field's unit cube,
+        offsets (R + 1,). Without gradients.
+    """
+    with torch.no_grad():
+        starts, ends, offsets = march(origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded)
+        coordinates = sample_coordinates(origins, directions, starts, ends, offsets=offsets, unbounded=unbounded)
+        encoded = hash_encode(coordinates, table, resolutions)
+        thickness = density(encoded, weights)
+        seen = optical_depth_before(thickness, ends - starts, offsets) < deepest
+        kept = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
+    return starts[seen], ends[seen], thickness[seen], encoded[seen], coordinates[seen], kept
+
+
 @torch.no_grad()
 def adam_rows(
     table: Tensor,

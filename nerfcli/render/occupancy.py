@@ -9,24 +9,18 @@ from nerfcli import kernels
 from nerfcli.field.contraction import training_points
 from nerfcli.field.hash_field import HashField
 
-# A cell counts as occupied when one step through it takes away more than this share of the light,
+# A cell counts as occupied when one step through it takes away more than this share of the light.
 OCCUPIED_OPTICAL_DEPTH = 0.01
-# and when some ray still has more than this share of its light when it gets there.
-VISIBLE_TRANSMITTANCE = 5e-3
 DECAY = 0.8
-# Of the cells asked about at a refresh, this share is taken for visible again, to be looked into by the rays.
-REOPENED = 1 / 16
 
 
 class Occupancy:
-    """What fills each cell, and whether light gets there: decaying maxima over what was seen of the cell lately.
+    """What fills each cell: a decaying maximum of the optical depth of one ray step.
 
-    The optical depth of one ray step comes from asking the field at random points; a cell is full where it exceeds
-    min(0.01, its mean over the unit ball): the mean keeps cells open at the start, when all of space is thin fog. The
-    transmittance comes from the rays of the training itself, and changes only where rays have been: it closes what lies
-    behind surfaces, which nothing ever tells to be empty.
-    Source of the first: Müller et al. 2022, Instant NGP, arXiv:2201.05989, appendix C, with a faster decay for short
-    trainings.
+    The optical depth comes from asking the field at random points; a cell is full where it exceeds min(0.01, its mean
+    over the unit ball): the mean keeps cells open at the start, when all of space is thin fog. What lies behind
+    surfaces stays as it is, and costs nothing: rays stop before they get there.
+    Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, appendix C, with a faster decay for short trainings.
     """
 
     def __init__(self, side: int, device: torch.device, *, unbounded: bool):
@@ -36,26 +30,19 @@ class Occupancy:
         # Steps grow without end outside the unit ball: a mean over all of space would be that of its far end.
         self.central = (radius <= 1.0) if unbounded else torch.ones_like(radius, dtype=torch.bool)
         self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
-        self.transmittance = torch.ones((side, side, side), device=device)
-        self.lately = torch.full((side, side, side), -1.0, device=device)
 
     @property
     def occupied(self) -> Tensor:
         """(side, side, side) bool, indexed [z, y, x]; cells never looked at are occupied."""
         known = self.optical_depth[self.central & self.optical_depth.isfinite()]
         mean = known.mean() if len(known) else self.optical_depth.new_tensor(0.0)
-        full = self.optical_depth > mean.clamp_max(OCCUPIED_OPTICAL_DEPTH)
-        return full & (self.transmittance > VISIBLE_TRANSMITTANCE)
-
-    def observe(self, coordinates: Tensor, transmittance: Tensor) -> None:
-        """Take note of the light (N,) that rays had when they came to points (N, 3) of the unit cube."""
-        kernels.scatter_max(self.lately, coordinates, transmittance)
+        return self.optical_depth > mean.clamp_max(OCCUPIED_OPTICAL_DEPTH)
 
     @torch.no_grad()
     def refresh(
         self, field: HashField, *, share: float, shortest_step: float, growth: float, generator: torch.Generator
     ) -> None:
-        """Ask the field at one random point in each of a random `share` of the cells, and take in what rays saw.
+        """Ask the field at one random point in each of a random `share` of the cells.
 
         Args:
             field: the field being trained.
@@ -76,20 +63,13 @@ class Occupancy:
         old = flat[cells]
         flat[cells] = torch.maximum(torch.where(old.isinf(), 0.0, old * DECAY), density * step)
 
-        passed = torch.maximum(self.transmittance * DECAY, self.lately)
-        self.transmittance = torch.where(self.lately >= 0, passed, self.transmittance)
-        self.transmittance.view(-1)[cells[: round(REOPENED * len(cells))]] = 1.0
-        self.lately.fill_(-1.0)
-
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs."""
-        return {"optical_depth": self.optical_depth, "transmittance": self.transmittance, "lately": self.lately}
+        return {"optical_depth": self.optical_depth}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take up what `state` gave."""
         self.optical_depth = tensors["optical_depth"]
-        self.transmittance = tensors["transmittance"]
-        self.lately = tensors["lately"]
 
 
 def cells_from_points(points: np.ndarray, side: int, unbounded: bool) -> Tensor:

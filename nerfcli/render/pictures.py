@@ -13,8 +13,10 @@ from nerfcli.render import depth as depth_of_rays
 from nerfcli.render.model import Model
 from nerfcli.render.rays import frame_rays
 
-# Colour is asked for only where a sample's weight can show in 8 bits: 1000 such samples make one grey level.
-NEGLIGIBLE_WEIGHT = 1e-5
+# Colour is asked for only where the weight of a sample can show: forty of these make one grey level.
+NEGLIGIBLE_WEIGHT = 1e-4
+# Rays end where a hundred-thousandth of the light is left, far less than a grey level.
+DEEPEST = 11.5
 RAYS_PER_TILE = 4096
 
 
@@ -108,22 +110,21 @@ def render_rays(
         background: (3,) sRGB.
         depth: which depth; its axis is the caller's business.
     """
-    starts, ends, offsets = kernels.march(
+    starts, ends, density, encoded, _, offsets = kernels.visible_samples(
         origins,
         directions,
         model.marching.edges().to(directions),
         jitter=torch.full_like(directions[:, 0], 0.5),
         occupied=model.occupied,
         unbounded=model.field.settings.unbounded,
+        table=model.field.table,
+        resolutions=model.field.settings.resolutions,
+        weights=tuple(model.field.weights),
+        deepest=DEEPEST,
     )
-    coordinates = kernels.sample_coordinates(
-        origins, directions, starts, ends, offsets=offsets, unbounded=model.field.settings.unbounded
-    )
-    encoded = kernels.hash_encode(coordinates, model.field.table, model.field.settings.resolutions)
-    density = kernels.density(encoded, tuple(model.field.weights))
     weights, _ = kernels.interval_weights(density, ends - starts, offsets)
     seen = weights > NEGLIGIBLE_WEIGHT
-    rgb = torch.zeros_like(coordinates)
+    rgb = density.new_zeros(len(density), 3)
     rays = kernels.ray_indices(offsets)[seen]
     rgb[seen] = model.field.radiance_of_encoded(encoded[seen], directions, rays)[1]
     colour, transmittance, _ = kernels.composite(

@@ -21,7 +21,7 @@ OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
 REFRESH_SHARE = 1 / 8
 MOST_RAYS = 2**14
-# Samples behind this optical depth see less than a thousandth of the light and are not trained on.
+# Rays of the training end where less than a thousandth of the light is left.
 DEEPEST = 7.0
 # Cells around a point that are open at the start, and the steps after which the next ones open.
 FIRST_CELLS = 2
@@ -142,33 +142,25 @@ class Fitting:
         if colours.shape[-1] == 4:
             background = torch.rand(len(origins), 3, generator=self.generator, device=device)
         field = self.field
-        starts, ends, offsets = kernels.march(
+        starts, ends, _, known, coordinates, offsets = kernels.visible_samples(
             origins,
             directions,
             edges,
             jitter=jitter,
             occupied=self.occupied,
             unbounded=field.settings.unbounded,
+            table=field.table,
+            resolutions=field.settings.resolutions,
+            weights=tuple(field.weights),
+            deepest=DEEPEST,
         )
-        coordinates = kernels.sample_coordinates(
-            origins, directions, starts, ends, offsets=offsets, unbounded=field.settings.unbounded
-        )
-        marched = len(coordinates)
-        with torch.no_grad():
-            encoded = kernels.hash_encode(coordinates, field.table, field.settings.resolutions)
-            density = kernels.density(encoded, tuple(field.weights))
-            before = kernels.optical_depth_before(density, ends - starts, offsets)
-            self.occupancy.observe(coordinates, torch.exp(-before))
-            seen = before < DEEPEST
-            offsets = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
         encoded = kernels.hash_encode(
-            coordinates[seen], field.table, field.settings.resolutions, sink=self.table_gradient, known=encoded[seen]
+            coordinates, field.table, field.settings.resolutions, sink=self.table_gradient, known=known
         )
         density, rgb = field.radiance_of_encoded(encoded, directions, kernels.ray_indices(offsets))
-        lengths = (ends - starts)[seen]
-        density, rgb = _scale_gradients(density, rgb, distance=starts[seen])
-        rendered, _, _ = kernels.composite(density, rgb, lengths, offsets=offsets, background=background)
-        return colour_loss(rendered, over_background(colours, background)), marched
+        density, rgb = _scale_gradients(density, rgb, distance=starts)
+        rendered, _, _ = kernels.composite(density, rgb, ends - starts, offsets=offsets, background=background)
+        return colour_loss(rendered, over_background(colours, background)), len(starts)
 
     def _refresh_occupancy(self) -> None:
         # The whole grid once, after a warm-up in which everything is open; then a share at a time.

@@ -170,6 +170,7 @@ def _run(
                 "seconds": round(totals.seconds, 3),
                 "loss": result.loss,
                 "samples": totals.samples,
+                "rays": totals.rays,
                 "samples_per_second": round(speed),
                 "rays_per_second": round(rays_speed),
                 "peak_memory_bytes": peak_memory_bytes(),

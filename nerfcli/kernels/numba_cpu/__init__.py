@@ -9,6 +9,7 @@ from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
 from nerfcli.kernels.numba_cpu.rays import march, ray_indices, sample_coordinates, scatter_max
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows
+from nerfcli.kernels.numba_cpu.visible import visible_samples
 
 __all__ = [
     "adam_rows",
@@ -25,6 +26,7 @@ __all__ = [
     "ray_indices",
     "sample_coordinates",
     "scatter_max",
+    "visible_samples",
     "warm_up",
 ]
 
@@ -46,6 +48,10 @@ def warm_up() -> None:
     table = torch.zeros(8, 16, 4, requires_grad=True)
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     weights = tuple(torch.zeros(shape, requires_grad=True) for shape in shapes)
+    visible_samples(
+        direction, direction, torch.arange(4.0), jitter=jitter, occupied=occupied, unbounded=True, table=table,
+        resolutions=(2,) * 8, weights=weights, deepest=1.0,
+    )  # fmt: skip
     encoded = hash_encode(points, table, (2,) * 8, None, None)
     optical_depth_before(density(encoded, weights), lengths, offsets)
     thickness, rgb = radiance(encoded, torch.zeros(1, 16), ray_indices(offsets), weights)

@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfcli.kernels.numba_cpu.threads import thread_count
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _depth_before(density: Any, lengths: Any, offsets: Any, out: Any) -> None:
     for ray in numba.prange(offsets.shape[0] - 1):
         depth = 0.0
@@ -24,7 +24,7 @@ def _depth_before(density: Any, lengths: Any, offsets: Any, out: Any) -> None:
             depth += np.float64(density[i]) * np.float64(lengths[i])
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _forward(
     density: Any, rgb: Any, lengths: Any, offsets: Any, background: Any, colour: Any, transmittance: Any, weights: Any
 ) -> None:
@@ -46,7 +46,7 @@ def _forward(
         colour[ray, 2] = blue + left * background[ray, 2]
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _backward(
     density: Any,
     rgb: Any,
@@ -82,7 +82,7 @@ def _backward(
             rgb_gradient[i, 2] = weight * gb
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _weights(density: Any, lengths: Any, offsets: Any, weights: Any, transmittance: Any) -> None:
     for ray in numba.prange(offsets.shape[0] - 1):
         depth = 0.0

@@ -14,142 +14,128 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.numba_cpu.threads import thread_count
-from nerfcli.kernels.numba_cpu.vector import prefetch
+from nerfcli.kernels.numba_cpu.vector import ROW, gather_rows, prefetch, scatter_rows
 
-# Row width that the kernels are unrolled for.
-FEATURES = 4
+# Row width that the kernels are written for, corners of a cell, and samples in a block.
+FEATURES = ROW
 BLOCK = 32
 
 
 @numba.njit(inline="always")
-def _locate(x: Any, y: Any, z: Any, resolution: Any) -> Any:
-    """Cell and place inside it, of coordinates clamped to [0, 1]."""
-    top = np.float32(resolution)
-    last = np.int32(resolution - 1)
-    sx = min(max(x, np.float32(0)), np.float32(1)) * top
-    sy = min(max(y, np.float32(0)), np.float32(1)) * top
-    sz = min(max(z, np.float32(0)), np.float32(1)) * top
-    cx, cy, cz = min(np.int32(sx), last), min(np.int32(sy), last), min(np.int32(sz), last)
-    return (
-        np.uint32(cx),
-        np.uint32(cy),
-        np.uint32(cz),
-        sx - np.float32(cx),
-        sy - np.float32(cy),
-        sz - np.float32(cz),
-    )
+def _cells(points: Any, first: Any, count: Any, resolution: Any, cell: Any, inside: Any) -> None:
+    """Cells (3, BLOCK) and places inside them of a block of samples, coordinates clamped to [0, 1]."""
+    top, last = np.float32(resolution), np.int32(resolution - 1)
+    for axis in range(3):
+        for i in range(count):
+            scaled = min(max(points[first + i, axis], np.float32(0)), np.float32(1)) * top
+            floor = min(np.int32(scaled), last)
+            cell[axis, i] = np.uint32(floor)
+            inside[axis, i] = scaled - np.float32(floor)
 
 
 @numba.njit(inline="always")
-def _corner_rows(cx: Any, cy: Any, cz: Any, resolution: Any, rows: Any, out: Any, at: Any) -> None:
-    """Table rows of the 8 corners of a cell; bit 0 of the corner is x, bit 1 is y, bit 2 is z."""
-    one = np.uint32(1)
+def _corner_rows(cell: Any, count: Any, resolution: Any, rows: Any, index: Any) -> None:
+    """Table rows of the 8 corners, corner after corner; bit 0 of the corner is x, bit 1 is y, bit 2 is z."""
     side = np.uint32(resolution + 1)
     dense = np.int64(side) * np.int64(side) * np.int64(side) <= np.int64(rows)
-    if dense:
-        base = (cz * side + cy) * side + cx
-        for corner in range(8):
-            dx, dy, dz = np.uint32(corner & 1), np.uint32((corner >> 1) & 1), np.uint32((corner >> 2) & 1)
-            out[at, corner] = base + (dz * side + dy) * side + dx
-        return
     mask = np.uint32(rows - 1)
-    y0, z0 = np.uint32(cy * np.uint32(2654435761)), np.uint32(cz * np.uint32(805459861))
-    y1, z1 = np.uint32(y0 + np.uint32(2654435761)), np.uint32(z0 + np.uint32(805459861))
-    x0, x1 = cx, np.uint32(cx + one)
-    out[at, 0] = (x0 ^ y0 ^ z0) & mask
-    out[at, 1] = (x1 ^ y0 ^ z0) & mask
-    out[at, 2] = (x0 ^ y1 ^ z0) & mask
-    out[at, 3] = (x1 ^ y1 ^ z0) & mask
-    out[at, 4] = (x0 ^ y0 ^ z1) & mask
-    out[at, 5] = (x1 ^ y0 ^ z1) & mask
-    out[at, 6] = (x0 ^ y1 ^ z1) & mask
-    out[at, 7] = (x1 ^ y1 ^ z1) & mask
+    for corner in range(8):
+        dx, dy, dz = np.uint32(corner & 1), np.uint32((corner >> 1) & 1), np.uint32((corner >> 2) & 1)
+        if dense:
+            for i in range(count):
+                index[corner * BLOCK + i] = np.uint32(
+                    ((cell[2, i] + dz) * side + cell[1, i] + dy) * side + cell[0, i] + dx
+                )
+        else:
+            for i in range(count):
+                y, z = np.uint32(cell[1, i] + dy), np.uint32(cell[2, i] + dz)
+                mixed = np.uint32(cell[0, i] + dx) ^ np.uint32(y * np.uint32(2654435761))
+                index[corner * BLOCK + i] = (mixed ^ np.uint32(z * np.uint32(805459861))) & mask
 
 
 @numba.njit(inline="always")
-def _corner_weights(fx: Any, fy: Any, fz: Any, out: Any, at: Any) -> None:
-    """Trilinear weights of the 8 corners."""
+def _corner_weights(inside: Any, count: Any, weight: Any) -> None:
+    """Trilinear weights of the 8 corners, corner after corner."""
     one = np.float32(1)
-    gx, gy, gz = one - fx, one - fy, one - fz
-    out[at, 0] = gx * gy * gz
-    out[at, 1] = fx * gy * gz
-    out[at, 2] = gx * fy * gz
-    out[at, 3] = fx * fy * gz
-    out[at, 4] = gx * gy * fz
-    out[at, 5] = fx * gy * fz
-    out[at, 6] = gx * fy * fz
-    out[at, 7] = fx * fy * fz
+    for corner in range(8):
+        for i in range(count):
+            x = inside[0, i] if corner & 1 else one - inside[0, i]
+            y = inside[1, i] if corner & 2 else one - inside[1, i]
+            z = inside[2, i] if corner & 4 else one - inside[2, i]
+            weight[corner * BLOCK + i] = x * y * z
 
 
 @numba.njit(inline="always")
 def _prepare_block(
-    points: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any, index: Any, weight: Any
+    points: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any, scratch: Any
 ) -> None:
     """Rows and weights of all corners of a block of samples, with the rows on their way into the cache."""
+    cell, inside, index, weight = scratch
+    _cells(points, first, count, resolution, cell, inside)
+    _corner_rows(cell, count, resolution, rows, index)
     offset = np.int64(level) * rows * FEATURES
-    for i in range(count):
-        cx, cy, cz, fx, fy, fz = _locate(points[first + i, 0], points[first + i, 1], points[first + i, 2], resolution)
-        _corner_rows(cx, cy, cz, resolution, rows, index, i)
-        _corner_weights(fx, fy, fz, weight, i)
-        for corner in range(8):
-            prefetch(flat, offset + np.int64(index[i, corner]) * FEATURES)
+    for corner in range(8):
+        for i in range(count):
+            prefetch(flat, offset + np.int64(index[corner * BLOCK + i]) * FEATURES)
+    _corner_weights(inside, count, weight)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(inline="always")
+def new_scratch() -> Any:
+    """Room for cells, places inside them, rows and weights of a block."""
+    return (
+        np.empty((3, BLOCK), np.uint32),
+        np.empty((3, BLOCK), np.float32),
+        np.empty(8 * BLOCK, np.uint32),
+        np.empty(8 * BLOCK, np.float32),
+    )
+
+
+@numba.njit(inline="always")
+def encode_range(
+    points: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any, out: Any
+) -> None:
+    """All levels of samples first to last into the flat array `out`, with `new_scratch`."""
+    index, weight = scratch[2], scratch[3]
+    width = resolutions.shape[0] * FEATURES
+    for level in range(resolutions.shape[0]):
+        resolution = resolutions[level]
+        offset = np.int64(level) * rows * FEATURES
+        for start in range(first, last, BLOCK):
+            count = min(BLOCK, last - start)
+            _prepare_block(points, start, count, level, resolution, rows, flat, scratch)
+            for i in range(count):
+                gather_rows(flat, offset, index, weight, i, BLOCK, out, (start + i) * width + level * FEATURES)
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _encode_forward(points: Any, flat: Any, rows: Any, resolutions: Any, out: Any, threads: Any) -> None:
-    samples = points.shape[0]
-    blocks = (samples + BLOCK - 1) // BLOCK
+    blocks = (points.shape[0] + BLOCK - 1) // BLOCK
     for thread in numba.prange(threads):
-        index = np.empty((BLOCK, 8), np.uint32)
-        weight = np.empty((BLOCK, 8), np.float32)
-        for level in range(resolutions.shape[0]):
-            resolution = resolutions[level]
-            offset = np.int64(level) * rows * FEATURES
-            column = level * FEATURES
-            for block in range(thread * blocks // threads, (thread + 1) * blocks // threads):
-                first = block * BLOCK
-                count = min(BLOCK, samples - first)
-                _prepare_block(points, first, count, level, resolution, rows, flat, index, weight)
-                for i in range(count):
-                    a, b, c, d = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-                    for corner in range(8):
-                        at = offset + np.int64(index[i, corner]) * FEATURES
-                        w = weight[i, corner]
-                        a += w * flat[at]
-                        b += w * flat[at + 1]
-                        c += w * flat[at + 2]
-                        d += w * flat[at + 3]
-                    out[first + i, column] = a
-                    out[first + i, column + 1] = b
-                    out[first + i, column + 2] = c
-                    out[first + i, column + 3] = d
+        first = thread * blocks // threads * BLOCK
+        last = min((thread + 1) * blocks // threads * BLOCK, points.shape[0])
+        encode_range(points, first, last, flat, rows, resolutions, new_scratch(), out)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _encode_backward(points: Any, gradient: Any, rows: Any, resolutions: Any, flat: Any, threads: Any) -> None:
     samples = points.shape[0]
+    width = resolutions.shape[0] * FEATURES
     for thread in numba.prange(threads):
-        index = np.empty((BLOCK, 8), np.uint32)
-        weight = np.empty((BLOCK, 8), np.float32)
+        scratch = new_scratch()
+        index, weight = scratch[2], scratch[3]
         for level in range(thread, resolutions.shape[0], threads):
             resolution = resolutions[level]
             offset = np.int64(level) * rows * FEATURES
             column = level * FEATURES
             for first in range(0, samples, BLOCK):
                 count = min(BLOCK, samples - first)
-                _prepare_block(points, first, count, level, resolution, rows, flat, index, weight)
+                _prepare_block(points, first, count, level, resolution, rows, flat, scratch)
                 for i in range(count):
-                    a, b = gradient[first + i, column], gradient[first + i, column + 1]
-                    c, d = gradient[first + i, column + 2], gradient[first + i, column + 3]
-                    if a == 0 and b == 0 and c == 0 and d == 0:  # a sample that nothing depends on
-                        continue
-                    for corner in range(8):
-                        at = offset + np.int64(index[i, corner]) * FEATURES
-                        w = weight[i, corner]
-                        flat[at] += w * a
-                        flat[at + 1] += w * b
-                        flat[at + 2] += w * c
-                        flat[at + 3] += w * d
+                    at = (first + i) * width + column
+                    a, b, c, d = gradient[at], gradient[at + 1], gradient[at + 2], gradient[at + 3]
+                    if a != 0 or b != 0 or c != 0 or d != 0:  # else nothing depends on this sample
+                        scatter_rows(flat, offset, index, weight, i, BLOCK, gradient, at)
 
 
 class _HashEncode(torch.autograd.Function):
@@ -167,7 +153,7 @@ class _HashEncode(torch.autograd.Function):
         sides = np.array(resolutions, dtype=np.int32)
         if known is None:
             out = torch.empty(len(points), levels * features)
-            _encode_forward(points.numpy(), table.view(-1).numpy(), rows, sides, out.numpy(), thread_count())
+            _encode_forward(points.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(), thread_count())
         else:
             out = known.view_as(known)
         ctx.save_for_backward(points)
@@ -180,7 +166,7 @@ class _HashEncode(torch.autograd.Function):
         total = torch.zeros(ctx.table_shape) if ctx.sink is None else ctx.sink
         _encode_backward(
             points.numpy(),
-            gradients[0].contiguous().numpy(),
+            gradients[0].contiguous().view(-1).numpy(),
             ctx.table_shape[1],
             ctx.sides,
             total.view(-1).numpy(),

@@ -111,25 +111,33 @@ def _sigmoid(x: Any) -> Any:
     return np.float32(1) / (np.float32(1) + np.exp(-x))
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(inline="always")
+def density_range(
+    encoded: Any, begin: Any, end: Any, weights: Any, x: Any, h: Any, geometry: Any, density: Any
+) -> None:
+    """Density of samples begin to end, with scratch space x and h of TILE * WIDTH, geometry of TILE * OUT."""
+    for first in range(begin, end, TILE):
+        count = min(TILE, end - first)
+        _load_rows(encoded, first, count, x)
+        _layer_32(x, weights, D1, WIDTH, h)
+        _rectify(h)
+        _layer_16(h, weights, D2, geometry)
+        for i in range(count):
+            density[first + i] = _density(geometry[i * OUT])
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _density_forward(encoded: Any, weights: Any, density: Any, threads: Any) -> None:
     samples = encoded.shape[0]
     tiles = (samples + TILE - 1) // TILE
     for thread in numba.prange(threads):
         x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
         geometry = np.empty(TILE * OUT, np.float32)
-        for tile in range(thread * tiles // threads, (thread + 1) * tiles // threads):
-            first = tile * TILE
-            count = min(TILE, samples - first)
-            _load_rows(encoded, first, count, x)
-            _layer_32(x, weights, D1, WIDTH, h)
-            _rectify(h)
-            _layer_16(h, weights, D2, geometry)
-            for i in range(count):
-                density[first + i] = _density(geometry[i * OUT])
+        first, last = thread * tiles // threads * TILE, min((thread + 1) * tiles // threads * TILE, samples)
+        density_range(encoded, first, last, weights, x, h, geometry, density)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _radiance_forward(
     encoded: Any, harmonics: Any, rays: Any, weights: Any, density: Any, rgb: Any, threads: Any
 ) -> None:
@@ -157,7 +165,7 @@ def _radiance_forward(
                     rgb[first + i, channel] = _sigmoid(out[i * OUT + channel])
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _radiance_backward(
     encoded: Any,
     harmonics: Any,
@@ -227,7 +235,7 @@ def _radiance_backward(
                     encoded_gradient[first + i, j] = g2[i * WIDTH + j]
 
 
-def _flat(weights: Sequence[Tensor]) -> np.ndarray:
+def flat_weights(weights: Sequence[Tensor]) -> np.ndarray:
     """All layers as (inputs, outputs), outputs padded to a multiple of 16, in one array."""
     padded = [torch.nn.functional.pad(w.detach(), (0, 0, 0, -len(w) % OUT)) for w in weights]
     return torch.cat([w.t().reshape(-1) for w in padded]).numpy()
@@ -245,7 +253,7 @@ class _Radiance(torch.autograd.Function):
         encoded, harmonics = encoded.detach().contiguous(), harmonics.detach().contiguous()
         density, rgb = torch.empty(len(encoded)), torch.empty(len(encoded), 3)
         _radiance_forward(
-            encoded.numpy(), harmonics.numpy(), rays.numpy(), _flat(weights), density.numpy(), rgb.numpy(),
+            encoded.numpy(), harmonics.numpy(), rays.numpy(), flat_weights(weights), density.numpy(), rgb.numpy(),
             thread_count(),
         )  # fmt: skip
         ctx.save_for_backward(encoded, harmonics, rays, *weights)
@@ -258,7 +266,7 @@ class _Radiance(torch.autograd.Function):
         encoded_gradient = torch.empty_like(encoded)
         sums = np.zeros((threads, WEIGHTS), np.float32)
         _radiance_backward(
-            encoded.numpy(), harmonics.numpy(), rays.numpy(), _flat(weights), _flat_back(weights),
+            encoded.numpy(), harmonics.numpy(), rays.numpy(), flat_weights(weights), _flat_back(weights),
             gradients[0].contiguous().numpy(), gradients[1].contiguous().numpy(), encoded_gradient.numpy(), sums,
             threads,
         )  # fmt: skip
@@ -287,5 +295,5 @@ def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
     """See `reference.density`; float32 on the CPU, without gradients."""
     encoded = encoded.detach().contiguous()
     out = torch.empty(len(encoded))
-    _density_forward(encoded.numpy(), _flat(weights[:2]), out.numpy(), thread_count())
+    _density_forward(encoded.numpy(), flat_weights(weights[:2]), out.numpy(), thread_count())
     return out

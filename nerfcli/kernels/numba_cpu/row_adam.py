@@ -14,7 +14,7 @@ from nerfcli.kernels.numba_cpu.threads import thread_count
 FEATURES = 4
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _update(
     table: Any, gradient: Any, first: Any, second: Any, rate: Any, beta1: Any, beta2: Any, correction: Any, eps: Any
 ) -> None:

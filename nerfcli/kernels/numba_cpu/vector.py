@@ -1,4 +1,6 @@
-"""What Numba has no words for: asking for a cache line ahead of time, and a block of a matrix product in registers."""
+"""What Numba has no words for: asking for a cache line ahead of time, rows of a table as vectors, a block of a matrix
+product in registers.
+"""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -31,6 +33,71 @@ def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
 
 # prefetch(array, index) asks for the cache line of array[index] of a flat float32 array, without waiting for it.
 prefetch: Callable[[Any, Any], None] = cast(Any, _prefetch)
+
+
+# Width of a table row in `gather_rows` and `scatter_rows`.
+ROW = 4
+CORNERS = 8
+
+
+def _row_access(generate: Callable[..., None]) -> Any:
+    """An intrinsic over the 8 corners of a cell: (flat, offset, index, weight, at, stride, row, row_at).
+
+    Corner c has the table row index[at + c stride], at flat[offset + 4 index], and the weight weight[at + c stride].
+    """
+
+    @intrinsic
+    def access(
+        typing_context: Any, flat: Any, offset: Any, index: Any, weight: Any, at: Any, stride: Any, row: Any,
+        row_at: Any,
+    ) -> Any:  # fmt: skip
+        def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            def data(which: int) -> Any:
+                return context.make_array(signature.args[which])(context, builder, args[which]).data
+
+            flat_data, index_data, weight_data, row_data = data(0), data(2), data(3), data(6)
+            offset, at, stride, row_at = (
+                context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 4, 5, 7)
+            )
+            long, vector = ir.IntType(64), ir.VectorType(ir.FloatType(), ROW)
+            spread = ir.Constant(ir.VectorType(ir.IntType(32), ROW), [0] * ROW)
+            undefined = ir.Constant(vector, ir.Undefined)
+            corners = []
+            for corner in range(CORNERS):
+                place = builder.add(at, builder.mul(stride, ir.Constant(long, corner)))
+                number = builder.zext(builder.load(builder.gep(index_data, [place])), long)
+                element = builder.add(offset, builder.mul(number, ir.Constant(long, ROW)))
+                pointer = builder.bitcast(builder.gep(flat_data, [element]), vector.as_pointer())
+                scalar = builder.load(builder.gep(weight_data, [place]))
+                first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
+                corners.append((pointer, builder.shuffle_vector(first, undefined, spread)))
+            generate(builder, corners, builder.bitcast(builder.gep(row_data, [row_at]), vector.as_pointer()))
+            return context.get_dummy_value()
+
+        return types.none(flat, offset, index, weight, at, stride, row, row_at), build
+
+    return access
+
+
+def _gather(builder: Any, corners: Any, row: Any) -> None:
+    total = None
+    for pointer, weight in corners:
+        product = builder.fmul(weight, builder.load(pointer, align=4), flags=("contract",))
+        total = product if total is None else builder.fadd(total, product, flags=("contract",))
+    builder.store(total, row, align=4)
+
+
+def _scatter(builder: Any, corners: Any, row: Any) -> None:
+    gradient = builder.load(row, align=4)
+    for pointer, weight in corners:  # one after the other: two corners may share a row
+        product = builder.fmul(weight, gradient, flags=("contract",))
+        builder.store(builder.fadd(builder.load(pointer, align=4), product, flags=("contract",)), pointer, align=4)
+
+
+# gather_rows: row[row_at : row_at + 4] = sum over corners of weight * flat row.  All arrays flat; index is uint32.
+gather_rows = _row_access(_gather)
+# scatter_rows: each flat row += weight * row[row_at : row_at + 4].
+scatter_rows = _row_access(_scatter)
 
 
 def _block_product(vectors: int) -> Callable[..., None]:

@@ -1,0 +1,167 @@
+"""The samples of rays that light gets to: marching, encoding and density together, stopping where a ray is opaque.
+
+Same operation as `reference.visible_samples`. A thread carries some rays at a time, each a few samples ahead, so that
+encoding and network work on full tiles although every ray stops where it likes; a ray that ends makes room for the
+next one. What stands behind a surface is never computed.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
+from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, density_range, flat_weights
+from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, padded
+from nerfcli.kernels.numba_cpu.threads import thread_count
+
+# Rays that a thread carries at a time, and samples that each of them looks ahead.
+LANES = 64
+AHEAD = 8
+ROUND = LANES * AHEAD
+
+
+@numba.njit(inline="always")
+def _follow(
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, unbounded: Any, flat: Any,
+    rows: Any, resolutions: Any, weights: Any, deepest: Any, coming: Any, last_ray: Any, counts: Any, owner: Any,
+    record: Any, code: Any,
+) -> Any:  # fmt: skip
+    """Samples of rays `coming` to `last_ray` in the order in which they are found, and how many they are.
+
+    A sample's ray goes to `owner`, its start, end, density and coordinates to `record`, its features to `code`.
+    """
+    intervals = edges.shape[0] - 2 - CHUNK
+    places, cells = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
+    lane_ray = np.full(LANES, -1, np.int64)
+    lane_next = np.zeros(LANES, np.int64)
+    lane_depth = np.zeros(LANES, np.float64)
+    tile_lane = np.empty(ROUND, np.int64)
+    tile_span = np.empty((ROUND, 2), np.float32)
+    points = np.empty((ROUND, 3), np.float32)
+    encoded = np.empty((ROUND, WIDTH), np.float32)
+    density = np.empty(ROUND, np.float32)
+    scratch = new_scratch()
+    x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
+    geometry = np.empty(TILE * OUT, np.float32)
+    found = 0
+    while True:
+        filled = 0
+        for lane in range(LANES):
+            taken = 0
+            while taken == 0:
+                if lane_ray[lane] < 0:
+                    if coming == last_ray:
+                        break
+                    lane_ray[lane], lane_next[lane], lane_depth[lane] = coming, 0, 0.0
+                    coming += 1
+                ray, k = lane_ray[lane], lane_next[lane]
+                while k < intervals and taken == 0:
+                    look_ahead(origins, directions, edges, jitter, ray, k, side, unbounded, places, cells)
+                    past = min(CHUNK, intervals - k)
+                    for i in range(past):
+                        if cells[i] >= 0 and occupied[cells[i]]:
+                            tile_lane[filled] = lane
+                            tile_span[filled, 0] = cut(edges, jitter[ray], k + i)
+                            tile_span[filled, 1] = cut(edges, jitter[ray], k + i + 1)
+                            for axis in range(3):
+                                points[filled, axis] = places[axis, i]
+                            filled += 1
+                            taken += 1
+                            if taken == AHEAD:
+                                past = i + 1
+                                break
+                    k += past
+                lane_next[lane] = k
+                if taken == 0:
+                    lane_ray[lane] = -1
+        if filled == 0:
+            return found
+        encode_range(points, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1))
+        density_range(encoded, 0, filled, weights, x, h, geometry, density)
+        for i in range(filled):
+            lane = tile_lane[i]
+            if lane_depth[lane] < deepest:
+                ray = lane_ray[lane]
+                counts[ray] += 1
+                owner[found] = ray
+                record[found, 0], record[found, 1], record[found, 2] = tile_span[i, 0], tile_span[i, 1], density[i]
+                for axis in range(3):
+                    record[found, 3 + axis] = points[i, axis]
+                for feature in range(WIDTH):
+                    code[found, feature] = encoded[i, feature]
+                found += 1
+                lane_depth[lane] += np.float64(density[i]) * np.float64(tile_span[i, 1] - tile_span[i, 0])
+        for lane in range(LANES):
+            if lane_ray[lane] >= 0 and (lane_depth[lane] >= deepest or lane_next[lane] >= intervals):
+                lane_ray[lane] = -1
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _visible(
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, unbounded: Any, flat: Any,
+    rows: Any, resolutions: Any, weights: Any, deepest: Any, borders: Any, counts: Any, owner: Any, record: Any,
+    code: Any, found: Any,
+) -> None:  # fmt: skip
+    """`_follow`, by a thread for the rays from each border to the next."""
+    for thread in numba.prange(len(borders) - 1):
+        found[thread] = _follow(
+            origins, directions, edges, jitter, occupied, side, unbounded, flat, rows, resolutions, weights, deepest,
+            borders[thread], borders[thread + 1], counts, owner[thread], record[thread], code[thread],
+        )  # fmt: skip
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _sort(
+    borders: Any, offsets: Any, owner: Any, record: Any, code: Any, found: Any, spans: Any, coordinates: Any,
+    encoded: Any,
+) -> None:  # fmt: skip
+    """Bring what `_visible` found into the order of the rays; along each ray it is in order already."""
+    for thread in numba.prange(len(borders) - 1):
+        place = offsets[borders[thread] : borders[thread + 1]].copy()
+        for i in range(found[thread]):
+            ray = owner[thread, i] - borders[thread]
+            to = place[ray]
+            place[ray] += 1
+            for j in range(3):
+                spans[j, to] = record[thread, i, j]
+                coordinates[to, j] = record[thread, i, 3 + j]
+            for feature in range(WIDTH):
+                encoded[to, feature] = code[thread, i, feature]
+
+
+def visible_samples(
+    origins: Tensor,
+    directions: Tensor,
+    edges: Tensor,
+    *,
+    jitter: Tensor,
+    occupied: Tensor,
+    unbounded: bool,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    weights: tuple[Tensor, ...],
+    deepest: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """See `reference.visible_samples`; float32 on the CPU."""
+    threads, rays, intervals = thread_count(), len(origins), len(edges) - 2
+    borders = np.arange(threads + 1) * rays // threads
+    # Room for all samples of all rays: memory that nobody writes to is never really taken.
+    room = (threads, -(-rays // threads) * intervals)
+    owner, record = np.empty(room, np.int64), np.empty((*room, 6), np.float32)
+    code = np.empty((*room, WIDTH), np.float32)
+    counts, found = np.zeros(rays, np.int64), np.zeros(threads, np.int64)
+    _visible(
+        origins.contiguous().numpy(), directions.contiguous().numpy(), padded(edges), jitter.numpy(),
+        occupied.contiguous().view(-1).numpy(), occupied.shape[0], unbounded,
+        table.detach().contiguous().view(-1).numpy(), table.shape[1], np.array(resolutions, dtype=np.int32),
+        flat_weights(weights[:2]), deepest, borders, counts, owner, record, code, found,
+    )  # fmt: skip
+    offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    samples = int(offsets[-1])
+    spans, coordinates, encoded = torch.empty(3, samples), torch.empty(samples, 3), torch.empty(samples, WIDTH)
+    _sort(borders, offsets, owner, record, code, found, spans.numpy(), coordinates.numpy(), encoded.numpy())
+    starts, ends, density = spans
+    return starts, ends, density, encoded, coordinates, torch.from_numpy(offsets)
