@@ -140,6 +140,28 @@ def test_composite(samples, magnitude, generator):
     assert_close(before, reference.optical_depth_before(density.double(), lengths.double(), offsets), "before")
 
 
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("magnitude", [1e-12, 1.0, 1e6])
+def test_distortion(samples, magnitude, generator):
+    offsets = offsets_of(samples, generator)
+    cuts = torch.rand(samples + 1, generator=generator).cumsum(0)
+    weights = torch.rand(samples, generator=generator) * magnitude
+    weights[::3] = 0.0
+    by_ray = torch.randn(len(offsets) - 1, generator=generator)
+
+    def run(function, dtype):
+        w = weights.detach().clone().to(dtype).requires_grad_()
+        out = function(w, cuts[:-1].to(dtype), cuts[1:].to(dtype), offsets)
+        (out @ by_ray.to(dtype)).backward()
+        return out.detach(), w.grad
+
+    for name, actual, expected in zip(
+        ("value", "gradient"), run(numba_cpu.distortion, torch.float32), run(reference.distortion, torch.float64),
+        strict=True,
+    ):  # fmt: skip
+        assert_close(actual, expected, name)
+
+
 @pytest.mark.parametrize("rays", [0, 1, 5, 123])
 @pytest.mark.parametrize("unbounded", [False, True])
 def test_march_and_coordinates(rays, unbounded, generator):

@@ -37,6 +37,39 @@ def test_composite_against_double_loop(counts):
         np.testing.assert_allclose(colour[ray], expected[2], rtol=1e-12)
 
 
+@pytest.mark.parametrize("counts", [[5], [0, 3, 1, 0, 7], [0], [1, 40]])
+def test_distortion_against_double_loop(counts):
+    weights, lengths, _, offsets = random_rays(3, counts)
+    ends = lengths.cumsum(0)
+    starts = ends - lengths
+    actual = reference.distortion(weights, starts, ends, offsets)
+    for ray in range(len(counts)):
+        own = range(int(offsets[ray]), int(offsets[ray + 1]))
+        middles = (starts + ends) / 2
+        expected = sum(float(weights[i] * weights[j] * (middles[i] - middles[j]).abs()) for i in own for j in own)
+        expected += sum(float(weights[i] ** 2 * lengths[i]) / 3 for i in own)
+        assert math.isclose(float(actual[ray]), expected, rel_tol=1e-12, abs_tol=1e-15)
+
+
+@pytest.mark.parametrize("intervals", [1, 2, 7, 100])
+def test_distortion_of_light_spread_evenly_is_a_third(intervals):
+    # E|x - y| of two uniform draws from [0, 1], however the interval is cut.
+    cuts = torch.linspace(0, 1, intervals + 1, dtype=torch.float64)
+    weights = torch.full((intervals,), 1 / intervals, dtype=torch.float64)
+    offsets = torch.tensor([0, intervals])
+    assert math.isclose(reference.distortion(weights, cuts[:-1], cuts[1:], offsets).item(), 1 / 3, rel_tol=1e-12)
+
+
+def test_distortion_of_two_points_is_their_distance():
+    places = torch.tensor([0.25, 2.0], dtype=torch.float64)
+    weights = torch.tensor([0.3, 0.6], dtype=torch.float64, requires_grad=True)
+    actual = reference.distortion(weights, places, places, torch.tensor([0, 2]))
+    assert math.isclose(actual.item(), 2 * 0.3 * 0.6 * 1.75, rel_tol=1e-12)
+    starts = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    offsets = torch.tensor([0, 2])
+    assert torch.autograd.gradcheck(lambda w: reference.distortion(w, starts, starts + 0.5, offsets), (weights,))
+
+
 def test_no_rays_at_all():
     empty = torch.zeros(0, dtype=torch.float64)
     colour, transmittance, weights = reference.composite(

@@ -20,6 +20,7 @@ __all__ = [
     "composite",
     "contract",
     "density",
+    "distortion",
     "grid_coordinates",
     "hash_encode",
     "interval_weights",
@@ -105,6 +106,11 @@ def composite(
     """See `reference.composite`."""
     module = _module_for(density, rgb, lengths, background, constant=(lengths, background))
     return module.composite(density, rgb, lengths, offsets=offsets, background=background)
+
+
+def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.distortion`."""
+    return _module_for(weights, starts, ends, constant=(starts, ends)).distortion(weights, starts, ends, offsets)
 
 
 def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:

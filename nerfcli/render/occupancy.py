@@ -9,34 +9,23 @@ from nerfcli import kernels
 from nerfcli.field.contraction import training_points
 from nerfcli.field.hash_field import HashField
 
-# A cell counts as occupied when one step through it takes away more than this share of the light.
-OCCUPIED_OPTICAL_DEPTH = 0.01
 DECAY = 0.8
 
 
 class Occupancy:
     """What fills each cell: a decaying maximum of the optical depth of one ray step.
 
-    The optical depth comes from asking the field at random points; a cell is full where it exceeds min(0.01, its mean
-    over the unit ball): the mean keeps cells open at the start, when all of space is thin fog. What lies behind
-    surfaces stays as it is, and costs nothing: rays stop before they get there.
+    It comes from asking the field at random points. What lies behind surfaces stays as it is, and costs nothing: rays
+    stop before they get there.
     Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, appendix C, with a faster decay for short trainings.
     """
 
-    def __init__(self, side: int, device: torch.device, *, unbounded: bool):
-        axis = (torch.arange(side, device=device) + 0.5) / side
-        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-        radius = training_points(torch.stack([x, y, z], dim=-1), unbounded).norm(dim=-1)
-        # Steps grow without end outside the unit ball: a mean over all of space would be that of its far end.
-        self.central = (radius <= 1.0) if unbounded else torch.ones_like(radius, dtype=torch.bool)
+    def __init__(self, side: int, device: torch.device):
         self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
 
-    @property
-    def occupied(self) -> Tensor:
-        """(side, side, side) bool, indexed [z, y, x]; cells never looked at are occupied."""
-        known = self.optical_depth[self.central & self.optical_depth.isfinite()]
-        mean = known.mean() if len(known) else self.optical_depth.new_tensor(0.0)
-        return self.optical_depth > mean.clamp_max(OCCUPIED_OPTICAL_DEPTH)
+    def above(self, optical_depth: float) -> Tensor:
+        """(side, side, side) bool, indexed [z, y, x]: cells that hold more; those never looked at are among them."""
+        return self.optical_depth > optical_depth
 
     @torch.no_grad()
     def refresh(

@@ -13,7 +13,7 @@ from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy, cells_from_points
-from nerfcli.train.losses import colour_loss, over_background
+from nerfcli.train.losses import DISTORTION, colour_loss, distortion_loss, over_background
 from nerfcli.train.photos import PixelPool
 from nerfcli.train.settings import TrainSettings
 
@@ -23,6 +23,10 @@ REFRESH_SHARE = 1 / 8
 MOST_RAYS = 2**14
 # Rays of the training end where less than a thousandth of the light is left.
 DEEPEST = 7.0
+# Rays pass over cells where a step takes away less light than this: hardly any at first, when all of space is thin fog
+# and nothing tells yet where the surfaces are; then ever more, so that surfaces have to become compact.
+FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
+CLOSING_STEPS = 150
 # Cells around a point that are open at the start, and the steps after which the next ones open.
 FIRST_CELLS = 2
 STEPS_PER_CELL = 100
@@ -73,7 +77,7 @@ class Fitting:
         self.settings = settings
         self.step = 0
         self.field = HashField(HashFieldSettings(unbounded=unbounded)).to(device)
-        self.occupancy = Occupancy(OCCUPANCY_SIDE, device, unbounded=unbounded)
+        self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.cells_from_points = cells_from_points(points, OCCUPANCY_SIDE, unbounded).to(device)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
@@ -159,8 +163,9 @@ class Fitting:
         )
         density, rgb = field.radiance_of_encoded(encoded, directions, kernels.ray_indices(offsets))
         density, rgb = _scale_gradients(density, rgb, distance=starts)
-        rendered, _, _ = kernels.composite(density, rgb, ends - starts, offsets=offsets, background=background)
-        return colour_loss(rendered, over_background(colours, background)), len(starts)
+        rendered, _, weights = kernels.composite(density, rgb, ends - starts, offsets=offsets, background=background)
+        loss = colour_loss(rendered, over_background(colours, background))
+        return loss + DISTORTION * distortion_loss(weights, starts, ends, offsets), len(starts)
 
     def _refresh_occupancy(self) -> None:
         # The whole grid once, after a warm-up in which everything is open; then a share at a time.
@@ -181,7 +186,9 @@ class Fitting:
         Surfaces are near these points; what lies between them and the cameras is mostly air. Cells open from the points
         outwards, so that fog cannot grow in front of the cameras before there is something to see behind it.
         """
-        return self.occupancy.occupied & (self.cells_from_points <= FIRST_CELLS + self.step / STEPS_PER_CELL)
+        closed = min(1.0, self.step / CLOSING_STEPS)
+        threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
+        return self.occupancy.above(threshold) & (self.cells_from_points <= FIRST_CELLS + self.step / STEPS_PER_CELL)
 
     def _check_finite(self, loss: Tensor) -> None:
         gradients = {f"gradient of {name}": p.grad for name, p in self.field.weights.named_parameters()}

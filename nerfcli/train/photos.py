@@ -119,7 +119,7 @@ class PixelPool:
         photo = torch.searchsorted(self.first_pixel, chosen, right=True) - 1
         bearing = self.bearings[self.first_bearing[photo] + chosen - self.first_pixel[photo]]
         pose = self.poses[photo]
-        directions = (pose[:, :3, :3] @ bearing[..., None])[..., 0]
+        directions = (pose[:, :3, :3] * bearing[:, None, :]).sum(-1)  # a batched product of 3x3 is slower
         return pose[:, :3, 3], directions, self.colours[chosen].float() / 255.0
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from nerfcli.kernels.numba_cpu.compositing import composite, interval_weights, optical_depth_before
+from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
 from nerfcli.kernels.numba_cpu.rays import march, ray_indices, sample_coordinates, scatter_max
@@ -17,6 +17,7 @@ __all__ = [
     "can_radiance",
     "composite",
     "density",
+    "distortion",
     "hash_encode",
     "interval_weights",
     "is_compiled",
@@ -56,7 +57,7 @@ def warm_up() -> None:
     optical_depth_before(density(encoded, weights), lengths, offsets)
     thickness, rgb = radiance(encoded, torch.zeros(1, 16), ray_indices(offsets), weights)
     interval_weights(thickness, lengths, offsets)
-    colour, _, _ = composite(thickness, rgb, lengths, offsets=offsets, background=torch.zeros(3))
-    colour.sum().backward()
+    colour, _, spread = composite(thickness, rgb, lengths, offsets=offsets, background=torch.zeros(3))
+    (colour.sum() + distortion(spread, starts, starts + 1, offsets).sum()).backward()
     gradient, first, second = (torch.zeros(8, 16, 4) for _ in range(3))
     adam_rows(table, gradient, first, second, step=1, rate=0.0, betas=(0.9, 0.99), eps=1e-15)

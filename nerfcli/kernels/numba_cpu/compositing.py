@@ -93,6 +93,62 @@ def _weights(density: Any, lengths: Any, offsets: Any, weights: Any, transmittan
         transmittance[ray] = np.exp(-depth)
 
 
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _distortion(weights: Any, starts: Any, ends: Any, offsets: Any, out: Any) -> None:
+    for ray in numba.prange(offsets.shape[0] - 1):
+        total, mass, moment = 0.0, 0.0, 0.0
+        for i in range(offsets[ray], offsets[ray + 1]):
+            weight, middle = np.float64(weights[i]), (np.float64(starts[i]) + np.float64(ends[i])) * 0.5
+            length = np.float64(ends[i]) - np.float64(starts[i])
+            total += 2.0 * weight * (middle * mass - moment) + weight * weight * length / 3.0
+            mass += weight
+            moment += weight * middle
+        out[ray] = total
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _distortion_backward(weights: Any, starts: Any, ends: Any, offsets: Any, gradient: Any, out: Any) -> None:
+    for ray in numba.prange(offsets.shape[0] - 1):
+        first, last = offsets[ray], offsets[ray + 1]
+        behind, moment_behind = 0.0, 0.0
+        for i in range(first, last):
+            behind += weights[i]
+            moment_behind += weights[i] * (np.float64(starts[i]) + np.float64(ends[i])) * 0.5
+        before, moment_before = 0.0, 0.0
+        for i in range(first, last):
+            weight, middle = np.float64(weights[i]), (np.float64(starts[i]) + np.float64(ends[i])) * 0.5
+            behind -= weight
+            moment_behind -= weight * middle
+            apart = middle * before - moment_before + moment_behind - middle * behind
+            own = weight * (np.float64(ends[i]) - np.float64(starts[i])) / 3.0
+            out[i] = gradient[ray] * 2.0 * (apart + own)
+            before += weight
+            moment_before += weight * middle
+
+
+class _Distortion(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+        numba.set_num_threads(thread_count())
+        weights, starts, ends = (x.detach().contiguous() for x in (weights, starts, ends))
+        out = torch.empty(len(offsets) - 1)
+        _distortion(*(x.numpy() for x in (weights, starts, ends, offsets, out)))
+        ctx.save_for_backward(weights, starts, ends, offsets)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        numba.set_num_threads(thread_count())
+        out = torch.empty_like(ctx.saved_tensors[0])
+        _distortion_backward(*(x.contiguous().numpy() for x in (*ctx.saved_tensors, *gradients, out)))
+        return out, None, None, None
+
+
+def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.distortion`; float32 on the CPU, differentiable in the weights."""
+    return _Distortion.apply(weights, starts, ends, offsets)  # type: ignore[return-value]
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
