@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import typer
@@ -101,6 +101,31 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
         lambda e, *w: (reference.density(e, w),),
         has_backward=False,
     )
+    origins = begin[:, 0] * 0.5 - 0.25  # rays of 32 steps of 1 / 32, well inside the cube [-1, 1]^3
+    edges = torch.arange(SAMPLES_PER_RAY + 2) / SAMPLES_PER_RAY * 0.5
+    axis = torch.tensor([0.0, 0.0, 1.0]).expand(rays, 3)
+    marching = {
+        "occupied": torch.ones(64, 64, 64, dtype=torch.bool),
+        "unbounded": False,
+        "resolutions": resolutions,
+        "deepest": 1e9,
+    }
+
+    def follow(module: Any, table: Tensor) -> tuple[Tensor, ...]:
+        """Density and features; nothing is dense enough to end a ray. The jitter of 0 keeps all 32 steps of a ray."""
+        o, d, e, w = (x.to(table.dtype) for x in (origins, axis, edges, weights[0]))
+        out = module.visible_samples(
+            o, d, e, jitter=torch.zeros_like(o[:, 0]), table=table, weights=(w, weights[1].to(table.dtype)), **marching
+        )
+        return out[2], out[3]
+
+    yield Operation(
+        "visible_samples",
+        (table * 0.1,),
+        lambda t: follow(numba_cpu, t),
+        lambda t: follow(reference, t),
+        has_backward=False,
+    )
     thickness = torch.rand(samples, generator=generator) * 4.0
     rgb = torch.rand(samples, 3, generator=generator)
     lengths = torch.full((samples,), 1 / SAMPLES_PER_RAY)
@@ -110,6 +135,30 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
         (thickness, rgb),
         lambda d, c: numba_cpu.composite(d, c, lengths, offsets=offsets, background=background),
         lambda d, c: reference.composite(d, c, lengths.to(d.dtype), offsets=offsets, background=background.to(d.dtype)),
+    )
+
+    middles = (torch.arange(samples) % SAMPLES_PER_RAY) / SAMPLES_PER_RAY
+    yield Operation(
+        "distortion",
+        (torch.rand(samples, generator=generator),),
+        lambda w: (numba_cpu.distortion(w, middles, middles + 1 / SAMPLES_PER_RAY, offsets),),
+        lambda w: (reference.distortion(w, middles.to(w.dtype), (middles + 1 / SAMPLES_PER_RAY).to(w.dtype), offsets),),
+    )
+    rows = [torch.randn(1, samples, 4, generator=generator) for _ in range(4)]
+    rows[3] = rows[3].square()
+
+    def step(module: Any, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        """One step of Adam on as many rows as there are samples, each touched; with the time to copy the arrays."""
+        arrays = [x.to(dtype, copy=True) for x in rows]
+        module.adam_rows(*arrays, step=3, rate=0.01, betas=(0.9, 0.99), eps=1e-15)
+        return arrays[0], arrays[2], arrays[3]
+
+    yield Operation(
+        "adam_rows, with a copy",
+        (rows[0],),
+        lambda t: step(numba_cpu, t.dtype),
+        lambda t: step(reference, t.dtype),
+        has_backward=False,
     )
 
 
@@ -188,8 +237,8 @@ def main(
         for rows in numbers(log2_rows):
             for samples in numbers(sizes):
                 for operation in operations(samples, rows):
-                    # Only the encoding depends on the table.
-                    if operation.name == "hash_encode" or rows == numbers(log2_rows)[0]:
+                    # Only these two depend on the size of the table.
+                    if operation.name in ("hash_encode", "visible_samples") or rows == numbers(log2_rows)[0]:
                         console.print(f"{operation.name}, {samples} samples, 2^{rows} rows, {count} threads")
                         lines.extend(measure(operation, samples, rows, count))
     names = [field.name for field in fields(Measurement)]

@@ -30,7 +30,7 @@ class HashFieldSettings:
     unbounded: bool
     levels: int = 8
     features: int = 4
-    log2_rows: int = 17
+    log2_rows: int = 16
     coarsest: int = 16
     finest: int = 1024
     width: int = 32

@@ -24,38 +24,19 @@ __all__ = [
     "grid_coordinates",
     "hash_encode",
     "interval_weights",
-    "march",
     "optical_depth_before",
     "prepare",
     "radiance",
     "ray_indices",
-    "sample_coordinates",
-    "scatter_max",
     "sum_along_rays",
     "visible_samples",
 ]
-
-
-def march(
-    origins: Tensor, directions: Tensor, edges: Tensor, *, jitter: Tensor, occupied: Tensor, unbounded: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    """See `reference.march`."""
-    module = _module_for(origins, directions, edges, jitter)
-    return module.march(origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded)
 
 
 def ray_indices(offsets: Tensor) -> Tensor:
     """See `reference.ray_indices`."""
     numba_cpu = _numba_cpu() if offsets.device.type == "cpu" else None
     return (numba_cpu or reference).ray_indices(offsets)
-
-
-def sample_coordinates(
-    origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, unbounded: bool
-) -> Tensor:
-    """See `reference.sample_coordinates`."""
-    module = _module_for(origins, directions, starts, ends, constant=(origins, directions, starts, ends))
-    return module.sample_coordinates(origins, directions, starts, ends, offsets=offsets, unbounded=unbounded)
 
 
 def hash_encode(
@@ -122,11 +103,6 @@ def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> T
 def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """See `reference.interval_weights`."""
     return _module_for(density, lengths, constant=(density, lengths)).interval_weights(density, lengths, offsets)
-
-
-def scatter_max(grid: Tensor, coordinates: Tensor, values: Tensor) -> None:
-    """See `reference.scatter_max`."""
-    _module_for(grid, coordinates, values).scatter_max(grid, coordinates, values)
 
 
 def visible_samples(

@@ -374,16 +374,3 @@ def adam_rows(
     spread = (second[touched] / (1 - betas[1] ** step)).sqrt()
     table[touched] -= rate * mean / (spread + eps)
     gradient.zero_()
-
-
-def scatter_max(grid: Tensor, coordinates: Tensor, values: Tensor) -> None:
-    """Raise each cell of a grid, in place, to the largest of the values that fall into it.
-
-    Args:
-        grid: (G, G, G) over the unit cube, indexed [z, y, x].
-        coordinates: (N, 3) in [0, 1], x y z.
-        values: (N,).
-    """
-    side = grid.shape[0]
-    x, y, z = (coordinates * side).long().clamp(0, side - 1).unbind(-1)
-    grid.view(-1).scatter_reduce_(0, (z * side + y) * side + x, values, "amax")

@@ -7,7 +7,7 @@ import torch
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
-from nerfcli.kernels.numba_cpu.rays import march, ray_indices, sample_coordinates, scatter_max
+from nerfcli.kernels.numba_cpu.rays import ray_indices
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows
 from nerfcli.kernels.numba_cpu.visible import visible_samples
 
@@ -21,12 +21,9 @@ __all__ = [
     "hash_encode",
     "interval_weights",
     "is_compiled",
-    "march",
     "optical_depth_before",
     "radiance",
     "ray_indices",
-    "sample_coordinates",
-    "scatter_max",
     "visible_samples",
     "warm_up",
 ]
@@ -42,18 +39,16 @@ def warm_up() -> None:
     offsets = torch.tensor([0, 2])
     direction, jitter = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1)
     occupied = torch.ones(2, 2, 2, dtype=torch.bool)
-    march(direction, direction, torch.arange(4.0), jitter=jitter, occupied=occupied, unbounded=True)
     starts, lengths = torch.tensor([0.0, 1.0]), torch.ones(2)
-    points = sample_coordinates(direction, direction, starts, starts + 1, offsets=offsets, unbounded=True)
-    scatter_max(torch.zeros(2, 2, 2), points, lengths)
     table = torch.zeros(8, 16, 4, requires_grad=True)
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     weights = tuple(torch.zeros(shape, requires_grad=True) for shape in shapes)
-    visible_samples(
-        direction, direction, torch.arange(4.0), jitter=jitter, occupied=occupied, unbounded=True, table=table,
-        resolutions=(2,) * 8, weights=weights, deepest=1.0,
+    _, _, _, encoded, points, _ = visible_samples(
+        direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, unbounded=True,
+        table=table, resolutions=(2,) * 8, weights=weights, deepest=10.0,
     )  # fmt: skip
-    encoded = hash_encode(points, table, (2,) * 8, None, None)
+    encoded = hash_encode(points, table, (2,) * 8, None, encoded)
+    hash_encode(points, table, (2,) * 8, None, None)
     optical_depth_before(density(encoded, weights), lengths, offsets)
     thickness, rgb = radiance(encoded, torch.zeros(1, 16), ray_indices(offsets), weights)
     interval_weights(thickness, lengths, offsets)

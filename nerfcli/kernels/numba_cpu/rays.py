@@ -1,7 +1,4 @@
-"""Rays on CPU threads: cutting them into occupied intervals, and where the samples lie in the field's cube.
-
-Same operations as in `reference`, for float32. A thread owns whole rays.
-"""
+"""Steps along rays, and the cells that they come through; the pieces of which `visible` is made, and `ray_indices`."""
 
 from typing import Any
 
@@ -67,83 +64,9 @@ def padded(edges: Tensor) -> np.ndarray:
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _mark(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, unbounded: Any, kept: Any,
-    counts: Any,
-) -> None:  # fmt: skip
-    intervals = kept.shape[1]
-    for ray in numba.prange(origins.shape[0]):
-        places, cells = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
-        count = 0
-        for first in range(0, intervals, CHUNK):
-            look_ahead(origins, directions, edges, jitter, ray, first, side, unbounded, places, cells)
-            for i in range(min(CHUNK, intervals - first)):
-                keep = cells[i] >= 0 and occupied[cells[i]]
-                kept[ray, first + i] = keep
-                count += keep
-        counts[ray] = count
-
-
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _collect(edges: Any, jitter: Any, kept: Any, offsets: Any, starts: Any, ends: Any) -> None:
-    for ray in numba.prange(kept.shape[0]):
-        shift = jitter[ray]
-        at = offsets[ray]
-        for k in range(kept.shape[1]):
-            if kept[ray, k]:
-                starts[at], ends[at] = cut(edges, shift, k), cut(edges, shift, k + 1)
-                at += 1
-
-
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _sample_coordinates(
-    origins: Any, directions: Any, starts: Any, ends: Any, offsets: Any, unbounded: Any, out: Any
-) -> None:
-    for ray in numba.prange(origins.shape[0]):
-        for i in range(offsets[ray], offsets[ray + 1]):
-            t = (starts[i] + ends[i]) * np.float32(0.5)
-            out[i, 0], out[i, 1], out[i, 2] = cube(
-                origins[ray, 0] + directions[ray, 0] * t,
-                origins[ray, 1] + directions[ray, 1] * t,
-                origins[ray, 2] + directions[ray, 2] * t,
-                unbounded,
-            )
-
-
-@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _ray_indices(offsets: Any, out: Any) -> None:
     for ray in numba.prange(offsets.shape[0] - 1):
         out[offsets[ray] : offsets[ray + 1]] = ray
-
-
-def march(
-    origins: Tensor, directions: Tensor, edges: Tensor, *, jitter: Tensor, occupied: Tensor, unbounded: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    """See `reference.march`; float32 on the CPU."""
-    numba.set_num_threads(thread_count())
-    kept = np.empty((len(origins), len(edges) - 2), np.bool_)
-    counts = np.empty(len(origins), np.int64)
-    _mark(
-        origins.contiguous().numpy(), directions.contiguous().numpy(), padded(edges), jitter.numpy(),
-        occupied.contiguous().view(-1).numpy(), occupied.shape[0], unbounded, kept, counts,
-    )  # fmt: skip
-    offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
-    starts, ends = torch.empty(int(offsets[-1])), torch.empty(int(offsets[-1]))
-    _collect(edges.numpy(), jitter.numpy(), kept, offsets, starts.numpy(), ends.numpy())
-    return starts, ends, torch.from_numpy(offsets)
-
-
-def sample_coordinates(
-    origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, unbounded: bool
-) -> Tensor:
-    """See `reference.sample_coordinates`; float32 on the CPU, without gradients."""
-    numba.set_num_threads(thread_count())
-    out = torch.empty(len(starts), 3)
-    _sample_coordinates(
-        origins.contiguous().numpy(), directions.contiguous().numpy(), starts.numpy(), ends.numpy(),
-        offsets.numpy(), unbounded, out.numpy(),
-    )  # fmt: skip
-    return out
 
 
 def ray_indices(offsets: Tensor) -> Tensor:
@@ -152,20 +75,3 @@ def ray_indices(offsets: Tensor) -> Tensor:
     out = torch.empty(int(offsets[-1]), dtype=torch.int64)
     _ray_indices(offsets.numpy(), out.numpy())
     return out
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _scatter_max(grid: Any, coordinates: Any, values: Any) -> None:
-    side = grid.shape[0]
-    cells = np.float32(side)
-    for i in range(values.shape[0]):
-        x = min(max(int(coordinates[i, 0] * cells), 0), side - 1)
-        y = min(max(int(coordinates[i, 1] * cells), 0), side - 1)
-        z = min(max(int(coordinates[i, 2] * cells), 0), side - 1)
-        if values[i] > grid[z, y, x]:
-            grid[z, y, x] = values[i]
-
-
-def scatter_max(grid: Tensor, coordinates: Tensor, values: Tensor) -> None:
-    """See `reference.scatter_max`; float32 on the CPU. One thread: it is a thousandth of a step's work."""
-    _scatter_max(grid.numpy(), coordinates.contiguous().numpy(), values.contiguous().numpy())
