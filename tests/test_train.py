@@ -13,6 +13,7 @@ import pytest
 import torch
 from conftest import SPHERES
 
+from nerfcli import kernels
 from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -157,6 +158,15 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(views, tmp_
         fit(views, tmp_path / name, replace(settings, seed=seed))
     assert weights(tmp_path / "one") == weights(tmp_path / "two")
     assert weights(tmp_path / "one") != weights(tmp_path / "other")
+
+
+def test_the_reference_trains_as_the_compiled_kernels_do(views, tmp_path, monkeypatch):
+    # What CUDA tensors and machines without Numba take. Rounding grows from step to step; after few it is still small.
+    settings = replace(FEW, steps=6)
+    compiled = fit(views, tmp_path / "compiled", settings)
+    monkeypatch.setattr(kernels, "_numba_cpu", lambda: None)
+    reference = fit(views, tmp_path / "reference", settings)
+    assert [step.loss for step in reference] == pytest.approx([step.loss for step in compiled], rel=1e-3)
 
 
 def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, tmp_path):

@@ -59,7 +59,12 @@ def hash_encode(
         return numba_cpu.hash_encode(points, table, resolutions, sink, known)
     if sink is not None and table.requires_grad and torch.is_grad_enabled():
         leaf = table.detach().requires_grad_()
-        leaf.register_post_accumulate_grad_hook(lambda given: sink.add_(given.grad))
+
+        def add_to_sink(given: Tensor) -> None:
+            if given.grad is not None:
+                sink.add_(given.grad)
+
+        leaf.register_post_accumulate_grad_hook(add_to_sink)
         return reference.hash_encode(points, leaf, resolutions)
     return reference.hash_encode(points, table, resolutions)
 
