@@ -386,6 +386,22 @@ def test_a_batch_goes_on_after_a_bad_path(capture, tmp_path):
     assert paths == [f"{capture}-run/metrics.json", f"{other}-run/metrics.json"]
 
 
+@pytest.mark.parametrize(("given", "used"), [(None, "1000"), ("7", "7")])
+def test_openmp_waits_briefly_unless_the_user_says_otherwise(given, used, monkeypatch):
+    # Not whether it helps: two trainings at a time are a matter for benchmarks.
+    monkeypatch.setenv("GOMP_SPINCOUNT", given or "")  # remembers what stood there, whatever main sets
+    if given is None:
+        monkeypatch.delenv("GOMP_SPINCOUNT")
+    monkeypatch.setattr(cli, "app", lambda: None)
+    cli.main()
+    assert os.environ["GOMP_SPINCOUNT"] == used
+
+
+def test_python_m_nerfcli_is_the_program():
+    told = subprocess.run([sys.executable, "-m", "nerfcli", "--version"], check=True, stdout=subprocess.PIPE, text=True)
+    assert told.stdout.startswith("nerfcli ")
+
+
 def test_there_is_no_place_beside_the_root():
     result = nerfcli("poses", "/")
     assert result.exit_code == BAD_INPUT

@@ -6,10 +6,12 @@ Gradients are compared as vectors (relative L2) and per element against the larg
 import subprocess
 import sys
 
+import numba
 import pytest
 import torch
 
 from nerfcli.kernels import numba_cpu, reference
+from nerfcli.kernels.numba_cpu.threads import use_threads
 
 SIZES = [0, 1, 5, 123, 3000]
 RELATIVE = 1e-5
@@ -199,6 +201,33 @@ def test_visible_samples(rays, unbounded, contrast, generator):
         assert (depth < 7.0).all()
 
 
+@pytest.mark.parametrize("side", [30, 64])
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("steps", [2000, 150, 20])
+def test_visible_samples_misses_no_lonely_cell(side, unbounded, steps, generator):
+    # Nearly all blocks of cells are empty and stepped over as a whole; steps from far within a block to many blocks long.
+    # A side of 30 leaves a narrow last block. Against the reference, which looks at every step.
+    rays = 300 if steps > 20 else 3000
+    origins = torch.randn(rays, 3, generator=generator)
+    directions = torch.nn.functional.normalize(-origins + 0.5 * torch.randn(rays, 3, generator=generator), dim=-1)
+    settings = {
+        "jitter": torch.rand(rays, generator=generator),
+        "occupied": torch.rand(side, side, side, generator=generator) < 0.002,
+        "unbounded": unbounded,
+        "table": torch.zeros(8, 16, 4),
+        "resolutions": (2,) * 8,
+        "weights": tuple(torch.zeros(shape) for shape in WEIGHTS),
+        "deepest": 1e9,
+    }
+    edges = torch.linspace(0.0, 5.0, steps)
+    fast = numba_cpu.visible_samples(origins, directions, edges, **settings)
+    exact = reference.visible_samples(origins, directions, edges, **settings)
+    assert len(exact[0]) > 20
+    # A middle that rounds across a cell's border may differ; a lost block is many samples.
+    counts = [out[5].diff() for out in (fast, exact)]
+    assert (counts[0] - counts[1]).abs().sum() <= 2
+
+
 def test_visible_samples_holds_many_rays_of_many_samples(generator):
     # More samples than the buffers start with, in order of rays: through fog so thin that no ray ends early.
     rays, edges = 200, torch.linspace(0, 2, 402)
@@ -260,10 +289,17 @@ def test_starting_numba_leaves_the_thread_count_alone():
     # Both libraries share one OpenMP: without care, the first compiled loop gave --threads 1 two threads.
     program = (
         "import torch; torch.set_num_threads(1); from nerfcli.kernels import numba_cpu; numba_cpu.warm_up(); "
-        "from nerfcli.kernels.numba_cpu.threads import thread_count; print(torch.get_num_threads(), thread_count())"
+        "from nerfcli.kernels.numba_cpu.threads import use_threads; print(torch.get_num_threads(), use_threads())"
     )
     told = subprocess.run([sys.executable, "-c", program], check=True, stdout=subprocess.PIPE, text=True)
     assert told.stdout.split() == ["1", "1"]
+
+
+def test_numba_follows_when_the_thread_count_changes():
+    # Its own count used to stay where the last loop had left it, and loops that asked for two threads got one.
+    for wanted in (1, 2, 1, 2):
+        torch.set_num_threads(wanted)
+        assert use_threads() == numba.get_num_threads() == min(wanted, numba.config.NUMBA_NUM_THREADS)
 
 
 def test_two_runs_are_bit_identical(generator):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.numba_cpu.threads import thread_count
+from nerfcli.kernels.numba_cpu.threads import use_threads
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -129,7 +129,7 @@ def _distortion_backward(weights: Any, starts: Any, ends: Any, offsets: Any, gra
 class _Distortion(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
-        numba.set_num_threads(thread_count())
+        use_threads()
         weights, starts, ends = (x.detach().contiguous() for x in (weights, starts, ends))
         out = torch.empty(len(offsets) - 1)
         _distortion(*(x.numpy() for x in (weights, starts, ends, offsets, out)))
@@ -138,7 +138,7 @@ class _Distortion(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        numba.set_num_threads(thread_count())
+        use_threads()
         out = torch.empty_like(ctx.saved_tensors[0])
         _distortion_backward(*(x.contiguous().numpy() for x in (*ctx.saved_tensors, *gradients, out)))
         return out, None, None, None
@@ -154,7 +154,7 @@ class _Composite(torch.autograd.Function):
     def forward(
         ctx: Any, density: Tensor, rgb: Tensor, lengths: Tensor, offsets: Tensor, background: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        numba.set_num_threads(thread_count())
+        use_threads()
         density, rgb, lengths = (x.detach().contiguous() for x in (density, rgb, lengths))
         rays = len(offsets) - 1
         background = background.detach().expand(rays, 3).contiguous()
@@ -165,7 +165,7 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        numba.set_num_threads(thread_count())
+        use_threads()
         density, rgb = ctx.saved_tensors[:2]
         out = torch.empty_like(density), torch.empty_like(rgb)
         _backward(*(x.contiguous().numpy() for x in (*ctx.saved_tensors, *gradients, *out)))
@@ -181,7 +181,7 @@ def composite(
 
 def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
     """See `reference.optical_depth_before`; float32 on the CPU, without gradients."""
-    numba.set_num_threads(thread_count())
+    use_threads()
     out = torch.empty_like(density)
     _depth_before(density.contiguous().numpy(), lengths.contiguous().numpy(), offsets.numpy(), out.numpy())
     return out
@@ -189,7 +189,7 @@ def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> T
 
 def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """See `reference.interval_weights`; float32 on the CPU, without gradients."""
-    numba.set_num_threads(thread_count())
+    use_threads()
     weights, transmittance = torch.empty_like(density), torch.empty(len(offsets) - 1)
     arrays = (density.detach().contiguous(), lengths.contiguous(), offsets, weights, transmittance)
     _weights(*(x.numpy() for x in arrays))

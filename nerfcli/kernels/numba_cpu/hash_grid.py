@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.numba_cpu.threads import thread_count
+from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import ROW, gather_rows, prefetch, scatter_rows
 
 # Row width that the kernels are written for, corners of a cell, and samples in a block.
@@ -153,7 +153,7 @@ class _HashEncode(torch.autograd.Function):
         sides = np.array(resolutions, dtype=np.int32)
         if known is None:
             out = torch.empty(len(points), levels * features)
-            _encode_forward(points.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(), thread_count())
+            _encode_forward(points.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(), use_threads())
         else:
             out = known.view_as(known)
         ctx.save_for_backward(points)
@@ -170,7 +170,7 @@ class _HashEncode(torch.autograd.Function):
             ctx.table_shape[1],
             ctx.sides,
             total.view(-1).numpy(),
-            thread_count(),
+            use_threads(),
         )
         return None, total if ctx.sink is None else None, None, None, None
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
-from nerfcli.kernels.numba_cpu.threads import thread_count
+from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import ROWS, add_product_16, add_product_32
 
 # Widths that the kernels are written for: encoded features, hidden layers, and the padded width of the outputs.
@@ -254,7 +254,7 @@ class _Radiance(torch.autograd.Function):
         density, rgb = torch.empty(len(encoded)), torch.empty(len(encoded), 3)
         _radiance_forward(
             encoded.numpy(), harmonics.numpy(), rays.numpy(), flat_weights(weights), density.numpy(), rgb.numpy(),
-            thread_count(),
+            use_threads(),
         )  # fmt: skip
         ctx.save_for_backward(encoded, harmonics, rays, *weights)
         return density, rgb
@@ -262,7 +262,7 @@ class _Radiance(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         encoded, harmonics, rays, *weights = ctx.saved_tensors
-        threads = thread_count()
+        threads = use_threads()
         encoded_gradient = torch.empty_like(encoded)
         sums = np.zeros((threads, WEIGHTS), np.float32)
         _radiance_backward(
@@ -295,5 +295,5 @@ def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
     """See `reference.density`; float32 on the CPU, without gradients."""
     encoded = encoded.detach().contiguous()
     out = torch.empty(len(encoded))
-    _density_forward(encoded.numpy(), flat_weights(weights[:2]), out.numpy(), thread_count())
+    _density_forward(encoded.numpy(), flat_weights(weights[:2]), out.numpy(), use_threads())
     return out

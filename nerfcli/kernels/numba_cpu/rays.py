@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.numba_cpu.threads import thread_count
+from nerfcli.kernels.numba_cpu.threads import use_threads
 
 # Steps of a ray that are looked at together: LLVM makes no vectors of a loop over fewer.
 CHUNK = 16
@@ -71,7 +71,7 @@ def _ray_indices(offsets: Any, out: Any) -> None:
 
 def ray_indices(offsets: Tensor) -> Tensor:
     """See `reference.ray_indices`."""
-    numba.set_num_threads(thread_count())
+    use_threads()
     out = torch.empty(int(offsets[-1]), dtype=torch.int64)
     _ray_indices(offsets.numpy(), out.numpy())
     return out

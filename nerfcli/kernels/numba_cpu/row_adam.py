@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from torch import Tensor
 
-from nerfcli.kernels.numba_cpu.threads import thread_count
+from nerfcli.kernels.numba_cpu.threads import use_threads
 
 FEATURES = 4
 
@@ -45,7 +45,7 @@ def adam_rows(
     eps: float,
 ) -> None:
     """See `reference.adam_rows`; float32 on the CPU, rows of 4 features."""
-    numba.set_num_threads(thread_count())
+    use_threads()
     scale = rate / (1 - betas[0] ** step)
     correction = (1 - betas[1] ** step) ** -0.5
     flat = (x.detach().view(-1, FEATURES).numpy() for x in (table, gradient, first, second))

@@ -5,8 +5,8 @@ import torch
 from numba.core import config
 
 
-def thread_count() -> int:
-    """Torch's thread count, which --threads sets, as far as Numba has threads; from now on its loops use as many."""
+def use_threads() -> int:
+    """Have Numba's loops use as many threads as torch, which --threads sets; returns how many these are."""
     count = min(torch.get_num_threads(), int(config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     numba.set_num_threads(count)
     return count
@@ -15,7 +15,7 @@ def thread_count() -> int:
 def _launch() -> None:
     """Start Numba's threads now: both libraries share one OpenMP, and the start overwrites torch's thread count."""
     wanted = torch.get_num_threads()
-    thread_count()
+    use_threads()
     torch.set_num_threads(wanted)
 
 

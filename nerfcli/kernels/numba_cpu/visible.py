@@ -15,7 +15,7 @@ from torch import Tensor
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
 from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, density_range, flat_weights
 from nerfcli.kernels.numba_cpu.rays import CHUNK, cube, cut, look_ahead, padded
-from nerfcli.kernels.numba_cpu.threads import thread_count
+from nerfcli.kernels.numba_cpu.threads import use_threads
 
 # Rays that a thread carries at a time, and samples that each of them looks ahead.
 LANES = 256
@@ -202,7 +202,7 @@ def visible_samples(
     deepest: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """See `reference.visible_samples`; float32 on the CPU."""
-    threads, rays, intervals = thread_count(), len(origins), len(edges) - 2
+    threads, rays, intervals = use_threads(), len(origins), len(edges) - 2
     borders = np.arange(threads + 1) * rays // threads
     # Room for all samples of all rays: memory that nobody writes to is never really taken.
     room = (threads, -(-rays // threads) * intervals)
