@@ -35,15 +35,33 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Capture:
-    """What a reader returns.
+class Observations:
+    """Where points were seen: one row per 2D feature of a frame.
 
     Args:
-        frames: the views whose picture is on disk, in the order of the file.
+        frame_index: (M,) int64, of the frame.
+        point_index: (M,) int64, of the point; -1 for a feature without one.
+        pixels: (M, 2) float64 positions in the frame's picture, pixel centres at 0.5.
+    """
+
+    frame_index: np.ndarray
+    point_index: np.ndarray
+    pixels: np.ndarray
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture as a file describes it.
+
+    Args:
+        frames: the views, in the order of the file; from a reader for scenes only those whose picture is on disk.
         points: (N, 3) points of the surface in the world; N is 0 where the format has none.
         missing: names of images that the file lists and that are not on disk.
         depth_bounds: (frames, 2) nearest and farthest z of each view in scene units, or None.
-        kind: the format: "colmap", "transforms", "blender" or "llff".
+        kind: the format: "colmap", "transforms", "blender", "llff", ...
+        colours: (N, 3) uint8 sRGB of the points, or None.
+        observations: where the points were seen, or None.
+        unit: of length: "arbitrary" or "metre".
     """
 
     frames: tuple[Frame, ...]
@@ -51,3 +69,6 @@ class Capture:
     missing: tuple[str, ...]
     depth_bounds: np.ndarray | None
     kind: str
+    colours: np.ndarray | None = None
+    observations: Observations | None = None
+    unit: str = "arbitrary"
