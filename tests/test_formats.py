@@ -10,15 +10,15 @@ import pytest
 
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.colmap import is_model, read_colmap, read_model
 from nerfcli.cameras.conventions import (
     opencv_from_llff_pose,
     opencv_from_opengl_pose,
     opengl_from_opencv_pose,
 )
+from nerfcli.cameras.formats.colmap import is_model, read_colmap, read_model
+from nerfcli.cameras.formats.llff import read_llff
+from nerfcli.cameras.formats.transforms import read_blender, read_camera_path, read_transforms, write_transforms
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.llff import read_llff
-from nerfcli.cameras.transforms import read_blender, read_camera_path, read_transforms, write_transforms
 from nerfcli.errors import BAD_INPUT, UserError
 
 # A camera at (1, 2, 3) that looks along -x with +z up. OpenGL axes: right +y, up +z, backward +x, as columns.

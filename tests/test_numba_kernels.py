@@ -205,7 +205,7 @@ def test_visible_samples(rays, unbounded, contrast, generator):
 @pytest.mark.parametrize("unbounded", [False, True])
 @pytest.mark.parametrize("steps", [2000, 150, 20])
 def test_visible_samples_misses_no_lonely_cell(side, unbounded, steps, generator):
-    # Nearly all blocks of cells are empty and stepped over as a whole; steps from far within a block to many blocks long.
+    # Nearly all blocks of cells are empty and stepped over as a whole; steps from within a block to many blocks long.
     # A side of 30 leaves a narrow last block. Against the reference, which looks at every step.
     rays = 300 if steps > 20 else 3000
     origins = torch.randn(rays, 3, generator=generator)

@@ -210,7 +210,7 @@ def chosen_frames(run: Path, cameras: str, *, count: int, max_size: int | None, 
 def frames_of_file(path: Path) -> "tuple[Frame, ...]":
     """The cameras of a transforms.json, or of any scene folder."""
     from nerfcli import scene as scenes
-    from nerfcli.cameras.transforms import read_camera_path
+    from nerfcli.cameras.formats.transforms import read_camera_path
 
     if path.is_dir():
         return scenes.load(path).frames

@@ -12,9 +12,9 @@ import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_llff_pose
+from nerfcli.cameras.formats.transforms import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, fit_to_picture
-from nerfcli.cameras.transforms import rigid_pose
 from nerfcli.errors import UserError
 
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
