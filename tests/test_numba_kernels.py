@@ -286,6 +286,26 @@ def test_adam_rows_is_adam_where_every_row_is_touched(generator):
     assert_close(ours[0], parameter.detach(), "table")
 
 
+@pytest.mark.parametrize("count", SIZES)
+@pytest.mark.parametrize("channels", [3, 4])
+def test_pixel_rays(count, channels, generator):
+    # Three photos of 5, 700 and 20 pixels, of which the first and the last share a camera's bearings.
+    poses = torch.randn(3, 4, 4, generator=generator)
+    given = {
+        "bearings": torch.randn(720, 3, generator=generator),
+        "poses": poses,
+        "photos": torch.randint(256, (725, channels), generator=generator, dtype=torch.uint8),
+    }
+    where = torch.tensor([0, 5, 705]), torch.tensor([700, 0, 700])
+    chosen = torch.randint(725, (count,), generator=generator)
+    fast = numba_cpu.pixel_rays(chosen, *where, **given)
+    exact = {key: value if value.dtype == torch.uint8 else value.double() for key, value in given.items()}
+    for name, actual, expected in zip(
+        ("origins", "directions", "colours"), fast, reference.pixel_rays(chosen, *where, **exact), strict=True
+    ):
+        assert_close(actual, expected, name)
+
+
 def test_starting_numba_leaves_the_thread_count_alone():
     # Both libraries share one OpenMP: without care, the first compiled loop gave --threads 1 two threads.
     program = (

@@ -25,12 +25,22 @@ __all__ = [
     "hash_encode",
     "interval_weights",
     "optical_depth_before",
+    "pixel_rays",
     "prepare",
     "radiance",
     "ray_indices",
     "sum_along_rays",
     "visible_samples",
 ]
+
+
+def pixel_rays(
+    chosen: Tensor, first_pixel: Tensor, first_bearing: Tensor, *, bearings: Tensor, poses: Tensor, photos: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.pixel_rays`."""
+    return _module_for(bearings, poses).pixel_rays(
+        chosen, first_pixel, first_bearing, bearings=bearings, poses=poses, photos=photos
+    )
 
 
 def ray_indices(offsets: Tensor) -> Tensor:

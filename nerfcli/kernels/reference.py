@@ -141,6 +141,29 @@ def march(
     return starts[kept], ends[kept], offsets
 
 
+def pixel_rays(
+    chosen: Tensor, first_pixel: Tensor, first_bearing: Tensor, *, bearings: Tensor, poses: Tensor, photos: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The rays of chosen pixels of many photos, and their colours.
+
+    Args:
+        chosen: (N,) int64 numbers of pixels, counted through all photos, row by row.
+        first_pixel: (P,) int64, the number of the first pixel of each photo, increasing from 0.
+        first_bearing: (P,) int64, where the bearings of a photo's camera begin.
+        bearings: (B, 3) directions of pixels in the axes of their cameras.
+        poses: (P, 4, 4) `world_from_cam`.
+        photos: (M, C) uint8 values of all pixels.
+
+    Returns:
+        origins (N, 3), directions (N, 3) = rotation @ bearing, colours (N, C) in [0, 1].
+    """
+    photo = torch.searchsorted(first_pixel, chosen, right=True) - 1
+    bearing = bearings[first_bearing[photo] + chosen - first_pixel[photo]]
+    pose = poses[photo]
+    directions = (pose[:, :3, :3] * bearing[:, None, :]).sum(-1)  # a batched product of 3x3 is slower
+    return pose[:, :3, 3], directions, photos[chosen].to(poses.dtype) / 255.0
+
+
 def ray_indices(offsets: Tensor) -> Tensor:
     """The ray of each packed sample, (N,) int64."""
     counts = offsets.diff()

@@ -29,28 +29,28 @@ class Occupancy:
 
     @torch.no_grad()
     def refresh(
-        self, field: HashField, *, share: float, shortest_step: float, growth: float, generator: torch.Generator
+        self, field: HashField, *, cells: slice, shortest_step: float, growth: float, generator: torch.Generator
     ) -> None:
-        """Ask the field at one random point in each of a random `share` of the cells.
+        """Ask the field at one random point in each of some cells.
 
         Args:
             field: the field being trained.
-            share: in (0, 1].
+            cells: which of the cells, numbered (z * side + y) * side + x; in this order their features are near in
+                memory.
             shortest_step, growth: the step schedule of `sampling.step_edges`; distance is taken from the origin of
                 the training frame, near which the cameras are.
-            generator: source of the random choice, on the grid's device.
+            generator: source of the random points, on the grid's device.
         """
         side, device = self.optical_depth.shape[0], self.optical_depth.device
-        cells = torch.randperm(side**3, generator=generator, device=device)[: max(1, round(share * side**3))]
-        place = torch.stack([cells % side, cells // side % side, cells // side**2], dim=-1)
-        inside = torch.rand(len(cells), 3, generator=generator, device=device)
+        numbers = torch.arange(side**3, device=device)[cells]
+        place = torch.stack([numbers % side, numbers // side % side, numbers // side**2], dim=-1)
+        inside = torch.rand(len(numbers), 3, generator=generator, device=device)
         coordinates = (place + inside) / side
         density = torch.cat([field.density(chunk) for chunk in coordinates.split(2**16)])
         radius = training_points(coordinates, field.settings.unbounded).norm(dim=-1)
         step = (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as `sampling.step_length`
-        flat = self.optical_depth.view(-1)
-        old = flat[cells]
-        flat[cells] = torch.maximum(torch.where(old.isinf(), 0.0, old * DECAY), density * step)
+        chosen = self.optical_depth.view(-1)[cells]
+        chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), density * step))
 
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs."""

@@ -19,7 +19,7 @@ from nerfcli.train.settings import TrainSettings
 
 OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
-REFRESH_SHARE = 1 / 8
+REFRESH_TURNS = 8
 MOST_RAYS = 2**14
 # Rays of the training end where less than a thousandth of the light is left.
 DEEPEST = 7.0
@@ -36,17 +36,16 @@ BETAS = (0.9, 0.99)
 EPS = 1e-15
 
 
-def _scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> tuple[Tensor, Tensor]:
-    """The same values with gradients times min(1, distance^2).
+def _scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> None:
+    """Have gradients that come to these tensors multiplied by min(1, distance^2).
 
     Space near a camera is crossed by many of its rays and by those of no other camera: without this it learns
     faster than what all cameras see, and fog grows in front of the lenses.
     Source: Philip and Deschaintre 2023, Floaters no more, arXiv:2305.02756, eq. 6.
     """
     scale = distance.square().clamp_max(1.0)
-    density = density * scale + (density * (1.0 - scale)).detach()
-    rgb = rgb * scale[:, None] + (rgb * (1.0 - scale)[:, None]).detach()
-    return density, rgb
+    density.register_hook(lambda gradient: gradient * scale)
+    rgb.register_hook(lambda gradient: gradient * scale[:, None])
 
 
 @dataclass(frozen=True)
@@ -162,7 +161,7 @@ class Fitting:
             coordinates, field.table, field.settings.resolutions, sink=self.table_gradient, known=known
         )
         density, rgb = field.radiance_of_encoded(encoded, directions, kernels.ray_indices(offsets))
-        density, rgb = _scale_gradients(density, rgb, distance=starts)
+        _scale_gradients(density, rgb, distance=starts)
         rendered, _, weights = kernels.composite(density, rgb, ends - starts, offsets=offsets, background=background)
         loss = colour_loss(rendered, over_background(colours, background))
         return loss + DISTORTION * distortion_loss(weights, starts, ends, offsets), len(starts)
@@ -171,9 +170,10 @@ class Fitting:
         # The whole grid once, after a warm-up in which everything is open; then a share at a time.
         if self.step == 0:
             return
+        turn = self.step // REFRESH_EVERY
         self.occupancy.refresh(
             self.field,
-            share=1.0 if self.step == REFRESH_EVERY else REFRESH_SHARE,
+            cells=slice(None) if turn == 1 else slice(turn % REFRESH_TURNS, None, REFRESH_TURNS),
             shortest_step=self.marching.shortest_step,
             growth=self.marching.growth,
             generator=self.generator,

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli import kernels
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
@@ -100,8 +101,11 @@ class PixelPool:
             good_rays[photo.frame.camera] if photo.used is None else good_rays[photo.frame.camera] & photo.used.ravel()
             for photo in photos
         ]
-        self.usable = torch.from_numpy(np.flatnonzero(np.concatenate(usable))).to(device)
-        if len(self.usable) == 0:
+        numbers = np.flatnonzero(np.concatenate(usable))
+        self.usable_count = len(numbers)
+        # A list of all pixels would be larger than the photos.
+        self.usable = None if len(numbers) == len(self.colours) else torch.from_numpy(numbers).to(device)
+        if self.usable_count == 0:
             raise UserError("no pixel is left to train on", "check that the masks are white where pixels count")
 
     @property
@@ -115,12 +119,15 @@ class PixelPool:
             origins (count, 3), unit directions (count, 3), colours (count, 3 or 4) float32 in [0, 1].
         """
         device = self.colours.device
-        chosen = self.usable[torch.randint(len(self.usable), (count,), generator=generator, device=device)]
-        photo = torch.searchsorted(self.first_pixel, chosen, right=True) - 1
-        bearing = self.bearings[self.first_bearing[photo] + chosen - self.first_pixel[photo]]
-        pose = self.poses[photo]
-        directions = (pose[:, :3, :3] * bearing[:, None, :]).sum(-1)  # a batched product of 3x3 is slower
-        return pose[:, :3, 3], directions, self.colours[chosen].float() / 255.0
+        chosen = torch.randint(self.usable_count, (count,), generator=generator, device=device)
+        return kernels.pixel_rays(
+            chosen if self.usable is None else self.usable[chosen],
+            self.first_pixel,
+            self.first_bearing,
+            bearings=self.bearings,
+            poses=self.poses,
+            photos=self.colours,
+        )
 
 
 def _with_alpha(pixels: np.ndarray) -> np.ndarray:

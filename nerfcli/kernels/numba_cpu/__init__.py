@@ -7,6 +7,7 @@ import torch
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
+from nerfcli.kernels.numba_cpu.pixels import pixel_rays
 from nerfcli.kernels.numba_cpu.rays import ray_indices
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows
 from nerfcli.kernels.numba_cpu.visible import visible_samples
@@ -22,6 +23,7 @@ __all__ = [
     "interval_weights",
     "is_compiled",
     "optical_depth_before",
+    "pixel_rays",
     "radiance",
     "ray_indices",
     "visible_samples",
@@ -54,5 +56,8 @@ def warm_up() -> None:
     interval_weights(thickness, lengths, offsets)
     colour, _, spread = composite(thickness, rgb, lengths, offsets=offsets, background=torch.zeros(3))
     (colour.sum() + distortion(spread, starts, starts + 1, offsets).sum()).backward()
+    pixel = torch.zeros(1, dtype=torch.int64)
+    photos = torch.zeros(1, 3, dtype=torch.uint8)
+    pixel_rays(pixel, pixel, pixel, bearings=direction, poses=torch.eye(4)[None], photos=photos)
     gradient, first, second = (torch.zeros(8, 16, 4) for _ in range(3))
     adam_rows(table, gradient, first, second, step=1, rate=0.0, betas=(0.9, 0.99), eps=1e-15)
