@@ -36,7 +36,7 @@ def trained(folder: Path, seconds: float, threads: int) -> Fitting:
     similarity, marching = training_frame(capture, unbounded=unbounded)
     settings = TrainSettings(budget_seconds=seconds, threads=threads)
     pool = PixelPool(photos, similarity, torch.device("cpu"))
-    fitting = Fitting(pool, marching, points=similarity.apply(capture.points), unbounded=unbounded, settings=settings)
+    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings)
     began = time.perf_counter()
     while (share := (time.perf_counter() - began) / seconds) < 1.0:
         fitting.advance(share)

@@ -8,10 +8,12 @@ import subprocess
 import sys
 
 import numba
+import numpy as np
 import pytest
 import torch
 
 from nerfcli.kernels import numba_cpu, reference
+from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
 SIZES = [0, 1, 5, 123, 3000]
@@ -284,6 +286,28 @@ def test_adam_rows_is_adam_where_every_row_is_touched(generator):
         ours[1].copy_(gradient)
         numba_cpu.adam_rows(*ours, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15)
     assert_close(ours[0], parameter.detach(), "table")
+
+
+def test_exponential_and_sigmoid_in_every_range():
+    @numba.njit(error_model="numpy")
+    def evaluate(x, values):
+        for i in range(len(x)):
+            values[0, i], values[1, i], values[2, i] = exponential(x[i]), sigmoid(x[i]), sigmoid_slope(x[i])
+
+    tiny = np.geomspace(1e-30, 1.0, 5000)
+    x = np.concatenate([np.linspace(-87.0, 87.0, 200_001), tiny, -tiny, [0.0]]).astype(np.float32)
+    values = np.empty((3, len(x)), np.float32)
+    evaluate(x, values)
+    exact = x.astype(np.float64)
+    tail = np.exp(-np.abs(exact))
+    for actual, expected in zip(values, (np.exp(exact), 1 / (1 + np.exp(-exact)), tail / (1 + tail) ** 2), strict=True):
+        np.testing.assert_allclose(actual, expected, rtol=3e-7)
+
+    odd = np.array([np.nan, np.inf, -np.inf, 1e30, -1e30], np.float32)
+    values = np.empty((3, len(odd)), np.float32)
+    evaluate(odd, values)
+    assert np.isnan(values[:, 0]).all()  # so that a number gone bad is found
+    assert np.isfinite(values[:, 1:]).all()
 
 
 @pytest.mark.parametrize("count", SIZES)

@@ -110,7 +110,7 @@ def test_photos_of_a_desk_are_learned_too(with_points, tmp_path):
         bearings, _ = camera.pixel_bearings()
         in_camera = (bearings / bearings[:, 2:] * depth.reshape(-1, 1))[::400]
         points.append(apply(frame.world_from_cam, in_camera))
-    # Without points nothing tells where space may be filled: all of it starts as fog, and has to stay open for a while.
+    # Points tell how near to the cameras things begin.
     cloud = np.concatenate(points) if with_points else np.zeros((0, 3))
     scene = Scene(desk, "transforms", frames, names, cloud, ())
     settings = TrainSettings(budget_seconds=None, steps=400, downscale=8, samples_per_step=2**14, threads=2)

@@ -1,11 +1,8 @@
 """Which cells of space hold anything: a coarse grid over the field's unit cube that lets rays skip the rest."""
 
-import numpy as np
 import torch
-from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
-from nerfcli import kernels
 from nerfcli.field.contraction import training_points
 from nerfcli.field.hash_field import HashField
 
@@ -59,24 +56,3 @@ class Occupancy:
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take up what `state` gave."""
         self.optical_depth = tensors["optical_depth"]
-
-
-def cells_from_points(points: np.ndarray, side: int, unbounded: bool) -> Tensor:
-    """How many cells each cell of a grid is away from the nearest point, diagonal steps counting one.
-
-    Args:
-        points: (N, 3) in the training frame; those outside the grid are left out.
-        side: cells per axis.
-        unbounded: see `kernels.grid_coordinates`.
-
-    Returns:
-        (side, side, side) int32, indexed [z, y, x]; 0 everywhere if there is no point.
-    """
-    coordinates = kernels.grid_coordinates(torch.as_tensor(points), unbounded).numpy()
-    coordinates = coordinates[((coordinates >= 0) & (coordinates < 1)).all(-1)]
-    if len(coordinates) == 0:
-        return torch.zeros((side, side, side), dtype=torch.int32)
-    empty = np.ones((side, side, side), dtype=bool)
-    x, y, z = (coordinates * side).astype(int).T
-    empty[z, y, x] = False
-    return torch.from_numpy(np.asarray(distance_transform_cdt(empty, metric="chessboard"), dtype=np.int32))

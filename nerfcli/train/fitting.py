@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,7 +11,7 @@ from nerfcli import kernels
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.render.model import Marching
-from nerfcli.render.occupancy import Occupancy, cells_from_points
+from nerfcli.render.occupancy import Occupancy
 from nerfcli.train.losses import DISTORTION, colour_loss, distortion_loss, over_background
 from nerfcli.train.photos import PixelPool
 from nerfcli.train.settings import TrainSettings
@@ -27,9 +26,6 @@ DEEPEST = 7.0
 # and nothing tells yet where the surfaces are; then ever more, so that surfaces have to become compact.
 FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
 CLOSING_STEPS = 150
-# Cells around a point that are open at the start, and the steps after which the next ones open.
-FIRST_CELLS = 2
-STEPS_PER_CELL = 100
 # Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
 STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
 BETAS = (0.9, 0.99)
@@ -65,7 +61,6 @@ class Fitting:
         pool: PixelPool,
         marching: Marching,
         *,
-        points: np.ndarray,
         unbounded: bool,
         settings: TrainSettings,
     ):
@@ -77,7 +72,6 @@ class Fitting:
         self.step = 0
         self.field = HashField(HashFieldSettings(unbounded=unbounded)).to(device)
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
-        self.cells_from_points = cells_from_points(points, OCCUPANCY_SIDE, unbounded).to(device)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
@@ -181,14 +175,10 @@ class Fitting:
         self.occupied = self._open_cells()
 
     def _open_cells(self) -> Tensor:
-        """Occupied cells, but for those that are still too far from the points that structure from motion found.
-
-        Surfaces are near these points; what lies between them and the cameras is mostly air. Cells open from the points
-        outwards, so that fog cannot grow in front of the cameras before there is something to see behind it.
-        """
+        """The cells that rays look into: those that take away more light than the threshold of this step."""
         closed = min(1.0, self.step / CLOSING_STEPS)
         threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
-        return self.occupancy.above(threshold) & (self.cells_from_points <= FIRST_CELLS + self.step / STEPS_PER_CELL)
+        return self.occupancy.above(threshold)
 
     def _check_finite(self, loss: Tensor) -> None:
         gradients = {f"gradient of {name}": p.grad for name, p in self.field.weights.named_parameters()}

@@ -93,8 +93,7 @@ def train(
         f"{'unbounded' if unbounded else 'bounded'} scene, {settings.device}, {settings.threads} threads"
     )
 
-    points = similarity.apply(scene.points)
-    fitting = Fitting(pool, marching, points=points, unbounded=unbounded, settings=settings)
+    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings)
     totals = _Totals()
     if resume:
         totals = _restore(fitting, run)

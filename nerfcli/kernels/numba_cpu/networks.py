@@ -14,8 +14,16 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
+from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import ROWS, add_product_16, add_product_32
+from nerfcli.kernels.numba_cpu.vector import (
+    ROWS,
+    add_product_16,
+    add_product_32,
+    product_16,
+    product_32,
+    rectified_product_32,
+)
 
 # Widths that the kernels are written for: encoded features, hidden layers, and the padded width of the outputs.
 WIDTH = 32
@@ -30,27 +38,31 @@ WEIGHTS = 4096
 
 
 @numba.njit(inline="always")
-def _layer_32(x: Any, weights: Any, at: Any, depth: Any, out: Any) -> None:
-    """out (TILE, 32) = x (TILE, 32)[:, :depth] @ weights[at:] (depth, 32)."""
-    out[: TILE * WIDTH] = np.float32(0)
+def _layer_32(x: Any, weights: Any, at: Any, out: Any) -> None:
+    """out (TILE, 32) = x (TILE, 32) @ weights[at:] (32, 32)."""
     for row in range(0, TILE, ROWS):
-        add_product_32(x, row * WIDTH, WIDTH, 1, weights, at, WIDTH, depth, out, row * WIDTH, WIDTH)
+        product_32(x, row * WIDTH, WIDTH, 1, weights, at, WIDTH, WIDTH, out, row * WIDTH, WIDTH)
+
+
+@numba.njit(inline="always")
+def _rectified_32(x: Any, weights: Any, at: Any, out: Any) -> None:
+    """out (TILE, 32) = max(0, x (TILE, 32) @ weights[at:] (32, 32))."""
+    for row in range(0, TILE, ROWS):
+        rectified_product_32(x, row * WIDTH, WIDTH, 1, weights, at, WIDTH, WIDTH, out, row * WIDTH, WIDTH)
 
 
 @numba.njit(inline="always")
 def _layer_16(x: Any, weights: Any, at: Any, out: Any) -> None:
     """out (TILE, 16) = x (TILE, 32) @ weights[at:] (32, 16)."""
-    out[: TILE * OUT] = np.float32(0)
     for row in range(0, TILE, ROWS):
-        add_product_16(x, row * WIDTH, WIDTH, 1, weights, at, OUT, WIDTH, out, row * OUT, OUT)
+        product_16(x, row * WIDTH, WIDTH, 1, weights, at, OUT, WIDTH, out, row * OUT, OUT)
 
 
 @numba.njit(inline="always")
 def _back_from_16(g: Any, weights: Any, at: Any, depth: Any, out: Any) -> None:
     """out (TILE, 32) = g (TILE, 16)[:, :depth] @ weights[at:] (depth, 32)."""
-    out[: TILE * WIDTH] = np.float32(0)
     for row in range(0, TILE, ROWS):
-        add_product_32(g, row * OUT, OUT, 1, weights, at, WIDTH, depth, out, row * WIDTH, WIDTH)
+        product_32(g, row * OUT, OUT, 1, weights, at, WIDTH, depth, out, row * WIDTH, WIDTH)
 
 
 @numba.njit(inline="always")
@@ -65,12 +77,6 @@ def _weights_16(x: Any, g: Any, sums: Any, at: Any) -> None:
     """sums[at:] (32, 16) += x (TILE, 32)^T @ g (TILE, 16)."""
     for row in range(0, WIDTH, ROWS):
         add_product_16(x, row, 1, WIDTH, g, 0, OUT, TILE, sums, at + row * OUT, OUT)
-
-
-@numba.njit(inline="always")
-def _rectify(x: Any) -> None:
-    for i in range(TILE * WIDTH):
-        x[i] = max(x[i], np.float32(0))
 
 
 @numba.njit(inline="always")
@@ -102,13 +108,20 @@ def _colour_inputs(geometry: Any, harmonics: Any, rays: Any, first: Any, count: 
 
 
 @numba.njit(inline="always")
-def _density(log_density: Any) -> Any:
-    return np.exp(min(max(log_density, -LIMIT), LIMIT))
+def _densities(geometry: Any, density: Any) -> None:
+    """Densities (TILE,) of what the density network puts out, (TILE, 16)."""
+    for i in range(TILE):
+        density[i] = geometry[i * OUT]
+    for i in range(TILE):  # apart from the loop above, so that it becomes vectors
+        density[i] = exponential(min(max(density[i], -LIMIT), LIMIT))
 
 
 @numba.njit(inline="always")
-def _sigmoid(x: Any) -> Any:
-    return np.float32(1) / (np.float32(1) + np.exp(-x))
+def _channels(out: Any, channels: Any) -> None:
+    """The three numbers (TILE, 3) of what the colour network puts out, (TILE, 16)."""
+    for i in range(TILE):
+        for channel in range(3):
+            channels[3 * i + channel] = out[i * OUT + channel]
 
 
 @numba.njit(inline="always")
@@ -116,14 +129,15 @@ def density_range(
     encoded: Any, begin: Any, end: Any, weights: Any, x: Any, h: Any, geometry: Any, density: Any
 ) -> None:
     """Density of samples begin to end, with scratch space x and h of TILE * WIDTH, geometry of TILE * OUT."""
+    own = np.empty(TILE, np.float32)
     for first in range(begin, end, TILE):
         count = min(TILE, end - first)
         _load_rows(encoded, first, count, x)
-        _layer_32(x, weights, D1, WIDTH, h)
-        _rectify(h)
+        _rectified_32(x, weights, D1, h)
         _layer_16(h, weights, D2, geometry)
+        _densities(geometry, own)
         for i in range(count):
-            density[first + i] = _density(geometry[i * OUT])
+            density[first + i] = own[i]
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -146,23 +160,25 @@ def _radiance_forward(
     for thread in numba.prange(threads):
         x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
         geometry, out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
+        own, channels = np.empty(TILE, np.float32), np.empty(3 * TILE, np.float32)
         for tile in range(thread * tiles // threads, (thread + 1) * tiles // threads):
             first = tile * TILE
             count = min(TILE, samples - first)
             _load_rows(encoded, first, count, x)
-            _layer_32(x, weights, D1, WIDTH, h)
-            _rectify(h)
+            _rectified_32(x, weights, D1, h)
             _layer_16(h, weights, D2, geometry)
             _colour_inputs(geometry, harmonics, rays, first, count, x)
-            _layer_32(x, weights, C1, WIDTH, h)
-            _rectify(h)
-            _layer_32(h, weights, C2, WIDTH, x)
-            _rectify(x)
+            _rectified_32(x, weights, C1, h)
+            _rectified_32(h, weights, C2, x)
             _layer_16(x, weights, C3, out)
+            _densities(geometry, own)
             for i in range(count):
-                density[first + i] = _density(geometry[i * OUT])
-                for channel in range(3):
-                    rgb[first + i, channel] = _sigmoid(out[i * OUT + channel])
+                density[first + i] = own[i]
+            _channels(out, channels)
+            for i in range(3 * TILE):
+                channels[i] = sigmoid(channels[i])
+            for i in range(3 * count):
+                rgb[3 * first + i] = channels[i]
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -190,46 +206,45 @@ def _radiance_backward(
         g, g2 = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
         geometry, out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
         g_out = np.empty(TILE * OUT, np.float32)
-        own = sums[thread]
+        own, channels = np.empty(TILE, np.float32), np.empty(3 * TILE, np.float32)
+        total = sums[thread]
         for tile in range(thread * tiles // threads, (thread + 1) * tiles // threads):
             first = tile * TILE
             count = min(TILE, samples - first)
             _load_rows(encoded, first, count, x)
-            _layer_32(x, weights, D1, WIDTH, h1)
-            _rectify(h1)
+            _rectified_32(x, weights, D1, h1)
             _layer_16(h1, weights, D2, geometry)
             _colour_inputs(geometry, harmonics, rays, first, count, c0)
-            _layer_32(c0, weights, C1, WIDTH, h2)
-            _rectify(h2)
-            _layer_32(h2, weights, C2, WIDTH, h3)
-            _rectify(h3)
+            _rectified_32(c0, weights, C1, h2)
+            _rectified_32(h2, weights, C2, h3)
 
-            # The slope of the sigmoid from both its tails: value * (1 - value) loses every digit near 1.
             _layer_16(h3, weights, C3, out)
+            _channels(out, channels)
+            for i in range(3 * TILE):
+                channels[i] = sigmoid_slope(channels[i])
             g_out[:] = np.float32(0)
             for i in range(count):
                 for channel in range(3):
-                    x_out = out[i * OUT + channel]
-                    slope = _sigmoid(x_out) * _sigmoid(-x_out)
-                    g_out[i * OUT + channel] = rgb_gradient[first + i, channel] * slope
-            _weights_16(h3, g_out, own, C3)
+                    g_out[i * OUT + channel] = rgb_gradient[first + i, channel] * channels[3 * i + channel]
+            _weights_16(h3, g_out, total, C3)
             _back_from_16(g_out, back, C3, 3, g)
             _mask(g, h3)
-            _weights_32(h2, g, own, C2)
-            _layer_32(g, back, C2, WIDTH, g2)
+            _weights_32(h2, g, total, C2)
+            _layer_32(g, back, C2, g2)
             _mask(g2, h2)
-            _weights_32(c0, g2, own, C1)
-            _layer_32(g2, back, C1, WIDTH, g)
+            _weights_32(c0, g2, total, C1)
+            _layer_32(g2, back, C1, g)
             for i in range(TILE):
                 for j in range(OUT):
                     g_out[i * OUT + j] = g[i * WIDTH + j]
+            _densities(geometry, own)
             for i in range(count):
-                g_out[i * OUT] += density_gradient[first + i] * _density(geometry[i * OUT])
-            _weights_16(h1, g_out, own, D2)
+                g_out[i * OUT] += density_gradient[first + i] * own[i]
+            _weights_16(h1, g_out, total, D2)
             _back_from_16(g_out, back, D2, OUT, g)
             _mask(g, h1)
-            _weights_32(x, g, own, D1)
-            _layer_32(g, back, D1, WIDTH, g2)
+            _weights_32(x, g, total, D1)
+            _layer_32(g, back, D1, g2)
             for i in range(count):
                 for j in range(WIDTH):
                     encoded_gradient[first + i, j] = g2[i * WIDTH + j]
@@ -253,8 +268,8 @@ class _Radiance(torch.autograd.Function):
         encoded, harmonics = encoded.detach().contiguous(), harmonics.detach().contiguous()
         density, rgb = torch.empty(len(encoded)), torch.empty(len(encoded), 3)
         _radiance_forward(
-            encoded.numpy(), harmonics.numpy(), rays.numpy(), flat_weights(weights), density.numpy(), rgb.numpy(),
-            use_threads(),
+            encoded.numpy(), harmonics.numpy(), rays.numpy(), flat_weights(weights), density.numpy(),
+            rgb.view(-1).numpy(), use_threads(),
         )  # fmt: skip
         ctx.save_for_backward(encoded, harmonics, rays, *weights)
         return density, rgb

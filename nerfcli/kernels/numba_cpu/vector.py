@@ -100,8 +100,14 @@ gather_rows = _row_access(_gather)
 scatter_rows = _row_access(_scatter)
 
 
-def _block_product(vectors: int) -> Callable[..., None]:
-    """An intrinsic for blocks that are `vectors` vectors wide."""
+def _block_product(vectors: int, *, begin: Callable[..., Any], finish: Callable[..., Any]) -> Callable[..., None]:
+    """An intrinsic for blocks that are `vectors` vectors wide.
+
+    Args:
+        vectors: of a row.
+        begin: what a vector of sums starts from, given the builder and where it will be stored.
+        finish: what is stored of a vector of sums.
+    """
 
     @intrinsic
     def add_product(
@@ -133,7 +139,7 @@ def _block_product(vectors: int) -> Callable[..., None]:
             sums = {}
             for cell in cells:
                 sums[cell] = cgutils.alloca_once(builder, vector)
-                builder.store(builder.load(places[cell], align=4), sums[cell])
+                builder.store(begin(builder, places[cell]), sums[cell])
             zeros = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
             with cgutils.for_range(builder, depth) as loop:
                 b_row = builder.add(b_at, builder.mul(b_step, loop.index))
@@ -152,7 +158,7 @@ def _block_product(vectors: int) -> Callable[..., None]:
                         total = builder.fadd(builder.load(sums[row, column]), product, flags=("contract",))
                         builder.store(total, sums[row, column])
             for cell in cells:
-                builder.store(builder.load(sums[cell]), places[cell], align=4)
+                builder.store(finish(builder, builder.load(sums[cell])), places[cell], align=4)
             return context.get_dummy_value()
 
         return types.none(a, a_at, a_row, a_step, b, b_at, b_step, depth, c, c_at, c_row), generate
@@ -160,8 +166,29 @@ def _block_product(vectors: int) -> Callable[..., None]:
     return add_product
 
 
-# add_product_N(a, a_at, a_row, a_step, b, b_at, b_step, depth, c, c_at, c_row), on flat float32 arrays, adds a block of
-# ROWS x N of a matrix product to c:
-#     c[c_at + r c_row + j] += sum_k a[a_at + r a_row + k a_step] * b[b_at + k b_step + j],  r < ROWS, j < N, k < depth
-add_product_16 = _block_product(1)
-add_product_32 = _block_product(2)
+def _stored(builder: Any, place: Any) -> Any:
+    return builder.load(place, align=4)
+
+
+def _zero(builder: Any, place: Any) -> Any:
+    return ir.Constant(ir.VectorType(ir.FloatType(), LANES), [0.0] * LANES)
+
+
+def _as_it_is(builder: Any, total: Any) -> Any:
+    return total
+
+
+def _rectified(builder: Any, total: Any) -> Any:
+    zero = _zero(builder, None)
+    return builder.select(builder.fcmp_ordered("<=", total, zero), zero, total)  # NaN stays NaN, to be found
+
+
+# X_N(a, a_at, a_row, a_step, b, b_at, b_step, depth, c, c_at, c_row), on flat float32 arrays, with a block of ROWS x N
+# of a matrix product
+#     p[r, j] = sum_k a[a_at + r a_row + k a_step] * b[b_at + k b_step + j],  r < ROWS, j < N, k < depth
+# does to c[c_at + r c_row + j]: add_product adds it, product stores it, rectified_product stores max(0, p).
+add_product_16 = _block_product(1, begin=_stored, finish=_as_it_is)
+add_product_32 = _block_product(2, begin=_stored, finish=_as_it_is)
+product_16 = _block_product(1, begin=_zero, finish=_as_it_is)
+product_32 = _block_product(2, begin=_zero, finish=_as_it_is)
+rectified_product_32 = _block_product(2, begin=_zero, finish=_rectified)
