@@ -6,7 +6,7 @@ calls some of them yaw, f_35mm, px_norm, py_norm. With s = max(width, height) of
 since f is in millimetres on a frame 36 mm long, but px and py are in lengths of that frame. k1 to k3 are OpenCV's, t1
 is OpenCV's p2 and t2 its p1. The camera's centre is (x, y, alt), and its rotation with OpenGL axes
     world_from_cam = Rz(-heading) Rx(pitch) Ry(roll)
-in degrees: with zeros it looks straight down with north (+y) at the top of the picture.
+in degrees: with zeros it looks straight down with north (+y) at the top of the picture, about which roll turns.
 Source: calibration.xml of RealityScan 2.2, the templates of its exports ("Internal/External camera parameters" with
 $(f*36), $(px); "OpenCV-compliant ..." with $(px*scale+width*0.5) and the order k1, k2, t2, t1, k3);
 nerfstudio process_data/realitycapture_utils.py for the rotation (it takes t1 for p1).
