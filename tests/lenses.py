@@ -23,7 +23,7 @@ def random_camera(model: str, rng: np.random.Generator, *, strength: float = 1.0
         values[name] = strength * rng.normal() * radial / (1 + index**2)
     for name in ("p0", "p1", "p2", "sx1", "sy1", "s0", "s1", "s2", "s3"):
         values[name] = strength * rng.normal() * 1e-3
-    values["omega"] = rng.uniform(0.02, 1.5)
+    values["omega"] = rng.choice([1e-4, 0.01, 0.04, rng.uniform(0.02, 1.5)])
     values["alpha"], values["beta"] = rng.uniform(0, 1), rng.uniform(0.5, 2)
     return Camera(model, WIDTH, HEIGHT, tuple(float(values[name]) for name in parameter_names(model)))
 

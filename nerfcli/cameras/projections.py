@@ -257,7 +257,7 @@ class Equirectangular:
         azimuth, elevation = 2 * np.pi * plane[0], np.pi * plane[1]
         level = np.cos(elevation)
         directions = np.stack([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)])
-        return directions, (np.abs(plane) <= 0.5).all(axis=0)
+        return directions, np.asarray((np.abs(plane) <= 0.5).all(axis=0))
 
     def jacobian(self, directions: np.ndarray) -> np.ndarray:
         x, y, z = directions
