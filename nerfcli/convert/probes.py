@@ -97,13 +97,19 @@ def _synthetic(capture: Capture, rng: np.random.Generator) -> tuple[np.ndarray, 
 
 def _seen(capture: Capture, frame_index: np.ndarray, point_index: np.ndarray, points: np.ndarray) -> Probes:
     """The pairs whose point appears inside the picture of its view."""
-    cam_from_world = rigid.inverse(poses_of(capture))
-    in_camera = np.einsum("mij,mj->mi", cam_from_world[frame_index, :3, :3], points)
-    in_camera += cam_from_world[frame_index, :3, 3]
+    tried = Probes(frame_index, point_index, points, np.zeros((len(points), 2)), np.zeros(len(points)))
+    pixels, kept, distances = projected(capture, tried)
+    sizes = np.array([(frame.camera.width, frame.camera.height) for frame in capture.frames])
+    kept &= np.all((pixels >= 0) & (pixels <= sizes[frame_index]), axis=1)
+    return Probes(frame_index[kept], point_index[kept], points[kept], pixels[kept], distances[kept])
+
+
+def projected(capture: Capture, probes: Probes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the views of a capture see points: pixels (M, 2), whether they do (M,) bool, distances (M,)."""
+    cam_from_world = rigid.inverse(poses_of(capture))[probes.frame_index]
+    in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], probes.points) + cam_from_world[:, :3, 3]
     cameras, camera_of_frame = distinct([frame.camera for frame in capture.frames])
-    pixels, kept = np.zeros((len(points), 2)), np.zeros(len(points), dtype=bool)
-    for camera, rows in zip(cameras, rows_of_each(camera_of_frame[frame_index], len(cameras)), strict=True):
-        pixels[rows], valid = camera.project(in_camera[rows])
-        kept[rows] = valid & np.all((pixels[rows] >= 0) & (pixels[rows] <= (camera.width, camera.height)), axis=1)
-    distances = np.linalg.norm(in_camera[kept], axis=1)
-    return Probes(frame_index[kept], point_index[kept], points[kept], pixels[kept], distances)
+    pixels, valid = np.zeros((len(in_camera), 2)), np.zeros(len(in_camera), dtype=bool)
+    for camera, rows in zip(cameras, rows_of_each(camera_of_frame[probes.frame_index], len(cameras)), strict=True):
+        pixels[rows], valid[rows] = camera.project(in_camera[rows])
+    return pixels, valid, np.linalg.norm(in_camera, axis=1)

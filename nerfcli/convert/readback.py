@@ -6,7 +6,7 @@ reads only what nerfcli writes, so it is short and checks nothing: whatever is w
 """
 
 import json
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,11 +41,17 @@ class ReadBack:
     points: np.ndarray | None
 
 
-# A file, the axes of its cameras as three letters, and where its pixel positions put the first pixel's centre.
-Reader = Callable[[Path, str, float], ReadBack]
+@dataclass(frozen=True)
+class Meant:
+    """What a file leaves open: the axes of its cameras as three letters, where its pixel positions put the first
+    pixel's centre, and the widths and heights of its views' pictures in the file's order."""
+
+    axes: str
+    pixel_centre: float
+    sizes: tuple[tuple[int, int], ...]
 
 
-def read_colmap(path: Path, axes: str, pixel_centre: float) -> ReadBack:
+def read_colmap(path: Path, meant: Meant) -> ReadBack:
     """A COLMAP model, by pycolmap."""
     model = pycolmap.Reconstruction(str(path))
     lenses = {
@@ -64,44 +70,46 @@ def read_colmap(path: Path, axes: str, pixel_centre: float) -> ReadBack:
     )
 
 
-def read_transforms(path: Path, axes: str, pixel_centre: float) -> ReadBack:
+def read_transforms(path: Path, meant: Meant) -> ReadBack:
     """transforms.json, by the json module."""
-    return _from_transforms([json.loads(path.read_text(encoding="utf-8"))], axes, pixel_centre)
+    return _from_transforms([json.loads(path.read_text(encoding="utf-8"))], meant)
 
 
-def read_blender(path: Path, axes: str, pixel_centre: float) -> ReadBack:
+def read_blender(path: Path, meant: Meant) -> ReadBack:
     """transforms_train.json, transforms_val.json and transforms_test.json of a folder: only the angle of view."""
     files = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
     contents = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
-    return _from_transforms(contents, axes, pixel_centre)
+    for content in contents:
+        content["frames"] = [{**record, "angle": content["camera_angle_x"]} for record in content["frames"]]
+    return _from_transforms(contents, meant)
 
 
-def read_llff(path: Path, axes: str, pixel_centre: float) -> ReadBack:
+def read_llff(path: Path, meant: Meant) -> ReadBack:
     """poses_bounds.npy, by NumPy: 17 numbers a view, of which the fifth column of 3 x 5 is height, width, focal."""
     rows = np.load(path)
     matrices = rows[:, :15].reshape(-1, 3, 5)
-    rotations, centres = _views_from_world_from_cam(matrices[:, :, :4], axes)
+    rotations, centres = _views_from_world_from_cam(matrices[:, :, :4], meant.axes)
     lenses = []
     for height, width, focal in matrices[:, :, 4]:
         lenses.append(Lens("SIMPLE_PINHOLE", int(width), int(height), (focal, width / 2, height / 2)))
     return ReadBack(None, rotations, centres, tuple(lenses), None)
 
 
-def read_tum(path: Path, axes: str, pixel_centre: float) -> ReadBack:
+def read_tum(path: Path, meant: Meant) -> ReadBack:
     """A TUM trajectory: time, position, quaternion with its real part last, by NumPy and SciPy."""
     rows = np.loadtxt(path, ndmin=2)
     matrices = np.concatenate([Rotation.from_quat(rows[:, 4:8]).as_matrix(), rows[:, 1:4, None]], axis=2)
-    rotations, centres = _views_from_world_from_cam(matrices, axes)
+    rotations, centres = _views_from_world_from_cam(matrices, meant.axes)
     return ReadBack(None, rotations, centres, None, None)
 
 
-def read_kitti(path: Path, axes: str, pixel_centre: float) -> ReadBack:
+def read_kitti(path: Path, meant: Meant) -> ReadBack:
     """A KITTI odometry file: 3 x 4 numbers a line, by NumPy."""
-    rotations, centres = _views_from_world_from_cam(np.loadtxt(path, ndmin=2).reshape(-1, 3, 4), axes)
+    rotations, centres = _views_from_world_from_cam(np.loadtxt(path, ndmin=2).reshape(-1, 3, 4), meant.axes)
     return ReadBack(None, rotations, centres, None, None)
 
 
-def read_opensfm(path: Path, axes: str, pixel_centre: float) -> ReadBack:
+def read_opensfm(path: Path, meant: Meant) -> ReadBack:
     """reconstruction.json, by the json module and SciPy: angle-axis and translation of cam_from_world."""
     (content,) = json.loads(path.read_text(encoding="utf-8"))
     shots = content["shots"]
@@ -115,6 +123,38 @@ def read_opensfm(path: Path, axes: str, pixel_centre: float) -> ReadBack:
         lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
         points=np.array([point["coordinates"] for point in content["points"].values()]).reshape(-1, 3),
     )
+
+
+def read_npz(path: Path, meant: Meant) -> ReadBack:
+    """The arrays of an .npz file, by NumPy."""
+    with np.load(path) as arrays:
+        rotations, centres = _views_from_world_from_cam(arrays["world_from_cam"], meant.axes)
+        lenses = []
+        for model, (width, height), params in zip(
+            arrays["camera_models"].tolist(), arrays["camera_sizes"].tolist(), arrays["camera_params"], strict=True
+        ):
+            camera = pycolmap.Camera(model=model, width=width, height=height, params=params[~np.isnan(params)])
+            shifted = np.array(camera.params)
+            shifted[list(camera.principal_point_idxs())] += 0.5 - meant.pixel_centre
+            lenses.append(Lens(model, width, height, tuple(shifted.tolist())))
+        return ReadBack(
+            labels=tuple(arrays["names"].tolist()),
+            cam_from_world=rotations,
+            centres=centres,
+            lenses=tuple(lenses[index] for index in arrays["camera_index"]),
+            points=arrays["points"],
+        )
+
+
+def read_ply_points(path: Path) -> np.ndarray:
+    """The vertices (N, 3) of a binary PLY file whose first three properties are doubles."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
+    sizes = {"double": 8, "float64": 8, "float": 4, "uchar": 1, "uint8": 1}
+    stride = sum(sizes[line.split()[1]] for line in lines if line.startswith("property"))
+    rows = np.frombuffer(body, dtype=np.uint8, count=count * stride).reshape(count, stride)
+    return np.ascontiguousarray(rows[:, :24]).view("<f8").reshape(count, 3)
 
 
 def _opensfm_lens(record: dict[str, Any]) -> Lens:
@@ -138,27 +178,32 @@ def _opensfm_lens(record: dict[str, Any]) -> Lens:
     return Lens("FULL_OPENCV", width, height, (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
 
 
-def _from_transforms(contents: list[dict[str, Any]], axes: str, pixel_centre: float) -> ReadBack:
+def _from_transforms(contents: list[dict[str, Any]], meant: Meant) -> ReadBack:
     records = [{**content, **record} for content in contents for record in content["frames"]]
-    rotations, centres = _views_from_world_from_cam([record["transform_matrix"] for record in records], axes)
+    rotations, centres = _views_from_world_from_cam([record["transform_matrix"] for record in records], meant.axes)
     return ReadBack(
         labels=tuple(record["file_path"] for record in records),
         cam_from_world=rotations,
         centres=centres,
-        lenses=tuple(_transforms_lens(record, 0.5 - pixel_centre) for record in records),
+        lenses=tuple(
+            _transforms_lens(record, 0.5 - meant.pixel_centre, size)
+            for record, size in zip(records, meant.sizes, strict=True)
+        ),
         points=None,
     )
 
 
-def _transforms_lens(record: dict[str, Any], shift: float) -> Lens:
+def _transforms_lens(record: dict[str, Any], shift: float, size: tuple[int, int]) -> Lens:
+    if "angle" in record:
+        width, height = size
+        return Lens("SIMPLE_PINHOLE", width, height, (width / 2 / math.tan(record["angle"] / 2), width / 2, height / 2))
     width, height = record["w"], record["h"]
     if record["camera_model"] == "EQUIRECTANGULAR":
         return Lens("EQUIRECTANGULAR", width, height, (width, height))
     head = (record["fl_x"], record["fl_y"], record["cx"] + shift, record["cy"] + shift)
     if "FISHEYE" in record["camera_model"]:
-        return Lens(
-            "OPENCV_FISHEYE", width, height, (*head, *(record.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")))
-        )
+        terms = (record.get(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
+        return Lens("OPENCV_FISHEYE", width, height, (*head, *terms))
     terms = (record.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
     return Lens("FULL_OPENCV", width, height, (*head, *terms))
 
@@ -178,3 +223,16 @@ def _pointing(poses: np.ndarray, axes: str, along: str, against: str) -> np.ndar
     if along in axes:
         return poses[:, :3, axes.index(along)]
     return -poses[:, :3, axes.index(against)]
+
+
+READERS = {
+    "colmap": read_colmap,
+    "colmap-text": read_colmap,
+    "transforms": read_transforms,
+    "blender": read_blender,
+    "llff": read_llff,
+    "opensfm": read_opensfm,
+    "tum": read_tum,
+    "kitti": read_kitti,
+    "npz": read_npz,
+}

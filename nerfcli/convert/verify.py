@@ -53,7 +53,9 @@ class Verification:
         return not self.fault and self.max_px <= self.tolerance_px
 
 
-def verify(capture: Capture, back: ReadBack, *, tolerance_px: float = TOLERANCE_PX) -> Verification:
+def verify(
+    capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px: float = TOLERANCE_PX
+) -> Verification:
     """Compare a capture with what was read back from the file that it was written to.
 
     Every 3D point that a view sees is projected by both, or a random choice of them where pairs of views and points are
@@ -63,6 +65,7 @@ def verify(capture: Capture, back: ReadBack, *, tolerance_px: float = TOLERANCE_
     Args:
         capture: what the file should hold: after accepted losses, what was left.
         back: what it does hold.
+        listed: (frames,) the indices of the capture's frames in the order in which the format lists them.
         tolerance_px: the largest residual that passes.
     """
     probes = probes_of(capture)
@@ -79,7 +82,7 @@ def verify(capture: Capture, back: ReadBack, *, tolerance_px: float = TOLERANCE_
         tolerance_px=max(tolerance_px, _rounding_px(capture, probes)),
     )
     try:
-        order = _order(capture, back)
+        order = _order(capture, back, listed)
         if back.points is not None and back.points.shape != points.shape:
             raise UnreadableError(f"it holds {len(back.points)} points instead of {len(points)}")
     except UnreadableError as error:
@@ -102,7 +105,26 @@ def verify(capture: Capture, back: ReadBack, *, tolerance_px: float = TOLERANCE_
     )
 
 
-def _order(capture: Capture, back: ReadBack) -> np.ndarray:
+def verify_points(capture: Capture, points: np.ndarray, *, tolerance_px: float = TOLERANCE_PX) -> Verification:
+    """Compare the points alone, for a format that holds nothing else: they must be the same to the last bit."""
+    same = points.shape == capture.points.shape
+    shift = float(np.abs(points - capture.points).max(initial=0.0) / _size(capture)) if same else np.inf
+    fault = "" if shift == 0 else f"its points are off by {shift:.3g} of the scene"
+    return Verification(0.0, 0.0, 0.0, shift, "", 0, len(capture.points), 0, tolerance_px, fault)
+
+
+def listed_order(capture: Capture, format_name: str) -> np.ndarray:
+    """The indices of the frames in the order in which a file of the format lists them, where names do not tell."""
+    places = range(len(capture.frames))
+    if format_name == "llff":
+        return np.array(sorted(places, key=lambda index: PurePosixPath(capture.frames[index].name).name))
+    if format_name == "blender":
+        splits = ("train", "val", "test")
+        return np.array(sorted(places, key=lambda index: splits.index(capture.frames[index].split or "train")))
+    return np.array(places)
+
+
+def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
     """For each frame of the capture, the view that was read back; (frames,).
 
     Raises:
@@ -111,16 +133,15 @@ def _order(capture: Capture, back: ReadBack) -> np.ndarray:
     if len(back.centres) != len(capture.frames):
         raise UnreadableError(f"it holds {len(back.centres)} views instead of {len(capture.frames)}")
     names = [frame.name for frame in capture.frames]
-    if back.labels is None:
-        return np.arange(len(names))
-    places = {label: index for index, label in enumerate(back.labels)}
+    places = {label: index for index, label in enumerate(back.labels or ())}
     if set(places) == set(names):
         return np.array([places[name] for name in names])
-    # A path relative to elsewhere, or a name without its suffix: in the order of the capture, then.
-    for name, label in zip(names, back.labels, strict=True):
-        if PurePosixPath(label).name not in (PurePosixPath(name).name, PurePosixPath(name).stem):
-            raise UnreadableError(f"where {name} should be, it lists {label}")
-    return np.arange(len(names))
+    if back.labels is not None:  # paths as seen from the file, or without a suffix
+        for frame_index, label in zip(listed, back.labels, strict=True):
+            name = PurePosixPath(names[frame_index])
+            if PurePosixPath(label).name not in (name.name, name.stem):
+                raise UnreadableError(f"where {name} should be, it lists {label}")
+    return np.argsort(listed)
 
 
 def _projected(capture: Capture, probes: Probes, back: ReadBack, order: np.ndarray) -> np.ndarray:

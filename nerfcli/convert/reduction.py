@@ -1,0 +1,81 @@
+"""What is left of a capture in a format that cannot hold all of it: the cameras, without the terms that are lost.
+
+A written file is compared with this when losses were accepted. It says in its own words what a writer keeps, so that a
+writer that loses something else is found out.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.frame import Capture
+
+# Models whose parameters behind the principal point are the first of OpenCV's; the others have different formulas.
+_BROWN = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+
+def reduced(capture: Capture, format_name: str) -> Capture:
+    """The capture with the cameras that a format can hold; the same capture where it can hold every camera."""
+    if format_name == "blender":
+        return _with_one_angle(_with_cameras(capture, _pinhole))
+    change = {"transforms": _to_transforms, "llff": _pinhole, "opensfm": _to_opensfm}.get(format_name)
+    return capture if change is None else _with_cameras(capture, change)
+
+
+def _with_cameras(capture: Capture, change: Callable[[Camera], Camera]) -> Capture:
+    changed = {camera: change(camera) for camera in {frame.camera for frame in capture.frames}}
+    return replace(capture, frames=tuple(replace(frame, camera=changed[frame.camera]) for frame in capture.frames))
+
+
+def _with_one_angle(capture: Capture) -> Capture:
+    """Every split's views with the angle that most of them have: its file holds one."""
+    angles: dict[str, Counter[float]] = {}
+    for frame in capture.frames:
+        angle = 2 * math.atan(frame.camera.width / 2 / frame.camera.params[0])
+        angles.setdefault(frame.split or "train", Counter())[angle] += 1
+    shared = {split: counts.most_common(1)[0][0] for split, counts in angles.items()}
+    frames = []
+    for frame in capture.frames:
+        width, height = frame.camera.width, frame.camera.height
+        focal_px = width / 2 / math.tan(shared[frame.split or "train"] / 2)
+        frames.append(replace(frame, camera=Camera.pinhole(width, height, focal_px)))
+    return replace(capture, frames=tuple(frames))
+
+
+def _pinhole(camera: Camera) -> Camera:
+    """The horizontal focal length alone; the principal point is the picture's middle."""
+    if camera.is_spherical:
+        return camera
+    return Camera.pinhole(camera.width, camera.height, camera.params[0])
+
+
+def _to_transforms(camera: Camera) -> Camera:
+    """OpenCV's k1, k2, p1, p2, k3, or its fisheye's k1 to k4."""
+    if camera.is_spherical:
+        return camera
+    value = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    head = (value.get("fx", value.get("f", 0.0)), value.get("fy", value.get("f", 0.0)), value["cx"], value["cy"])
+    if "FISHEYE" in camera.model:
+        if camera.model.startswith("RAD_TAN"):
+            terms = [value[key] for key in ("k0", "k1", "k2", "k3")]
+        else:
+            terms = [value.get("k", value.get("k1", 0.0)), *(value.get(key, 0.0) for key in ("k2", "k3", "k4"))]
+        return Camera("OPENCV_FISHEYE", camera.width, camera.height, (*head, *terms))
+    if camera.model not in _BROWN:
+        return Camera("PINHOLE", camera.width, camera.height, head)
+    k1 = value.get("k", value.get("k1", 0.0))
+    terms = (k1, *(value.get(key, 0.0) for key in ("k2", "p1", "p2", "k3")), 0.0, 0.0, 0.0)
+    return Camera("FULL_OPENCV", camera.width, camera.height, (*head, *terms))
+
+
+def _to_opensfm(camera: Camera) -> Camera:
+    """Brown's terms without the denominator's, or six radial ones of the fisheye."""
+    lost = {
+        "FULL_OPENCV": ("k4", "k5", "k6"),
+        "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3"),
+    }.get(camera.model, ())
+    values = zip(parameter_names(camera.model), camera.params, strict=True)
+    params = tuple(0.0 if name in lost else value for name, value in values)
+    return Camera(camera.model, camera.width, camera.height, params)
