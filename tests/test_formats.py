@@ -15,10 +15,10 @@ from nerfcli.cameras.conventions import (
     opencv_from_opengl_pose,
     opengl_from_opencv_pose,
 )
+from nerfcli.cameras.formats.blender import read_blender
 from nerfcli.cameras.formats.colmap import is_model, read_colmap, read_model
 from nerfcli.cameras.formats.llff import read_llff
-from nerfcli.cameras.formats.transforms import read_blender, read_camera_path, read_transforms, write_transforms
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.formats.transforms import read_camera_path, read_transforms
 from nerfcli.errors import BAD_INPUT, UserError
 
 # A camera at (1, 2, 3) that looks along -x with +z up. OpenGL axes: right +y, up +z, backward +x, as columns.
@@ -191,46 +191,6 @@ def test_blender_splits_are_kept_and_val_is_left_out(tmp_path):
     ]
     assert capture.missing == ("test/r_1",)
     assert capture.kind == "blender"
-
-
-WRITABLE = {
-    "PINHOLE": (50, 51, 33, 23),
-    "SIMPLE_RADIAL": (50, 33, 23, 0.1),
-    "RADIAL": (50, 33, 23, 0.1, -0.05),
-    "OPENCV": (50, 51, 33, 23, 0.1, -0.05, 0.001, 0.002),
-    "FULL_OPENCV": (50, 51, 33, 23, 0.1, -0.05, 0.001, 0.002, 0.01, 0, 0, 0),
-    "OPENCV_FISHEYE": (50, 51, 33, 23, 0.1, -0.05, 0.01, 0.02),
-    "SIMPLE_FISHEYE": (50, 33, 23),
-    "RADIAL_FISHEYE": (50, 33, 23, 0.1, -0.05),
-}
-
-
-@pytest.mark.parametrize("model", WRITABLE)
-def test_written_cameras_are_read_back(tmp_path, model):
-    rng = np.random.default_rng(0)
-    cameras = [Camera(model, 64, 48, WRITABLE[model]), Camera.pinhole(32, 32, 40.0)]
-    poses = [rigid.look_at(rng.normal(size=3), rng.normal(size=3), rng.normal(size=3)) for _ in range(4)]
-    for chosen in (cameras[:1] * 4, cameras * 2):  # shared intrinsics and intrinsics per frame
-        frames = [Frame(f"view_{i}", camera, pose) for i, (camera, pose) in enumerate(zip(chosen, poses, strict=True))]
-        write_transforms(tmp_path / "path.json", frames)
-        back = read_camera_path(tmp_path / "path.json")
-        assert [frame.name for frame in back] == [frame.name for frame in frames]
-        for frame, again in zip(frames, back, strict=True):
-            np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
-            directions, valid = frame.camera.pixel_bearings()
-            directions_again, valid_again = again.camera.pixel_bearings()
-            np.testing.assert_array_equal(valid_again, valid)
-            np.testing.assert_allclose(directions_again, directions, rtol=0, atol=1e-12)
-
-
-def test_a_model_without_words_in_transforms_is_refused(tmp_path):
-    for model, params in (
-        ("FOV", (50, 50, 32, 24, 0.5)),
-        ("FULL_OPENCV", (50, 51, 33, 23, 0.1, 0, 0, 0, 0, 0, 0, 0.1)),
-    ):
-        with pytest.raises(UserError, match=f"{model} cannot be written"):
-            write_transforms(tmp_path / "path.json", [Frame("a", Camera(model, 64, 48, params), np.eye(4))])
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_camera_path_needs_the_size_of_its_pictures(tmp_path):

@@ -35,3 +35,8 @@ def opengl_from_opencv_pose(world_from_cam: np.ndarray) -> np.ndarray:
 def opencv_from_llff_pose(world_from_llff_cam: np.ndarray) -> np.ndarray:
     """`world_from_cam` (..., 4, 4) with OpenCV axes, of a pose whose columns are down, right, backward, centre."""
     return world_from_llff_cam @ OPENCV_FROM_LLFF.T
+
+
+def llff_from_opencv_pose(world_from_cam: np.ndarray) -> np.ndarray:
+    """The pose (..., 4, 4) whose columns are down, right, backward, centre, of `world_from_cam` with OpenCV axes."""
+    return world_from_cam @ OPENCV_FROM_LLFF

@@ -1,21 +1,20 @@
 """COLMAP models: cameras, images and points3D, as .bin or .txt.
 
 Read here and not through pycolmap.Reconstruction: on a truncated points3D.bin or frames.bin pycolmap 4.2.1 does not
-fail but loops for ever and fills the memory. The three files hold all that is needed; the rigs.bin and frames.bin of
-newer models repeat it. Source: colmap.github.io/format.html; colmap src/colmap/scene/reconstruction_io_binary.cc.
+fail but loops for ever and fills the memory. The three files hold all that is needed. The rigs and frames of models of
+COLMAP 4 say which images were taken together by cameras on a rig; each image's own pose is in images.bin all the same,
+and pycolmap reads a model without those two files.
+Source: colmap.github.io/format.html; colmap src/colmap/scene/reconstruction_io_binary.cc.
 """
 
 import struct
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
-import pycolmap
-
-from nerfcli.cameras import rigid
-from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.formats import colmap_binary, colmap_text
+from nerfcli.cameras.formats.colmap_model import ColmapModel, capture_of
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, fit_to_picture
 from nerfcli.errors import UserError
@@ -23,27 +22,6 @@ from nerfcli.errors import UserError
 FILES = ("cameras", "images", "points3D")
 
 T = TypeVar("T")
-
-_POINT2D_BYTES = 24  # x, y as float64, and the id of its 3D point
-_TRACK_ELEMENT_BYTES = 8  # image id and index of the 2D point
-
-
-@dataclass(frozen=True)
-class ColmapImage:
-    """A registered image of a model: its name, the id of its camera, and `world_from_cam` (4, 4)."""
-
-    name: str
-    camera_id: int
-    world_from_cam: np.ndarray
-
-
-@dataclass(frozen=True)
-class ColmapModel:
-    """Cameras by id, images in the order of their names, and points (N, 3)."""
-
-    cameras: dict[int, Camera]
-    images: tuple[ColmapImage, ...]
-    points: np.ndarray
 
 
 def is_model(folder: Path) -> bool:
@@ -82,38 +60,63 @@ def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
     return Capture(tuple(frames), model.points, tuple(missing), None, "colmap")
 
 
-def read_model(model_dir: Path) -> ColmapModel:
-    """A COLMAP model as its files hold it, whatever pictures are on disk.
+def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
+    """All that a COLMAP model says: cameras, poses, points with colours, and every 2D feature.
+
+    Frames are in the order of their image ids, and those of one camera share its object. What no capture holds: the
+    ids themselves, the mean reprojection error of each point, and rigs.
+
+    Args:
+        model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt.
+        image_dir: the folder that the names of the images are relative to; nothing is looked up there.
 
     Raises:
         UserError: a file is missing, truncated or inconsistent; the file is named.
     """
-    if (model_dir / "cameras.bin").is_file():
-        suffix = ".bin"
-        cameras = _parse(model_dir / "cameras.bin", _read_cameras_binary)
-        images = _parse(model_dir / "images.bin", _read_images_binary)
-        points = _parse(model_dir / "points3D.bin", _read_points_binary)
+    model = read_model(model_dir)
+    try:
+        return capture_of(model, image_dir)
+    except ValueError as error:
+        raise UserError(
+            f"{_file(model_dir, 'images')} and {_file(model_dir, 'points3D').name} do not belong together: {error}",
+            "the files of the model are from different reconstructions; copy all of them again",
+        ) from error
+
+
+def read_model(model_dir: Path) -> ColmapModel:
+    """A COLMAP model as its files hold it, whatever pictures are on disk; images in the order of their names.
+
+    Raises:
+        UserError: a file is missing, truncated or inconsistent; the file is named.
+    """
+    cameras_file, images_file, points_file = (_file(model_dir, name) for name in FILES)
+    if cameras_file.suffix == ".bin":
+        cameras = _parse(cameras_file, colmap_binary.cameras_from_bytes)
+        images = _parse(images_file, colmap_binary.images_from_bytes)
+        point_ids, points, colours = _parse(points_file, colmap_binary.points_from_bytes)
     else:
-        suffix = ".txt"
-        cameras = _parse(model_dir / "cameras.txt", _read_cameras_text)
-        images = _parse(model_dir / "images.txt", _read_images_text)
-        points = _parse(model_dir / "points3D.txt", _read_points_text)
+        cameras = _parse(cameras_file, colmap_text.cameras_from_text)
+        images = _parse(images_file, colmap_text.images_from_text)
+        point_ids, points, colours = _parse(points_file, colmap_text.points_from_text)
     if not images:
         raise UserError(f"{model_dir} has no registered image", "the reconstruction is empty; make it again")
     for image in images:
         if image.camera_id not in cameras:
-            images_file = model_dir / f"images{suffix}"
             raise UserError(
                 f"{images_file}: image {image.name} has camera {image.camera_id}, which is not there",
                 "the files of the model are from different reconstructions; copy all of them again",
             )
-    names = [image.name for image in images]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
+    twice, count = Counter(image.name for image in images).most_common(1)[0]
+    if count > 1:
         raise UserError(
             f"{model_dir}: image {twice} is registered twice", "an image has one pose; make the model again"
         )
-    return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points)
+    return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points, point_ids, colours)
+
+
+def _file(model_dir: Path, name: str) -> Path:
+    """The file of a model, binary if its cameras are binary."""
+    return model_dir / f"{name}{'.bin' if (model_dir / 'cameras.bin').is_file() else '.txt'}"
 
 
 def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
@@ -132,90 +135,3 @@ def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
         ) from error
     except UserError as error:
         raise UserError(f"{path}: {error.message}", error.hint) from error
-
-
-def _read_cameras_binary(data: bytes) -> dict[int, Camera]:
-    cameras, offset = {}, 8
-    for _ in range(_count(data, 24)):
-        camera_id, model_id, width, height = struct.unpack_from("<IiQQ", data, offset)
-        model = pycolmap.CameraModelId(model_id).name
-        num_params = len(parameter_names(model))
-        cameras[camera_id] = Camera(model, width, height, struct.unpack_from(f"<{num_params}d", data, offset + 24))
-        offset += 24 + 8 * num_params
-    return cameras
-
-
-def _read_images_binary(data: bytes) -> list[ColmapImage]:
-    images, offset = [], 8
-    for _ in range(_count(data, 73)):
-        _, *pose, camera_id = struct.unpack_from("<I7dI", data, offset)
-        end = data.index(b"\0", offset + 64)
-        images.append(_image(data[offset + 64 : end].decode("utf-8"), camera_id, pose))
-        (num_points,) = struct.unpack_from("<Q", data, end + 1)
-        offset = end + 9 + _POINT2D_BYTES * num_points
-        if offset > len(data):
-            raise ValueError(f"it ends within image {images[-1].name}")
-    return images
-
-
-def _read_points_binary(data: bytes) -> np.ndarray:
-    count, offset = _count(data, 51), 8
-    points = np.empty((count, 3))
-    for index in range(count):
-        points[index] = struct.unpack_from("<3d", data, offset + 8)
-        (track_length,) = struct.unpack_from("<Q", data, offset + 43)
-        offset += 51 + _TRACK_ELEMENT_BYTES * track_length
-        if offset > len(data):
-            raise ValueError(f"it ends within point {index} of {count}")
-    return _finite_points(points)
-
-
-def _count(data: bytes, least_bytes: int) -> int:
-    """The number of records that a file announces, if it is long enough to hold them."""
-    (count,) = struct.unpack_from("<Q", data, 0)
-    if count * least_bytes > len(data) - 8:
-        raise ValueError(f"it announces {count} records, but has {len(data)} bytes")
-    return count
-
-
-def _read_cameras_text(data: bytes) -> dict[int, Camera]:
-    cameras = {}
-    for line in _lines(data):
-        camera_id, model, width, height, *params = line.split()
-        cameras[int(camera_id)] = Camera(model, int(width), int(height), tuple(float(value) for value in params))
-    return cameras
-
-
-def _read_images_text(data: bytes) -> list[ColmapImage]:
-    # Every other line lists 2D points and may be empty, so empty lines count from the first image on.
-    lines = data.decode("utf-8").splitlines()
-    start = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
-    images = []
-    for line in lines[start::2]:
-        if line.strip():
-            _, *pose, camera_id, name = line.strip().split(maxsplit=9)
-            images.append(_image(name, int(camera_id), [float(value) for value in pose]))
-    return images
-
-
-def _read_points_text(data: bytes) -> np.ndarray:
-    points = [[float(value) for value in line.split(maxsplit=4)[1:4]] for line in _lines(data)]
-    return _finite_points(np.array(points, dtype=np.float64).reshape(len(points), 3))
-
-
-def _lines(data: bytes) -> list[str]:
-    return [line for line in data.decode("utf-8").splitlines() if line.strip() and not line.startswith("#")]
-
-
-def _image(name: str, camera_id: int, pose: list[float]) -> ColmapImage:
-    """An image from its quaternion wxyz and translation of cam_from_world."""
-    if len(pose) != 7 or not np.isfinite(pose).all():
-        raise ValueError(f"the pose of image {name} is not 7 finite numbers")
-    cam_from_world = rigid.from_parts(rigid.rotation_from_quaternion(np.array(pose[:4])), np.array(pose[4:]))
-    return ColmapImage(name, camera_id, rigid.inverse(cam_from_world))
-
-
-def _finite_points(points: np.ndarray) -> np.ndarray:
-    if not np.isfinite(points).all():
-        raise ValueError("a point's coordinates are not finite")
-    return points

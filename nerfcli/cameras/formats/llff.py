@@ -2,22 +2,32 @@
 
 Each row of the array holds a 3x5 matrix, row by row (the pose with axes down, right, backward; the centre; height,
 width, focal length of the full-size photo), and the depths of the nearest and farthest point. Rows are in the order of
-the sorted file names. Source: Fyusion/LLFF README, "Using your own poses without running COLMAP".
+the sorted file names. Source: Fyusion/LLFF README, "Using your own poses without running COLMAP";
+llff/poses/pose_utils.py, save_poses.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 
-from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.conventions import opencv_from_llff_pose
-from nerfcli.cameras.formats.transforms import rigid_pose
+from nerfcli.atomic import atomic_path
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
+from nerfcli.cameras.formats.limits import plausible, stated_camera
+from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts, lost_to_pinhole
+from nerfcli.cameras.formats.npy import array_from_npy
+from nerfcli.cameras.formats.poses import rigid_poses
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, fit_to_picture
 from nerfcli.errors import UserError
 
+FILE = "poses_bounds.npy"
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8")
+
+# Between which percentiles of the depths of its points a view's scene lies. Source: pose_utils.py, save_poses.
+_NEAR_PERCENT, _FAR_PERCENT = 0.1, 99.9
 
 
 def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list[Path]]) -> Capture:
@@ -31,39 +41,108 @@ def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list
     Raises:
         UserError: the array is damaged or of another shape, or no image folder has as many images as it has rows.
     """
-    path = folder / "poses_bounds.npy"
+    path = folder / FILE
     rows = _read_rows(path)
     images = _images_of_rows(folder, len(rows), list_images)
     frames = []
-    for index, (row, image) in enumerate(zip(rows, images, strict=True)):
-        where = f"{path}: row {index}"
-        matrix = row[:15].reshape(3, 5)
-        camera = _camera(matrix[:, 4], where)
-        world_from_cam = opencv_from_llff_pose(rigid_pose(matrix[:, :4], where))
+    for image, (camera, world_from_cam) in zip(images, _views(path, rows), strict=True):
         camera, world_from_cam = fit_to_picture(camera, world_from_cam, path=image, measure=measure)
-        frames.append(Frame(f"{image.parent.name}/{image.name}", camera, world_from_cam, image=image))
-        near, far = row[15:]
-        if not 0 < near < far < np.inf:
-            raise UserError(
-                f"{where}: depth bounds {near:g} and {far:g}", "expected 0 < near < far in the last two columns"
-            )
+        frames.append(Frame(_name(image), camera, world_from_cam, image=image))
     return Capture(tuple(frames), np.zeros((0, 3)), (), rows[:, 15:].copy(), "llff")
+
+
+def parse_llff(folder: Path, list_images: Callable[[Path], list[Path]]) -> Capture:
+    """All that poses_bounds.npy says; cameras are for the full-size photos.
+
+    The file names no photos. They are those of the first image folder that holds one per row; where there is no image
+    folder at all, frames are named image000, image001, ... and have no image.
+
+    Args:
+        folder: holds poses_bounds.npy.
+        list_images: the image files of a folder, sorted by name.
+
+    Raises:
+        UserError: the array is damaged or of another shape, or image folders hold other numbers of images.
+    """
+    path = folder / FILE
+    rows = _read_rows(path)
+    images: list[Path] | list[None] = [None] * len(rows)
+    if any((folder / name).is_dir() for name in IMAGE_FOLDERS):
+        images = _images_of_rows(folder, len(rows), list_images)
+    frames = [
+        Frame(f"image{index:03d}" if image is None else _name(image), camera, world_from_cam, image=image)
+        for index, (image, (camera, world_from_cam)) in enumerate(zip(images, _views(path, rows), strict=True))
+    ]
+    return Capture(tuple(frames), np.zeros((0, 3)), (), rows[:, 15:].copy(), "llff")
+
+
+def losses_llff(capture: Capture) -> tuple[str, ...]:
+    """What of a capture poses_bounds.npy cannot hold.
+
+    The order of the photos' file names stands for their names, so these are lost only where that order does not tell
+    them apart: where photos are in more than one folder.
+    """
+    folders = {Path(frame.name).parent for frame in capture.frames}
+    names = [f"the photos' {len(folders)} folders"] if len(folders) > 1 else []
+    parts = lost_parts(capture, holds=("depth bounds",))
+    return (*lost_of_cameras(capture, lost_to_pinhole), *names, *parts)
+
+
+def write_llff(capture: Capture, folder: Path) -> None:
+    """Write a capture as poses_bounds.npy into a folder, atomically; rows are in the order of the photos' names.
+
+    Depth bounds are the capture's own. Where it has none, they are the 0.1th and 99.9th percentile of the depths of the
+    points that a view observes, or if there are no observations, of those that lie within its picture. A view without
+    two such depths gets the widest bounds of the other ones. Of two focal lengths the horizontal one is written.
+
+    Raises:
+        UserError: neither depth bounds nor points, a spherical camera, or a place that cannot be written.
+    """
+    spherical = [frame.name for frame in capture.frames if frame.camera.is_spherical]
+    if spherical:
+        raise UserError(f"the spherical picture {spherical[0]} has no focal length", "write transforms.json instead")
+    bounds = _percentile_bounds(capture) if capture.depth_bounds is None else capture.depth_bounds
+    poses = llff_from_opencv_pose(np.array([frame.world_from_cam for frame in capture.frames]))
+    sizes = [(frame.camera.height, frame.camera.width, _focal_x(frame.camera)) for frame in capture.frames]
+    matrices = np.concatenate([poses[:, :3], np.array(sizes, dtype=np.float64)[:, :, None]], axis=2)  # (F, 3, 5)
+    rows = np.concatenate([matrices.reshape(-1, 15), bounds], axis=1)
+    order = sorted(range(len(rows)), key=lambda index: Path(capture.frames[index].name).name)
+    with atomic_path(folder / FILE) as partial:
+        np.save(partial, rows[order], allow_pickle=False)
 
 
 def _read_rows(path: Path) -> np.ndarray:
     try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        rows = array_from_npy(path.read_bytes())
+    except (OSError, ValueError) as error:
         raise UserError(
-            f"{path}: no readable NumPy array ({error})",
+            f"{path}: no readable NumPy array ({str(error)[:200]})",
             "the file is cut off or something else; copy it again from the source",
         ) from error
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
-        shape = rows.shape if isinstance(rows, np.ndarray) else type(rows).__name__
+    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0 or rows.dtype.kind not in "fiu":
         raise UserError(
-            f"{path}: an array of {shape}", "expected (images, 17): 3x5 pose and intrinsics, near and far depth"
+            f"{path}: an array of {rows.shape}", "expected (images, 17): 3x5 pose and intrinsics, near and far depth"
         )
     return rows.astype(np.float64)
+
+
+def _views(path: Path, rows: np.ndarray) -> list[tuple[Camera, np.ndarray]]:
+    """Camera and `world_from_cam` of each row; rows of equal intrinsics share one camera."""
+    matrices = rows[:, :15].reshape(-1, 3, 5)
+    poses = opencv_from_llff_pose(rigid_poses(matrices[:, :, :4], lambda index: f"{path}: row {index}"))
+    bad = ~((rows[:, 15] > 0) & (rows[:, 15] < rows[:, 16]) & plausible(rows[:, 15:]))
+    if bad.any():
+        index = int(np.argmax(bad))
+        near, far = rows[index, 15:]
+        raise UserError(
+            f"{path}: row {index}: depth bounds {near:g} and {far:g}",
+            "expected 0 < near < far in the last two columns",
+        )
+    cameras: dict[tuple[float, ...], Camera] = {}
+    for index, size_and_focal in enumerate(map(tuple, matrices[:, :, 4].tolist())):
+        if size_and_focal not in cameras:
+            cameras[size_and_focal] = _camera(size_and_focal, f"{path}: row {index}")
+    return [(cameras[tuple(row)], pose) for row, pose in zip(matrices[:, :, 4].tolist(), poses, strict=True)]
 
 
 def _images_of_rows(folder: Path, count: int, list_images: Callable[[Path], list[Path]]) -> list[Path]:
@@ -76,16 +155,63 @@ def _images_of_rows(folder: Path, count: int, list_images: Callable[[Path], list
             return images
         found.append(f"{name}/ has {len(images)}")
     raise UserError(
-        f"{folder / 'poses_bounds.npy'} has {count} rows, but {', '.join(found) or 'there is no folder images/'}",
+        f"{folder / FILE} has {count} rows, but {', '.join(found) or 'there is no folder images/'}",
         "the photos must be exactly the ones that the poses were made from, one per row, sorted by name",
     )
 
 
-def _camera(size_and_focal: np.ndarray, where: str) -> Camera:
+def _name(image: Path) -> str:
+    return f"{image.parent.name}/{image.name}"
+
+
+def _camera(size_and_focal: Iterable[float], where: str) -> Camera:
     height, width, focal = size_and_focal
-    if not np.isfinite(size_and_focal).all() or min(height, width, focal) <= 0:
+    if not min(height, width) >= 1 or not focal > 0 or not max(height, width, focal) < np.inf:  # True at NaN
         raise UserError(
             f"{where}: height, width and focal length are {height:g}, {width:g}, {focal:g}",
             "expected three numbers above 0 in the fifth column of the pose",
         )
-    return Camera.pinhole(round(width), round(height), float(focal))
+    params = (focal, focal, round(width) / 2, round(height) / 2)
+    return stated_camera("PINHOLE", round(width), round(height), params, where=where)
+
+
+def _focal_x(camera: Camera) -> float:
+    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    return values["fx"] if "fx" in values else values["f"]
+
+
+def _percentile_bounds(capture: Capture) -> np.ndarray:
+    """Nearest and farthest depth of each view (frames, 2), from the points."""
+    bounds = np.full((len(capture.frames), 2), np.nan)
+    seen = _points_seen(capture)
+    for index, frame in enumerate(capture.frames):
+        depths = rigid.apply(rigid.inverse(frame.world_from_cam), capture.points[seen[index]])[:, 2]
+        depths = depths[depths > 0]
+        if len(depths):
+            bounds[index] = np.percentile(depths, [_NEAR_PERCENT, _FAR_PERCENT])
+    known = bounds[:, 0] < bounds[:, 1]  # False at NaN
+    if not known.any():
+        raise UserError(
+            f"poses_bounds.npy needs depths, but no view of the {len(capture.frames)} sees two of the "
+            f"{len(capture.points)} points",
+            "convert from a format that has points or depth bounds, such as a COLMAP model",
+        )
+    bounds[~known] = bounds[known, 0].min(), bounds[known, 1].max()
+    return bounds
+
+
+def _points_seen(capture: Capture) -> list[np.ndarray]:
+    """Which points each view sees: indices of those that it observes, or that lie within its picture."""
+    seen = capture.observations
+    if seen is not None and (seen.point_index >= 0).any():
+        with_point = seen.point_index >= 0
+        frame_index, point_index = seen.frame_index[with_point], seen.point_index[with_point]
+        order = np.argsort(frame_index, kind="stable")
+        starts = np.searchsorted(frame_index[order], np.arange(1, len(capture.frames)))
+        return np.split(point_index[order], starts)
+    inside = []
+    for frame in capture.frames:
+        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points))
+        within = (pixels >= 0).all(axis=1) & (pixels <= (frame.camera.width, frame.camera.height)).all(axis=1)
+        inside.append(np.flatnonzero(valid & within))
+    return inside

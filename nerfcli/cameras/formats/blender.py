@@ -1,0 +1,153 @@
+"""Blender captures of NeRF's synthetic scenes: transforms_train.json, transforms_val.json and transforms_test.json.
+
+Each file holds one horizontal field of view (camera_angle_x, radians) and the poses of its views; pixels are square,
+the principal point is the middle, and the picture's size is the one of the PNG file, whose suffix file_path leaves out.
+Source: bmild/nerf load_blender.py.
+"""
+
+import math
+from collections import Counter
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from nerfcli.atomic import write_json
+from nerfcli.cameras.camera import parameter_names
+from nerfcli.cameras.conventions import opengl_from_opencv_pose
+from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts, lost_to_pinhole
+from nerfcli.cameras.formats.transforms import (
+    SPLITS,
+    capture_on_disk,
+    frames_on_disk,
+    listed_frames,
+    read_json_object,
+    refuse_twins,
+    relative_path,
+)
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.orientation import Measure
+from nerfcli.errors import UserError
+
+
+def read_blender(folder: Path, measure: Measure) -> Capture:
+    """A Blender capture's views that are on disk, of train and test; val frames are left out.
+
+    Raises:
+        UserError: a file is malformed or lists no image that is on disk.
+    """
+    frames: list[Frame] = []
+    missing: list[str] = []
+    for split in ("train", "test"):
+        path = _file(folder, split)
+        if split == "test" and not path.exists():
+            continue
+        found, absent = frames_on_disk(path, read_json_object(path), measure)
+        frames += [replace(frame, split=split) for frame in found]
+        missing += absent
+    return capture_on_disk(_file(folder, "train"), frames, missing, kind="blender")
+
+
+def parse_blender(folder: Path, measure: Measure) -> Capture:
+    """All that the files of a Blender capture say: the views of all three splits that there are.
+
+    Args:
+        folder: holds at least one of the three files.
+        measure: tells an image's upright size and EXIF orientation: the files do not. An image that is not on disk has
+            the size of the other ones in its file.
+
+    Raises:
+        UserError: a file is malformed or lists no image that is on disk, or there is no file.
+    """
+    frames: list[Frame] = []
+    for split in SPLITS:
+        path = _file(folder, split)
+        if path.exists():
+            listed = listed_frames(path, read_json_object(path), measure, suffix=".png")
+            frames += [replace(frame, split=split) for frame in listed]
+    if not frames:
+        raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")
+    refuse_twins(folder, frames)
+    return Capture(tuple(frames), np.zeros((0, 3)), (), None, "blender")
+
+
+def losses_blender(capture: Capture) -> tuple[str, ...]:
+    """What of a capture the files of Blender cannot hold.
+
+    They hold pictures' sizes only through the pictures, so that those of frames without an image are lost; frames
+    without a split go to train.
+    """
+    sizes = sum(frame.image is None for frame in capture.frames)
+    lost = lost_of_cameras(capture, lost_to_pinhole)
+    off = sum(
+        camera_angle != shared
+        for split, frames in _by_split(capture).items()
+        for shared in [_shared_angle(frames)]
+        for camera_angle in map(_angle, frames)
+    )
+    lost += [f"the field of view of {off} frames (one per file)"] if off else []
+    lost += [f"the picture's size of {sizes} frames"] if sizes else []
+    return (*lost, *lost_parts(capture, holds=("splits",)))
+
+
+def write_blender(capture: Capture, folder: Path) -> None:
+    """Write a capture as transforms_{train,val,test}.json, for the splits that it has; all or none.
+
+    Frames without a split are written to train. The angle of a file is the one that most of its frames have.
+
+    Raises:
+        UserError: a spherical camera, the file of another split from before, or a place that cannot be written.
+    """
+    spherical = [frame.name for frame in capture.frames if frame.camera.is_spherical]
+    if spherical:
+        raise UserError(f"the spherical picture {spherical[0]} has no field of view", "write transforms.json instead")
+    by_split = _by_split(capture)
+    stale = [_file(folder, split) for split in SPLITS if split not in by_split and _file(folder, split).exists()]
+    if stale:
+        raise UserError(f"{stale[0]} is there already, of another capture", "remove it or choose another folder")
+    with ExitStack() as undo:
+        for split, frames in by_split.items():
+            path = _file(folder, split)
+            records = [
+                {
+                    "file_path": _file_path(frame, folder),
+                    "transform_matrix": opengl_from_opencv_pose(frame.world_from_cam).tolist(),
+                }
+                for frame in frames
+            ]
+            if not path.exists():
+                undo.callback(path.unlink, missing_ok=True)
+            write_json(path, {"camera_angle_x": _shared_angle(frames), "frames": records})
+        undo.pop_all()
+
+
+def _file(folder: Path, split: str) -> Path:
+    return folder / f"transforms_{split}.json"
+
+
+def _by_split(capture: Capture) -> dict[str, list[Frame]]:
+    by_split: dict[str, list[Frame]] = {}
+    for split in SPLITS:
+        frames = [frame for frame in capture.frames if (frame.split or "train") == split]
+        if frames:
+            by_split[split] = frames
+    return by_split
+
+
+def _file_path(frame: Frame, folder: Path) -> str:
+    """The image's path as NeRF's own loader wants it: without .png, which it appends."""
+    path = PurePosixPath(relative_path(frame, folder))
+    text = str(path.with_suffix("")) if path.suffix == ".png" else str(path)
+    return text if text.startswith(("/", "../")) else f"./{text}"
+
+
+def _angle(frame: Frame) -> float:
+    """The horizontal angle between the edges of a picture whose principal point is its middle, radians."""
+    camera = frame.camera
+    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    return 2 * math.atan(camera.width / 2 / values.get("fx", values.get("f", math.inf)))
+
+
+def _shared_angle(frames: list[Frame]) -> float:
+    return Counter(map(_angle, frames)).most_common(1)[0][0]

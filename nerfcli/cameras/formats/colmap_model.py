@@ -1,0 +1,207 @@
+"""A COLMAP model in memory, as its files hold it, and the way between it and a capture."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.limits import plausible
+from nerfcli.cameras.frame import Capture, Frame, Observations
+
+# The id of a feature's point where it has none: the largest number of 64 bits in the file, which is -1 with a sign.
+NO_POINT = -1
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """A registered image of a model.
+
+    Args:
+        image_id: unique in the model.
+        name: with forward slashes, relative to the folder of the photos.
+        camera_id: of its camera.
+        world_from_cam: (4, 4).
+        pixels: (F, 2) positions of its features, float64.
+        point_ids: (F,) int64 ids of their points, -1 where a feature has none.
+    """
+
+    image_id: int
+    name: str
+    camera_id: int
+    world_from_cam: np.ndarray
+    pixels: np.ndarray
+    point_ids: np.ndarray
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """Cameras by id, images, and points.
+
+    Args:
+        cameras: by id.
+        images: in any order.
+        points: (N, 3) float64.
+        point_ids: (N,) int64.
+        colours: (N, 3) uint8.
+    """
+
+    cameras: dict[int, Camera]
+    images: tuple[ColmapImage, ...]
+    points: np.ndarray
+    point_ids: np.ndarray
+    colours: np.ndarray
+
+
+def images_of_parts(
+    image_ids: list[int],
+    names: list[str],
+    camera_ids: list[int],
+    *,
+    cam_from_world: np.ndarray,
+    features: list[tuple[np.ndarray, np.ndarray]],
+) -> list[ColmapImage]:
+    """The images of a file, from lists with one item per image.
+
+    Args:
+        image_ids, names, camera_ids: of the images.
+        cam_from_world: (images, 7) quaternions wxyz and translations.
+        features: pixels (F, 2) and ids of their points (F,), per image.
+
+    Raises:
+        ValueError: a number makes no sense; its image is named.
+    """
+    if len(set(image_ids)) < len(image_ids):
+        raise ValueError("two images have the same id")
+    cam_from_world = cam_from_world.reshape(-1, 7)
+    wrong = ~plausible(cam_from_world)
+    if wrong.any():
+        values = ", ".join(f"{value:g}" for value in cam_from_world[np.argmax(wrong)])
+        raise ValueError(f"the pose of image {names[np.argmax(wrong)]} is not 7 finite numbers of a scene: {values}")
+    zero = ~cam_from_world[:, :4].any(axis=1)
+    if zero.any():
+        raise ValueError(f"a quaternion of length 0 in the pose of image {names[np.argmax(zero)]}")
+    rotations = rigid.rotation_from_quaternion(cam_from_world[:, :4])
+    poses = rigid.inverse(rigid.from_parts(rotations, cam_from_world[:, 4:]))
+    images = []
+    for image_id, name, camera_id, pose, (pixels, point_ids) in zip(
+        image_ids, names, camera_ids, poses, features, strict=True
+    ):
+        if not name or not plausible(pixels.reshape(1, -1)).all():
+            raise ValueError(f"image {image_id} ({name!r}) has no name, or a feature that is nowhere")
+        images.append(ColmapImage(image_id, name, camera_id, pose, pixels, point_ids))
+    return images
+
+
+def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
+    """All that a model says, its frames in the order of the image ids.
+
+    Cameras stay shared: frames of one camera id hold the same object. Where the model has no points at all (some people
+    empty that file), features have no point. COLMAP leaves points black until it has looked up their colours, so where
+    all are black there are no colours.
+
+    Args:
+        model: to be described.
+        image_dir: the folder of the photos, if it is known.
+
+    Raises:
+        ValueError: a feature has a point that is not in the model, or two points have the same id.
+    """
+    images = sorted(model.images, key=lambda image: image.image_id)
+    frames = tuple(
+        Frame(
+            image.name,
+            model.cameras[image.camera_id],
+            image.world_from_cam,
+            image=None if image_dir is None else image_dir / image.name,
+        )
+        for image in images
+    )
+    counts = [len(image.pixels) for image in images]
+    observations = None
+    if sum(counts):
+        point_ids = np.concatenate([image.point_ids for image in images])
+        observations = Observations(
+            frame_index=np.repeat(np.arange(len(images)), counts),
+            point_index=_point_index(point_ids, model.point_ids),
+            pixels=np.concatenate([image.pixels for image in images]),
+        )
+    colours = model.colours if model.colours.any() else None
+    return Capture(frames, model.points, (), None, "colmap", colours=colours, observations=observations)
+
+
+def model_of(capture: Capture) -> ColmapModel:
+    """The model that holds a capture: ids count from 1, and equal cameras have one id."""
+    camera_ids: dict[Camera, int] = {}
+    for frame in capture.frames:
+        camera_ids.setdefault(frame.camera, len(camera_ids) + 1)
+    num_frames, num_points = len(capture.frames), len(capture.points)
+    seen = capture.observations
+    if seen is None:
+        seen = Observations(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
+    order = np.argsort(seen.frame_index, kind="stable")
+    bounds = np.searchsorted(seen.frame_index[order], np.arange(num_frames + 1))
+    pixels = np.asarray(seen.pixels, dtype=np.float64)[order]
+    point_ids = np.where(seen.point_index >= 0, seen.point_index + 1, NO_POINT).astype(np.int64)[order]
+    images = tuple(
+        ColmapImage(
+            index + 1,
+            frame.name,
+            camera_ids[frame.camera],
+            frame.world_from_cam,
+            pixels[bounds[index] : bounds[index + 1]],
+            point_ids[bounds[index] : bounds[index + 1]],
+        )
+        for index, frame in enumerate(capture.frames)
+    )
+    colours = np.zeros((num_points, 3), np.uint8) if capture.colours is None else capture.colours
+    return ColmapModel(
+        {camera_id: camera for camera, camera_id in camera_ids.items()},
+        images,
+        np.asarray(capture.points, dtype=np.float64),
+        np.arange(1, num_points + 1, dtype=np.int64),
+        np.asarray(colours, dtype=np.uint8),
+    )
+
+
+def pose_rows(model: ColmapModel) -> np.ndarray:
+    """`cam_from_world` of the images as COLMAP writes it: (images, 7) quaternions wxyz and translations."""
+    poses = np.array([image.world_from_cam for image in model.images]).reshape(-1, 4, 4)
+    cam_from_world = rigid.inverse(poses)
+    quaternions = rigid.quaternion_from_rotation(cam_from_world[:, :3, :3])
+    return np.concatenate([quaternions, cam_from_world[:, :3, 3]], axis=1)
+
+
+def tracks(model: ColmapModel) -> tuple[np.ndarray, np.ndarray]:
+    """Where the points of a model were seen.
+
+    Returns:
+        elements (M, 2) uint32: image id and index of the feature in that image, point after point; lengths (N,) int64:
+        how many of them belong to each point.
+    """
+    counts = [len(image.point_ids) for image in model.images]
+    image_ids = np.repeat([image.image_id for image in model.images], counts)
+    starts = np.cumsum([0, *counts])[:-1] if counts else np.zeros(0, np.int64)
+    feature_index = np.arange(sum(counts)) - np.repeat(starts, counts)
+    point_ids = np.concatenate([np.zeros(0, np.int64), *(image.point_ids for image in model.images)])
+    point_index = _point_index(point_ids, model.point_ids)
+    order = np.argsort(point_index, kind="stable")
+    order = order[np.searchsorted(point_index[order], 0) :]  # features without a point have -1 and come first
+    elements = np.stack([image_ids[order], feature_index[order]], axis=-1).astype(np.uint32)
+    return elements, np.bincount(point_index[order], minlength=len(model.point_ids))
+
+
+def _point_index(ids: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Where the ids (M,) stand in `known` (N,); -1 for `NO_POINT`, and everywhere if nothing is known."""
+    if not len(known):
+        return np.full(len(ids), -1, dtype=np.int64)
+    order = np.argsort(known, kind="stable")
+    ordered = known[order]
+    if (ordered[1:] == ordered[:-1]).any():
+        raise ValueError(f"two points have the id {ordered[1:][ordered[1:] == ordered[:-1]][0]}")
+    place = np.minimum(np.searchsorted(ordered, ids), len(ordered) - 1)
+    found = ordered[place] == ids
+    if not (found | (ids == NO_POINT)).all():
+        raise ValueError(f"a feature has the point {ids[~found & (ids != NO_POINT)][0]}, which is not there")
+    return np.where(found, order[place], -1).astype(np.int64)

@@ -1,0 +1,46 @@
+"""The numbers that captures hold: what lies beyond is damage, however well the file parses."""
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.errors import UserError
+
+# Positions and depths in scene units. Beyond, float64 cannot tell a millimetre from none, even in UTM coordinates.
+MOST_UNITS = 1e12
+
+# Width and height; the largest stitched pictures have a million.
+MOST_PIXELS = 10**7
+
+# Focal lengths in pixels, principal points, distortion terms.
+MOST_PARAMETER = 1e12
+
+
+def plausible(positions: np.ndarray) -> np.ndarray:
+    """Whether each position (..., 3), or number (..., 1), is finite and below `MOST_UNITS`; (...,) bool."""
+    return np.asarray((np.abs(positions) < MOST_UNITS).all(axis=-1))  # False at NaN
+
+
+def stated_camera(model: str, width: int, height: int, params: tuple[float, ...], *, where: str) -> Camera:
+    """The camera that a file states.
+
+    Raises:
+        UserError: it makes no camera, or one of a size or with a number that no camera has; `where` opens the message.
+    """
+    if max(width, height) > MOST_PIXELS:
+        raise UserError(
+            f"{where}: a picture of {_short(width)}x{_short(height)} pixels",
+            f"width and height must be at most {MOST_PIXELS}",
+        )
+    if not all(abs(value) < MOST_PARAMETER for value in params):  # True at NaN
+        raise UserError(
+            f"{where}: camera parameters {', '.join(f'{value:g}' for value in params)}",
+            f"every parameter must be a finite number below {MOST_PARAMETER:g}",
+        )
+    try:
+        return Camera(model, width, height, params)
+    except UserError as error:
+        raise UserError(f"{where}: {error.message}", error.hint) from error
+
+
+def _short(number: int) -> str:
+    return str(number) if number < 10**12 else f"{float(number):.3g}" if number < 10**300 else "1e300 or more"

@@ -1,0 +1,76 @@
+"""What a capture has that a format cannot hold, told in clauses such as "k3 of 12 cameras" or "3 masks"."""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable
+
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.frame import Capture
+
+# Parameters that every format of perspective pictures has a place for.
+_PINHOLE = ("f", "fx", "fy", "cx", "cy")
+
+
+def lost_parts(capture: Capture, *, holds: Collection[str]) -> list[str]:
+    """Clauses for what stands beside the cameras and poses of a capture.
+
+    Args:
+        capture: to be written.
+        holds: the parts that the format has a place for: "masks", "points", "colours", "observations", "splits",
+            "depth bounds", "unit".
+    """
+    num_points = len(capture.points)
+    num_observations = 0 if capture.observations is None else len(capture.observations.pixels)
+    num_split = sum(frame.split is not None for frame in capture.frames)
+    parts = {
+        "masks": (num := sum(frame.mask is not None for frame in capture.frames), f"{num} masks"),
+        "points": (num_points, f"{num_points} points"),
+        "colours": (num_points if capture.colours is not None else 0, f"colours of {num_points} points"),
+        "observations": (num_observations, f"{num_observations} observations"),
+        "splits": (num_split, f"the split of {num_split} frames"),
+        "depth bounds": (capture.depth_bounds is not None, "depth bounds"),
+        "unit": (capture.unit != "arbitrary", f"the unit of length ({capture.unit})"),
+    }
+    return [clause for part, (present, clause) in parts.items() if present and part not in holds]
+
+
+def lost_of_cameras(capture: Capture, lost: Callable[[Camera], Iterable[str]]) -> list[str]:
+    """Clauses "k3 of 2 cameras", with the number of different cameras that lose a property.
+
+    Args:
+        capture: to be written.
+        lost: the properties of a camera that the format cannot hold.
+    """
+    cameras = {frame.camera for frame in capture.frames}
+    counts = Counter(name for camera in cameras for name in lost(camera))
+    return [f"{name} of {_cameras(count)}" for name, count in sorted(counts.items())]
+
+
+def distortion(camera: Camera) -> dict[str, float]:
+    """The parameters beside focal lengths and principal point that are not 0, by name."""
+    if camera.is_spherical:
+        return {}
+    values = zip(parameter_names(camera.model), camera.params, strict=True)
+    return {name: value for name, value in values if name not in _PINHOLE and value}
+
+
+def projection(camera: Camera) -> str:
+    """How a model maps angles without its distortion terms: "perspective", "fisheye" (equidistant) or "spherical"."""
+    return "spherical" if camera.is_spherical else "fisheye" if "FISHEYE" in camera.model else "perspective"
+
+
+def lost_to_pinhole(camera: Camera) -> list[str]:
+    """What of a camera one focal length and the picture's size do not tell, its centre being the principal point."""
+    if camera.is_spherical:
+        return ["the spherical projection"]
+    lost = ["the fisheye projection"] if projection(camera) == "fisheye" else []
+    lost += distortion(camera)
+    if camera.principal_point != (camera.width / 2, camera.height / 2):
+        lost.append("the principal point")
+    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    if values.get("fx") != values.get("fy"):
+        lost.append("the second focal length")
+    return lost
+
+
+def _cameras(count: int) -> str:
+    return "1 camera" if count == 1 else f"{count} cameras"

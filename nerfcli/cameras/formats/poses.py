@@ -1,0 +1,62 @@
+"""Poses as files print them, made exactly rigid."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.formats.limits import MOST_UNITS, plausible
+from nerfcli.errors import UserError
+
+# How far a pose's rotation may be from orthonormal: files print 6 digits or more; beyond is a mistake, not rounding.
+_MAX_BEND = 1e-2
+
+# Rotations that are off by less are left alone, to the last bit.
+_ROUNDING = 1e-13
+
+
+def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
+    """Poses (N, 4, 4) whose rotations are orthonormal to 1e-13, from (N, 3, 4) or (N, 4, 4) as a file holds them.
+
+    Args:
+        matrices: with a rotation in the upper left and a position in the fourth column; a fourth row is not looked at.
+        where: says of a number of these matrices which file and field it is, to open the message.
+
+    Raises:
+        UserError: not finite, mirrored, or farther from a rotation than rounding explains.
+    """
+    rotations, positions = matrices[:, :3, :3], matrices[:, :3, 3]
+    _refuse(
+        ~plausible(matrices[:, :3].reshape(-1, 12)),
+        where,
+        what=f"holds a number that is not finite, or above {MOST_UNITS:g}",
+        hint="the pose of this image is lost; remove its entry",
+    )
+    bend = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0)
+    _refuse(
+        bend > _MAX_BEND,
+        where,
+        what="its upper left 3x3 is no rotation",
+        hint="rows must be perpendicular and of length 1",
+    )
+    _refuse(
+        np.linalg.det(rotations) < 0,
+        where,
+        what="mirrors the scene (determinant -1)",
+        hint="expected a right-handed camera frame",
+    )
+    bent = bend > _ROUNDING
+    if bent.any():
+        rotations = rotations.copy()
+        rotations[bent] = rigid.nearest_rotation(rotations[bent])
+    return rigid.from_parts(rotations, positions)
+
+
+def rigid_pose(matrix: np.ndarray, where: str) -> np.ndarray:
+    """`rigid_poses` of one matrix (3, 4) or (4, 4): a pose (4, 4)."""
+    return rigid_poses(matrix[None], lambda _: where)[0]
+
+
+def _refuse(wrong: np.ndarray, where: Callable[[int], str], *, what: str, hint: str) -> None:
+    if wrong.any():
+        raise UserError(f"{where(int(np.argmax(wrong)))}: {what}", hint)

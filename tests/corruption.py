@@ -1,0 +1,202 @@
+"""Damage to files, drawn by a seeded generator, and what a reader of captures owes us when it meets one.
+
+A reader that is handed a damaged file either says so (a `UserError` that names the file) or returns a sound capture,
+where the damage did no harm. It never raises anything else, hangs, or allocates much more than the file is large.
+"""
+
+import json
+import signal
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from nerfcli.cameras.frame import Capture
+from nerfcli.errors import BAD_INPUT, UserError
+
+MOST_SECONDS = 20
+MOST_BYTES = 64 * 2**20
+
+_WORDS = (
+    "nan",
+    "inf",
+    "-inf",
+    "1e308",
+    "-1e308",
+    "1e-320",
+    "-1",
+    "0",
+    "",
+    "word",
+    "9" * 30,
+    "9" * 5000,
+    "1,5",
+    "ü",
+    "[",
+)
+_VALUES = (
+    *(float("nan"), float("inf"), -1e308, 1e308, 0, -1, 0.5, True, None, "word", "", [], {}, [[1]], {"a": 1}),
+    *(2**31, 2**63, 10**400, -(10**30), [None], ["1"], 1e-320),
+)
+_NUMBERS = tuple(
+    np.array(number, dtype=kind).tobytes()
+    for number, kind in (
+        *((value, "<f8") for value in (np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, -1.0, 1e-320)),
+        *((value, "<i8") for value in (-1, 0, 1, 2**31, 2**40, 2**62, -(2**63))),
+        *((value, "<i4") for value in (-1, 0, 99, 2**31 - 1)),
+    )
+)
+
+
+def corrupted_binary(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damaged bytes: cut off, longer, with a number overwritten anywhere, bits flipped, or a stretch lost."""
+    at = int(rng.integers(0, len(data)))
+    # Counts, magic words and other structure stand at the beginning of most files: half of the hits go there.
+    start = int(rng.integers(0, min(len(data), 128))) if rng.random() < 0.5 else at
+    kind = int(rng.integers(0, 6))
+    if kind == 0:
+        return data[:at]
+    if kind == 1:
+        return data + bytes(rng.integers(0, 256, size=int(rng.integers(1, 64)), dtype=np.uint8))
+    if kind == 2:
+        number = _NUMBERS[int(rng.integers(0, len(_NUMBERS)))]
+        return data[:start] + number + data[start + len(number) :]
+    if kind == 3:
+        return data[:start] + bytes(rng.integers(0, 256, size=8, dtype=np.uint8)) + data[start + 8 :]
+    if kind == 4:
+        return data[:start] + bytes([data[start] ^ (1 << int(rng.integers(0, 8)))]) + data[start + 1 :]
+    return data[:start] + data[start + int(rng.integers(1, 40)) :]
+
+
+def corrupted_text(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damaged lines: cut off, a word replaced, dropped or doubled, a line dropped or doubled, or damaged bytes."""
+    lines = data.decode("utf-8").split("\n")
+    filled = [index for index, line in enumerate(lines) if line.strip() and not line.startswith("#")]
+    kind = int(rng.integers(0, 7))
+    if kind == 0 or not filled:
+        return data[: int(rng.integers(0, len(data)))]
+    index = filled[int(rng.integers(0, len(filled)))]
+    words = lines[index].split(" ")
+    at = int(rng.integers(0, len(words)))
+    if kind in (1, 2):
+        words[at] = _WORDS[int(rng.integers(0, len(_WORDS)))]
+    elif kind == 3:
+        words = words[:at] + words[at + 1 :]
+    elif kind == 4:
+        words = words[: at + 1] + words[at:]
+    lines[index] = " ".join(words)
+    if kind == 5:
+        lines = lines[:index] + lines[index + 1 :] if rng.random() < 0.5 else lines[: index + 1] + lines[index:]
+    damaged = "\n".join(lines).encode()
+    return corrupted_binary(damaged, rng) if kind == 6 else damaged
+
+
+def corrupted_json(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damaged JSON: a value anywhere in the tree replaced by another type, NaN or a huge number, or dropped; or cut."""
+    kind = int(rng.integers(0, 6))
+    if kind == 0:
+        return data[: int(rng.integers(0, len(data)))]
+    if kind == 1:
+        return corrupted_binary(data, rng)
+    content = json.loads(data)
+    places = list(_places(content))
+    # As many places at the top as in the leaves, where most places are.
+    top = [place for place in places if place[0] is content]
+    chosen = top if rng.random() < 0.3 else places
+    holder, key = chosen[int(rng.integers(0, len(chosen)))]
+    if kind == 2:
+        del holder[key]
+    else:
+        holder[key] = _VALUES[int(rng.integers(0, len(_VALUES)))]
+    return json.dumps(content).encode()
+
+
+def assert_refused_or_sound(read: Callable[[], Capture], path: Path) -> bool:
+    """Whether `read` refused the damaged file; else what it returned is a sound capture.
+
+    Args:
+        read: reads the damaged capture.
+        path: the damaged file, which an error must name; for a format of several files their folder.
+    """
+    refusal, capture = None, None
+    tracemalloc.start()
+    try:
+        with _at_most(MOST_SECONDS):
+            capture = read()
+    except UserError as error:
+        refusal = error
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < MOST_BYTES
+    if refusal is None:
+        assert capture is not None
+        assert_sound(capture)
+        return False
+    assert refusal.exit_code == BAD_INPUT
+    assert str(path) in refusal.message, refusal.message
+    assert "\n" not in refusal.message + refusal.hint
+    assert len(refusal.message) < 1000
+    return True
+
+
+def assert_sound(capture: Capture) -> None:
+    """Every number of a capture is finite and in its range, poses are rigid, names are unique, indices in range."""
+    assert len(capture.frames) > 0
+    assert len({frame.name for frame in capture.frames}) == len(capture.frames)
+    for frame in capture.frames:
+        assert frame.name
+        assert frame.camera.width >= 1
+        assert frame.camera.height >= 1
+        assert np.isfinite(frame.camera.params).all()
+        pose = frame.world_from_cam
+        assert pose.shape == (4, 4)
+        assert np.isfinite(pose).all()
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-12)
+        assert np.linalg.det(pose[:3, :3]) > 0
+        np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
+        assert frame.split in (None, "train", "val", "test")
+    assert capture.points.shape == (len(capture.points), 3)
+    assert np.isfinite(capture.points).all()
+    if capture.colours is not None:
+        assert capture.colours.dtype == np.uint8
+        assert capture.colours.shape == (len(capture.points), 3)
+    if capture.depth_bounds is not None:
+        assert capture.depth_bounds.shape == (len(capture.frames), 2)
+        assert np.isfinite(capture.depth_bounds).all()
+    seen = capture.observations
+    if seen is not None:
+        assert seen.frame_index.shape == seen.point_index.shape == (len(seen.pixels),)
+        assert seen.pixels.shape == (len(seen.pixels), 2)
+        assert np.isfinite(seen.pixels).all()
+        assert ((seen.frame_index >= 0) & (seen.frame_index < len(capture.frames))).all()
+        assert ((seen.point_index >= -1) & (seen.point_index < len(capture.points))).all()
+    assert capture.unit in ("arbitrary", "metre")
+
+
+def _places(node: Any) -> Iterator[tuple[Any, Any]]:
+    """Every value in a JSON tree as the list or dict that holds it and the index or key where it stands."""
+    keys = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
+    for key in keys:
+        yield node, key
+        yield from _places(node[key])
+
+
+@contextmanager
+def _at_most(seconds: int) -> Iterator[None]:
+    """Fail what takes longer, so that an endless loop is a failed test and not a frozen one."""
+
+    def fail(signum: int, frame: FrameType | None) -> None:
+        raise AssertionError(f"not done after {seconds} seconds")
+
+    before = signal.signal(signal.SIGALRM, fail)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
