@@ -1,0 +1,183 @@
+"""Numbers and texts out of files that may be damaged: whatever is wrong becomes one error that names file and field.
+
+`where` is always the file and the place in it, such as "poses.txt: line 3"; it begins the message.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from nerfcli.errors import UserError
+
+# No coordinate, angle or lens parameter is larger; beyond, products of a few of them would overflow.
+LARGEST = 1e100
+
+# No picture is wider or higher.
+LARGEST_SIZE_PX = 10**7
+
+_LONGEST_NAME = 1000
+
+
+def malformed(where: str, what: str, hint: str) -> UserError:
+    """The error for a field: where it stands, what was found there, and what was expected."""
+    return UserError(f"{where}: {what}", hint)
+
+
+def shown(value: Any) -> str:
+    """A value as a message can show it: on one line and not longer than 60 characters."""
+    text = repr(value) if not isinstance(value, dict | list) else f"a {type(value).__name__} of {len(value)}"
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The text of a file in UTF-8, with or without a byte order mark.
+
+    Raises:
+        UserError: the file is not there, not readable, or no text; `expected` says what it should have been.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise malformed(str(path), error.strerror or str(error), expected) from error
+    except UnicodeDecodeError as error:
+        raise malformed(str(path), f"not UTF-8 text (byte {error.start})", expected) from error
+
+
+def read_json(path: Path, expected: str) -> Any:
+    """The value that a JSON file holds.
+
+    Raises:
+        UserError: as for `read_text`, or the text is no JSON, or is nested deeper than any file of cameras.
+    """
+    text = read_text(path, expected)
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        what = f"not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
+        raise malformed(str(path), what, "the file is cut off or was edited by hand; write it again") from error
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits; brackets in brackets in brackets
+        raise malformed(str(path), f"not valid JSON: {error}", expected) from error
+
+
+def filled_lines(text: str) -> list[tuple[int, str]]:
+    """Line numbers, from 1, and lines without the empty ones and the comments (#)."""
+    lines = enumerate(text.splitlines(), start=1)
+    return [(number, line) for number, line in lines if line.strip() and not line.lstrip().startswith("#")]
+
+
+def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
+    """The numbers of a line of text.
+
+    Raises:
+        UserError: there are more or fewer than `count`, or one of them is no finite number.
+    """
+    if len(words) != count:
+        raise malformed(where, f"has {len(words)} numbers", f"expected {count}")
+    try:
+        values = list(map(float, words))
+    except ValueError:
+        values = []
+    if len(values) == count and all(-LARGEST <= value <= LARGEST for value in values):  # False for NaN too
+        return values
+    _refuse_number(words, where)
+
+
+def record_of(value: Any, where: str) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        UserError: the value is something else.
+    """
+    if not isinstance(value, dict):
+        raise malformed(where, f"is {shown(value)}", "expected a JSON object {...}")
+    return value
+
+
+def number(record: dict[str, Any], key: str, where: str, *, default: float | None = None) -> float:
+    """A number of a JSON object, or `default` where the key is absent.
+
+    Raises:
+        UserError: the key is absent and there is no default, or its value is no finite number.
+    """
+    value = record.get(key, default)
+    if not _is_number(value):
+        raise malformed(
+            where, f"{key} is {shown(value)}" if key in record else f"{key} is missing", "expected a number"
+        )
+    return float(value)
+
+
+def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarray:
+    """A list of `count` numbers of a JSON object, as float64.
+
+    Raises:
+        UserError: the key is absent or holds something else.
+    """
+    value = record.get(key)
+    if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
+        what = f"{key} is missing" if key not in record else f"{key} is {shown(value)}"
+        raise malformed(where, what, f"expected a list of {count} numbers")
+    return np.array(value, dtype=np.float64)
+
+
+def size_of(width: float, height: float, where: str) -> tuple[int, int]:
+    """Width and height of a picture as whole pixels.
+
+    Raises:
+        UserError: one of them is no whole number from 1 to the largest picture there is.
+    """
+    if not all(1 <= side <= LARGEST_SIZE_PX and side == int(side) for side in (width, height)):
+        what = f"width and height are {shown(width)} and {shown(height)}"
+        raise malformed(where, what, "expected the picture's size in whole pixels")
+    return int(width), int(height)
+
+
+def name_of(value: Any, where: str) -> str:
+    """The name of an image, with forward slashes.
+
+    Raises:
+        UserError: no text, an empty one, or one that no file can have as its name.
+    """
+    if not isinstance(value, str) or not value.strip() or len(value) > _LONGEST_NAME or not _is_plain(value):
+        raise malformed(where, f"the image's name is {shown(value)}", "expected the image's path as text")
+    return value.strip().replace("\\", "/")
+
+
+def refuse_twins(names: Iterable[str], path: Path) -> None:
+    """Check that no name stands for two frames.
+
+    Raises:
+        UserError: a name is listed twice, or none is listed.
+    """
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise malformed(str(path), f"image {shown(name)} is listed twice", "remove one of its two entries")
+        seen.add(name)
+    if not seen:
+        raise malformed(str(path), "lists no image with a pose", "the reconstruction is empty; make it again")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
+
+
+def _is_plain(text: str) -> bool:
+    """Whether a text has no control characters and no halves of characters (a lone surrogate from JSON)."""
+    return not any(ord(char) < 32 or ord(char) == 127 or 0xD800 <= ord(char) <= 0xDFFF for char in text)
+
+
+def _refuse_number(words: Iterable[str], where: str) -> NoReturn:
+    for word in words:
+        try:
+            if -LARGEST <= float(word) <= LARGEST:
+                continue
+            what = f"{shown(word)} is not finite" if not math.isfinite(float(word)) else f"{shown(word)} is too large"
+        except ValueError:
+            what = f"{shown(word)} is no number"
+        raise malformed(where, what, "the file was changed or is cut off; write it again")
+    raise AssertionError("called for numbers that are all right")

@@ -1,0 +1,101 @@
+"""The COLMAP camera model that holds a lens as other programs describe it, with as few parameters as it needs.
+
+Letters: focal lengths fx, fy and principal point cx, cy in pixels; k radial, p tangential, in OpenCV's order.
+"""
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.fields import malformed
+from nerfcli.errors import UserError
+
+Pair = tuple[float, float]
+
+
+def brown_camera(
+    size: tuple[int, int],
+    focal: Pair,
+    centre: Pair,
+    *,
+    radial: tuple[float, float, float],
+    tangential: Pair,
+    where: str,
+) -> Camera:
+    """A perspective camera with Brown's distortion.
+
+    With x = X/Z, y = Y/Z, r^2 = x^2 + y^2:
+        u = fx (x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)) + cx
+        v = fy (y (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p2 x y + p1 (r^2 + 2 y^2)) + cy
+
+    Raises:
+        UserError: numbers that make no camera; `where` is named.
+
+    Source: docs.opencv.org, "Camera Calibration and 3D Reconstruction".
+    """
+    k1, k2, k3 = radial
+    if k3:
+        return _camera("FULL_OPENCV", size, (*focal, *centre, k1, k2, *tangential, k3, 0.0, 0.0, 0.0), where)
+    if any(tangential) or (focal[0] != focal[1] and (k1 or k2)):
+        return _camera("OPENCV", size, (*focal, *centre, k1, k2, *tangential), where)
+    if k2:
+        return _camera("RADIAL", size, (focal[0], *centre, k1, k2), where)
+    if k1:
+        return _camera("SIMPLE_RADIAL", size, (focal[0], *centre, k1), where)
+    return _camera("PINHOLE", size, (*focal, *centre), where)
+
+
+def fisheye_camera(
+    size: tuple[int, int],
+    focal: Pair,
+    centre: Pair,
+    *,
+    radial: tuple[float, float, float, float],
+    tangential: Pair,
+    prism: Pair,
+    where: str,
+) -> Camera:
+    """A camera with equidistant projection and Brown's distortion, thin prisms (sx, sy) included.
+
+    With R = sqrt(X^2 + Y^2), t = atan2(R, Z), x = t X/R, y = t Y/R, r^2 = x^2 + y^2:
+        u = fx (x (1 + k1 r^2 + ... + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2) + sx r^2) + cx
+        v = fy (y (1 + k1 r^2 + ... + k4 r^8) + 2 p2 x y + p1 (r^2 + 2 y^2) + sy r^2) + cy
+
+    Raises:
+        UserError: numbers that make no camera; `where` is named.
+
+    Source: docs.opencv.org, "Fisheye camera model"; COLMAP src/colmap/sensor/models.h, ThinPrismFisheyeCameraModel.
+    """
+    if any(tangential) or any(prism):
+        params = (*focal, *centre, *radial[:2], *tangential, *radial[2:], *prism)
+        return _camera("THIN_PRISM_FISHEYE", size, params, where)
+    return _camera("OPENCV_FISHEYE", size, (*focal, *centre, *radial), where)
+
+
+def long_fisheye_camera(
+    size: tuple[int, int], focal: Pair, centre: Pair, *, radial: tuple[float, ...], where: str
+) -> Camera:
+    """As `fisheye_camera`, with six radial terms up to k6 r^12 and no other.
+
+    Raises:
+        UserError: numbers that make no camera; `where` is named.
+    """
+    params = (*focal, *centre, *radial, *(0.0,) * 6)
+    return _camera("RAD_TAN_THIN_PRISM_FISHEYE", size, params, where)
+
+
+def spherical_camera(size: tuple[int, int], where: str) -> Camera:
+    """The camera of a panorama of the whole sphere: longitude and latitude on equally long pixels.
+
+    Raises:
+        UserError: the picture is not twice as wide as high, so that it shows something else.
+    """
+    if abs(size[0] - 2 * size[1]) > 1:
+        raise malformed(
+            where, f"a spherical picture of {size[0]}x{size[1]} pixels", "expected one twice as wide as it is high"
+        )
+    return _camera("EQUIRECTANGULAR", size, (float(size[0]), float(size[1])), where)
+
+
+def _camera(model: str, size: tuple[int, int], params: tuple[float, ...], where: str) -> Camera:
+    try:
+        return Camera(model, *size, params)
+    except UserError as error:
+        raise malformed(where, error.message, error.hint) from error

@@ -1,0 +1,270 @@
+"""OpenSfM's reconstruction.json, which OpenDroneMap and WebODM write too.
+
+Lengths in the picture are divided by the larger of width and height, with the origin in the picture's middle:
+normalised = (pixel + 1/2 - size/2) / max(size) with whole numbers at pixel centres, which is (p - size/2) / max(size)
+for positions p with pixel centres at 1/2. Poses are cam_from_world as angle-axis and translation, in OpenCV axes.
+Cameras refer to the stored pixels: OpenSfM ignores the EXIF orientation, and only notes it with the shot.
+Source: opensfm.org/docs/dataset.html and geometry.html; mapillary/OpenSfM opensfm/io.py, opensfm/features.py and
+opensfm/src/geometry/camera_{projections,distortions}_functions.h.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nerfcli.atomic import write_json
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.formats import lenses
+from nerfcli.cameras.formats.fields import (
+    LARGEST,
+    malformed,
+    name_of,
+    number,
+    read_json,
+    record_of,
+    refuse_twins,
+    shown,
+    size_of,
+    vector,
+)
+from nerfcli.cameras.formats.losses import counted, lost
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.errors import UserError
+
+IMAGE_FOLDER = "images"
+
+_EXPECTED = "expected the reconstruction.json of an OpenSfM dataset: a list of reconstructions"
+
+_BROWN = ("perspective", "simple_radial", "radial", "brown")
+_FISHEYE = ("fisheye", "fisheye_opencv", "fisheye62", "fisheye624")
+_SPHERICAL = ("spherical", "equirectangular")
+
+# What OpenSfM has no term for. The tangential and prism terms of RAD_TAN_THIN_PRISM_FISHEYE act on other coordinates.
+_LOST_TERMS = {
+    "FULL_OPENCV": ("k4", "k5", "k6"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3"),
+}
+_NO_WORDS = ("FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM")
+
+
+def parse_opensfm(path: Path) -> Capture:
+    """The reconstruction with the most shots of a reconstruction.json; the others are not in the same world.
+
+    The photos are where OpenSfM has them, in images/ beside the file. The unit of length is the metre where the file
+    has a `reference_lla` other than latitude 0, longitude 0: OpenSfM then aligned the world to GPS positions, east,
+    north, up from there. Without GPS it writes zeros, and the unit is arbitrary.
+
+    Raises:
+        UserError: the file is damaged (file and field are named), or has a lens that no COLMAP model holds.
+    """
+    content = _largest(path)
+    camera_records = record_of(content.get("cameras"), f"{path}: cameras")
+    cameras = {key: _camera(record, f"{path}: cameras.{shown(key)}") for key, record in camera_records.items()}
+    frames = []
+    poses = _poses(content["shots"], path)
+    for (key, record), world_from_cam in zip(content["shots"].items(), poses, strict=True):
+        where = f"{path}: shots.{shown(key)}"
+        name = name_of(key, where)
+        camera = record.get("camera")
+        if not isinstance(camera, str) or camera not in cameras:
+            raise malformed(where, f"camera is {shown(camera)}", "expected a key of cameras")
+        frames.append(Frame(name, cameras[camera], world_from_cam, image=path.parent / IMAGE_FOLDER / name))
+    refuse_twins((frame.name for frame in frames), path)
+    points, colours = _points(content, path)
+    unit = "metre" if _is_on_earth(content, path) else "arbitrary"
+    return Capture(tuple(frames), points, (), None, "opensfm", colours=colours, unit=unit)
+
+
+def losses_opensfm(capture: Capture) -> tuple[str, ...]:
+    """What reconstruction.json cannot hold of a capture. Observations stand in OpenSfM's tracks.csv, not there."""
+    clauses = []
+    for model, terms in _LOST_TERMS.items():
+        names = parameter_names(model)
+        cameras = {frame.camera for frame in capture.frames if frame.camera.model == model}
+        for term in terms:
+            used = sum(camera.params[names.index(term)] != 0 for camera in cameras)
+            clauses += [f"{term} of {counted(used, 'camera')}"] if used else []
+    for model in _NO_WORDS:
+        used = len({frame.camera for frame in capture.frames if frame.camera.model == model})
+        clauses += [f"lens of {counted(used, 'camera')} ({model})"] if used else []
+    return (*clauses, *lost(capture, holds=("points", "colours")))
+
+
+def write_opensfm(capture: Capture, path: Path) -> None:
+    """Write a capture as reconstruction.json, atomically, with full precision.
+
+    Raises:
+        UserError: a lens model that OpenSfM has nothing like, or a place that cannot be written.
+    """
+    keys: dict[Camera, str] = {}
+    for frame in capture.frames:
+        keys.setdefault(frame.camera, f"camera {len(keys)}")
+    cam_from_world = rigid.inverse(np.stack([frame.world_from_cam for frame in capture.frames]))
+    rotations = Rotation.from_matrix(cam_from_world[:, :3, :3]).as_rotvec().tolist()
+    translations = cam_from_world[:, :3, 3].tolist()
+    shots = {
+        frame.name: {"rotation": rotation, "translation": translation, "camera": keys[frame.camera]}
+        for frame, rotation, translation in zip(capture.frames, rotations, translations, strict=True)
+    }
+    colours = np.full((len(capture.points), 3), 255) if capture.colours is None else capture.colours
+    pairs = zip(capture.points.tolist(), colours.astype(np.float64).tolist(), strict=True)
+    points = {str(index): {"color": colour, "coordinates": point} for index, (point, colour) in enumerate(pairs)}
+    cameras = {key: _camera_record(camera) for camera, key in keys.items()}
+    write_json(path, [{"cameras": cameras, "shots": shots, "points": points}])
+
+
+def _largest(path: Path) -> dict[str, Any]:
+    content = read_json(path, _EXPECTED)
+    if not isinstance(content, list) or not content:
+        raise malformed(str(path), f"holds {shown(content)}", _EXPECTED)
+    for index, item in enumerate(content):
+        record_of(item, f"{path}: reconstruction {index}")
+        shots = record_of(item.get("shots"), f"{path}: reconstruction {index}: shots")
+        for key, shot in shots.items():
+            record_of(shot, f"{path}: shots.{shown(key)}")
+    return max(content, key=lambda item: len(item["shots"]))
+
+
+def _camera(value: Any, where: str) -> Camera:
+    record = record_of(value, where)
+    kind = record.get("projection_type", "perspective")
+    size = size_of(number(record, "width", where), number(record, "height", where), where)
+    if kind in _SPHERICAL:
+        return lenses.spherical_camera(size, where)
+    if kind not in _BROWN + _FISHEYE:
+        known = ", ".join(_BROWN + _FISHEYE + _SPHERICAL)
+        raise malformed(where, f"projection_type {shown(kind)} is not supported", f"expected one of {known}")
+    term = {key: number(record, key, where, default=0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
+    scale = max(size)
+    if kind in ("perspective", "fisheye"):
+        focal = (scale * number(record, "focal", where),) * 2
+        centre = (size[0] / 2, size[1] / 2)
+    else:
+        focal = (scale * number(record, "focal_x", where), scale * number(record, "focal_y", where))
+        centre = (
+            size[0] / 2 + scale * number(record, "c_x", where, default=0.0),
+            size[1] / 2 + scale * number(record, "c_y", where, default=0.0),
+        )
+    tangential = (term["p1"], term["p2"])
+    if kind == "brown":
+        radial = (term["k1"], term["k2"], term["k3"])
+        return lenses.brown_camera(size, focal, centre, radial=radial, tangential=tangential, where=where)
+    if kind in _BROWN:
+        radial = (term["k1"], 0.0 if kind == "simple_radial" else term["k2"], 0.0)
+        return lenses.brown_camera(size, focal, centre, radial=radial, tangential=(0.0, 0.0), where=where)
+    if kind in ("fisheye", "fisheye_opencv"):
+        radial = (term["k1"], term["k2"], *((0.0, 0.0) if kind == "fisheye" else (term["k3"], term["k4"])))
+        return lenses.fisheye_camera(
+            size, focal, centre, radial=radial, tangential=(0.0, 0.0), prism=(0.0, 0.0), where=where
+        )
+    prism = [number(record, key, where, default=0.0) for key in ("s0", "s1", "s2", "s3")] if kind[-1] == "4" else [0.0]
+    return _long_fisheye(size, focal, centre, term, prism, where)
+
+
+def _long_fisheye(
+    size: tuple[int, int],
+    focal: tuple[float, float],
+    centre: tuple[float, float],
+    term: dict[str, float],
+    prism: Sequence[float],
+    where: str,
+) -> Camera:
+    """The camera of fisheye62 or fisheye624, whose terms no COLMAP model holds all at once."""
+    tangential = (term["p1"], term["p2"])
+    if not any(tangential) and not any(prism):
+        radial = tuple(term[f"k{index}"] for index in range(1, 7))
+        return lenses.long_fisheye_camera(size, focal, centre, radial=radial, where=where)
+    s0, s1, s2, s3 = prism if len(prism) == 4 else (0.0,) * 4
+    if term["k5"] or term["k6"] or s1 or s3:
+        raise malformed(
+            where, "k5, k6, s1 or s3 beside p1, p2, s0 or s2", "no camera model here has all of these terms at once"
+        )
+    radial = (term["k1"], term["k2"], term["k3"], term["k4"])
+    return lenses.fisheye_camera(size, focal, centre, radial=radial, tangential=tangential, prism=(s0, s2), where=where)
+
+
+def _camera_record(camera: Camera) -> dict[str, Any]:
+    """The entry that describes a camera; the inverse of `_camera`."""
+    size = {"width": camera.width, "height": camera.height}
+    if camera.is_spherical:
+        return {"projection_type": "spherical", **size}
+    if camera.model in _NO_WORDS:
+        raise UserError(
+            f"camera model {camera.model} cannot be written to OpenSfM's reconstruction.json",
+            "write undistorted cameras, or keep the COLMAP model",
+        )
+    scale = max(camera.width, camera.height)
+    value = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    intrinsics = {
+        "focal_x": value.get("fx", value.get("f", 0.0)) / scale,
+        "focal_y": value.get("fy", value.get("f", 0.0)) / scale,
+        "c_x": (value["cx"] - camera.width / 2) / scale,
+        "c_y": (value["cy"] - camera.height / 2) / scale,
+    }
+    if camera.model == "RAD_TAN_THIN_PRISM_FISHEYE":
+        kind, terms = "fisheye62", {f"k{index + 1}": value[f"k{index}"] for index in range(6)} | {"p1": 0.0, "p2": 0.0}
+    elif camera.model == "THIN_PRISM_FISHEYE":
+        kind = "fisheye624"
+        terms = {key: value.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
+        terms |= {"s0": value["sx1"], "s1": 0.0, "s2": value["sy1"], "s3": 0.0}
+    elif camera.model.endswith("FISHEYE"):
+        kind = "fisheye_opencv"
+        terms = {key: value.get(key, 0.0) for key in ("k1", "k2", "k3", "k4")}
+    elif camera.model in ("SIMPLE_RADIAL", "RADIAL"):
+        kind = camera.model.lower()
+        terms = {key: value[key] for key in ("k1", "k2") if key in value}
+    else:
+        kind = "brown"
+        terms = {key: value.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")}
+    if "k" in value:
+        terms["k1"] = value["k"]
+    return {"projection_type": kind, **size, **intrinsics, **terms}
+
+
+def _poses(shots: dict[str, Any], path: Path) -> np.ndarray:
+    """`world_from_cam` (shots, 4, 4)."""
+    rows = [
+        (vector(shot, "rotation", 3, where), vector(shot, "translation", 3, where))
+        for where, shot in ((f"{path}: shots.{shown(key)}", shot) for key, shot in shots.items())
+    ]
+    rotations, translations = np.array(rows).reshape(-1, 2, 3).swapaxes(0, 1)
+    return rigid.inverse(rigid.from_parts(Rotation.from_rotvec(rotations).as_matrix(), translations))
+
+
+def _points(content: dict[str, Any], path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points (N, 3) and their colours (N, 3) uint8, if there is a point."""
+    records = record_of(content.get("points", {}), f"{path}: points")
+    if not records:
+        return np.zeros((0, 3)), None
+    try:
+        points = _rows([record["coordinates"] for record in records.values()])
+        colours = _rows([record["color"] for record in records.values()])
+    except (KeyError, TypeError, ValueError, OverflowError):
+        for key, record in records.items():
+            where = f"{path}: points.{shown(key)}"
+            vector(record_of(record, where), "coordinates", 3, where)
+            vector(record, "color", 3, where)
+        raise
+    return points, np.clip(np.rint(colours), 0, 255).astype(np.uint8)
+
+
+def _rows(values: list[Any]) -> np.ndarray:
+    """Lists of three numbers as one array; quicker than `vector` on each. Raises where one of them is none."""
+    rows = np.array(values, dtype=np.float64)
+    if rows.shape != (len(values), 3) or not (np.abs(rows) <= LARGEST).all():
+        raise ValueError("not three finite numbers each")
+    return rows
+
+
+def _is_on_earth(content: dict[str, Any], path: Path) -> bool:
+    """Whether the world was aligned to GPS positions."""
+    where = f"{path}: reference_lla"
+    reference = content.get("reference_lla")
+    if reference is None:
+        return False
+    place = [number(record_of(reference, where), key, where) for key in ("latitude", "longitude")]
+    return any(place)

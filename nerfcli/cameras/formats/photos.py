@@ -1,0 +1,37 @@
+"""The sizes of the photos that a capture lists, for formats that give none; of the pixels as they are stored."""
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from nerfcli.cameras.formats.fields import malformed, shown
+from nerfcli.cameras.orientation import Measure, stored_size
+
+
+def measured_sizes(
+    names: Iterable[str], folder: Path, measure: Measure, path: Path
+) -> tuple[dict[str, tuple[tuple[int, int], Path]], tuple[str, ...]]:
+    """Width and height of each photo that is on disk, with its path, and the names of the others.
+
+    Args:
+        names: of the photos, relative to `folder`.
+        measure: tells an image's upright size and EXIF orientation.
+        path: the file that lists them, for the error.
+
+    Raises:
+        UserError: there is none of them, or one is no readable photo.
+    """
+    sizes, missing = {}, []
+    for name in names:
+        image = folder / name
+        if os.path.isfile(image):  # False, not an error, for a name that no file can have
+            sizes[name] = (stored_size(image, measure), image)
+        else:
+            missing.append(name)
+    if not sizes:
+        raise malformed(
+            str(path),
+            f"none of the {len(missing)} photos that it lists is in {folder}, such as {shown(missing[0])}",
+            "the file gives no picture sizes, so the photos must be there under the names that it lists",
+        )
+    return sizes, tuple(missing)

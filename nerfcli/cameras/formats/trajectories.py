@@ -1,0 +1,152 @@
+"""Trajectories of the TUM and KITTI benchmarks: poses without cameras, pictures or points.
+
+TUM: a line "timestamp tx ty tz qx qy qz qw" for each pose. KITTI: a line with the first three rows of a 4x4 matrix, row
+by row; its frames are known by their place in the file alone. Both are world_from_cam with OpenCV axes.
+Sources: cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats; cvlibs.net/datasets/kitti, odometry devkit, readme.txt.
+"""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.atomic import atomic_path
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.fields import filled_lines, malformed, numbers, read_text, refuse_twins
+from nerfcli.cameras.formats.losses import counted, lost
+from nerfcli.cameras.formats.transforms import rigid_pose
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.errors import UserError
+
+_TUM_EXPECTED = "expected lines of timestamp tx ty tz qx qy qz qw"
+_KITTI_EXPECTED = "expected lines of 12 numbers, the first three rows of a 4x4 matrix"
+
+# How far the length of a quaternion may be from 1: files print 4 digits or more; beyond is a mistake, not rounding.
+_MAX_BEND = 1e-2
+
+_NUMBER = re.compile(r"[+-]?\d{1,20}(\.\d{0,20})?", re.ASCII)
+_PICTURE = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)
+
+
+def parse_tum(path: Path, camera: Camera | None) -> Capture:
+    """A trajectory in the TUM format; a frame's name is its timestamp as the file has it.
+
+    Args:
+        path: the text file.
+        camera: that all frames have, since the file names none.
+
+    Raises:
+        UserError: the file is damaged (file and line are named), or no camera is given.
+    """
+    return _parse(path, camera, _tum_pose, expected=_TUM_EXPECTED, kind="tum")
+
+
+def parse_kitti(path: Path, camera: Camera | None) -> Capture:
+    """A trajectory in the KITTI format; a frame's name is its index in six digits, as KITTI names its pictures.
+
+    Args:
+        path: the text file.
+        camera: that all frames have, since the file names none.
+
+    Raises:
+        UserError: the file is damaged (file and line are named), or no camera is given.
+    """
+    return _parse(path, camera, _kitti_pose, expected=_KITTI_EXPECTED, kind="kitti")
+
+
+def losses_tum(capture: Capture) -> tuple[str, ...]:
+    """What a TUM trajectory cannot hold of a capture."""
+    return _losses(capture, named=_timestamps(capture) == [frame.name for frame in capture.frames])
+
+
+def losses_kitti(capture: Capture) -> tuple[str, ...]:
+    """What a KITTI trajectory cannot hold of a capture."""
+    return _losses(capture, named=all(frame.name == _indexed(i) for i, frame in enumerate(capture.frames)))
+
+
+def write_tum(capture: Capture, path: Path) -> None:
+    """Write a capture's poses in the TUM format, atomically, with full precision.
+
+    The timestamps are the frames' names where all of them are different numbers, without the suffix of a picture
+    ("1305031102.175304.png"); else the frames' indices.
+
+    Raises:
+        UserError: a place that cannot be written.
+    """
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    poses = np.stack([frame.world_from_cam for frame in capture.frames])
+    wxyz = rigid.quaternion_from_rotation(poses[:, :3, :3])
+    rows = np.concatenate([poses[:, :3, 3], wxyz[:, [1, 2, 3, 0]]], axis=1)
+    for timestamp, row in zip(_timestamps(capture), rows.tolist(), strict=True):
+        lines.append(" ".join([timestamp, *map(repr, row)]))
+    _write(lines, path)
+
+
+def write_kitti(capture: Capture, path: Path) -> None:
+    """Write a capture's poses in the KITTI format, atomically, with full precision.
+
+    Raises:
+        UserError: a place that cannot be written.
+    """
+    rows = [frame.world_from_cam[:3].ravel().tolist() for frame in capture.frames]
+    _write([" ".join(map(repr, row)) for row in rows], path)
+
+
+def _parse(
+    path: Path,
+    camera: Camera | None,
+    pose_of: Callable[[int, list[str], str], tuple[str, np.ndarray]],
+    *,
+    expected: str,
+    kind: str,
+) -> Capture:
+    if camera is None:
+        raise UserError(
+            f"{path}: a trajectory of the {kind.upper()} format has poses only, no camera",
+            "give the camera too: its model, width, height and parameters in pixels",
+        )
+    frames = []
+    for index, (number, line) in enumerate(filled_lines(read_text(path, expected))):
+        name, world_from_cam = pose_of(index, line.split(), f"{path}: line {number}")
+        frames.append(Frame(name, camera, world_from_cam))
+    if not frames:
+        raise malformed(str(path), "has no pose", expected)
+    refuse_twins((frame.name for frame in frames), path)
+    return Capture(tuple(frames), np.zeros((0, 3)), (), None, kind)
+
+
+def _tum_pose(_: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
+    values = np.array(numbers(words, 8, where))
+    xyzw = values[4:]
+    if abs(np.linalg.norm(xyzw) - 1.0) > _MAX_BEND:
+        raise malformed(where, f"its quaternion has length {np.linalg.norm(xyzw):.4g}", "expected length 1")
+    return words[0], rigid.from_parts(rigid.rotation_from_quaternion(xyzw[[3, 0, 1, 2]]), values[1:4])
+
+
+def _kitti_pose(index: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
+    return _indexed(index), rigid_pose(np.array(numbers(words, 12, where)).reshape(3, 4), where)
+
+
+def _indexed(index: int) -> str:
+    return f"{index:06d}"
+
+
+def _timestamps(capture: Capture) -> list[str]:
+    """The frames' names without the suffix of a picture where all are different numbers, else their indices."""
+    stems = [_PICTURE.sub("", frame.name.rsplit("/", 1)[-1]) for frame in capture.frames]
+    if all(map(_NUMBER.fullmatch, stems)) and len(set(stems)) == len(stems):
+        return stems
+    return [str(index) for index in range(len(stems))]
+
+
+def _losses(capture: Capture, *, named: bool) -> tuple[str, ...]:
+    cameras = len({frame.camera for frame in capture.frames})
+    names = [] if named else [f"names of {counted(len(capture.frames), 'frame')}"]
+    return (f"intrinsics of {counted(cameras, 'camera')}", *names, *lost(capture))
+
+
+def _write(lines: list[str], path: Path) -> None:
+    with atomic_path(path) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")

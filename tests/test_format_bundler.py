@@ -1,0 +1,182 @@
+"""Bundler's model against the formula of its manual written out here, by hand, and damaged."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from corruption import assert_refused_or_sound, corrupted_text
+from scipy.spatial.transform import Rotation
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.bundler import parse_bundler
+from nerfcli.cameras.frame import Capture
+from nerfcli.errors import BAD_INPUT, UserError
+
+LENSES = [(60.0, 0.1, -0.05), (55.0, 0.02, 0.0), (50.0, 0.0, 0.0)]
+NAMES = ["a.jpg", "b c.jpg", "ü.jpg"]
+POINTS = np.random.default_rng(5).uniform(-1, 1, (7, 3))
+SIZE = (64, 48)
+
+
+def measure(_: Path) -> tuple[int, int, int]:
+    """Stands for media: every image is 64 x 48 and upright."""
+    return *SIZE, 1
+
+
+def bundler_cameras() -> list[tuple[np.ndarray, np.ndarray]]:
+    """R and t of three cameras, four units from the origin, which they see in front: along their -z."""
+    turns = Rotation.random(3, rng=np.random.default_rng(6)).as_matrix()
+    return [(turn, np.array([0.1 * index, -0.2, -4.0])) for index, turn in enumerate(turns)]
+
+
+def from_middle(lens: tuple[float, float, float], turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Bundler v0.4 User's Manual: pixels from the picture's middle, y upwards."""
+    f, k1, k2 = lens
+    cam = POINTS @ turn.T + shift
+    p = -cam[:, :2] / cam[:, 2:]
+    n2 = (p**2).sum(axis=1, keepdims=True)
+    return f * (1 + k1 * n2 + k2 * n2**2) * p
+
+
+def model_text() -> str:
+    cameras, seen = [], []
+    for lens, (turn, shift) in zip(LENSES, bundler_cameras(), strict=True):
+        cameras += [lens, *turn.tolist(), shift.tolist()]
+        seen.append(from_middle(lens, turn, shift).tolist())
+    lines = ["# Bundle file v0.3", "3 7", *(" ".join(map(repr, row)) for row in cameras)]
+    for index, point in enumerate(POINTS.tolist()):
+        # A view for each camera, but not point 0, which nobody saw.
+        views = [
+            f"{camera} {17 * index} {pixels[index][0]!r} {pixels[index][1]!r}" for camera, pixels in enumerate(seen)
+        ]
+        views = views if index else []
+        lines += [" ".join(map(repr, point)), f"{index} 128 255", " ".join([str(len(views)), *views])]
+    return "\n".join(lines) + "\n"
+
+
+def write(folder: Path, text: str, names: list[str] = NAMES, *, on_disk: list[str] = NAMES) -> Path:
+    for name in on_disk:
+        (folder / name).write_bytes(b"")
+    (folder / "list.txt").write_text("\n".join(names) + "\n", encoding="utf-8")
+    (folder / "bundle").mkdir(exist_ok=True)
+    path = folder / "bundle" / "bundle.out"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def parse(path: Path) -> Capture:
+    return parse_bundler(path, measure)
+
+
+def test_cameras_project_as_in_the_manual(tmp_path):
+    capture = parse(write(tmp_path, model_text()))
+    assert [frame.name for frame in capture.frames] == NAMES
+    assert [frame.camera.model for frame in capture.frames] == ["RADIAL", "SIMPLE_RADIAL", "PINHOLE"]
+    np.testing.assert_array_equal(capture.points, POINTS)
+    np.testing.assert_array_equal(capture.colours, [[index, 128, 255] for index in range(7)])
+    assert (capture.kind, capture.unit, capture.missing) == ("bundler", "arbitrary", ())
+    for frame, lens, (turn, shift) in zip(capture.frames, LENSES, bundler_cameras(), strict=True):
+        assert frame.image == tmp_path / frame.name
+        np.testing.assert_allclose(frame.centre, -turn.T @ shift, rtol=0, atol=1e-14)
+        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), POINTS))
+        assert valid.all()
+        expected = from_middle(lens, turn, shift) * [1, -1] + [32, 24]
+        np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-9)
+
+
+def test_views_are_where_the_points_project(tmp_path):
+    capture = parse(write(tmp_path, model_text()))
+    seen = capture.observations
+    assert seen is not None
+    assert len(seen.pixels) == 18
+    assert set(zip(seen.frame_index.tolist(), seen.point_index.tolist(), strict=True)) == {
+        (frame, point) for frame in range(3) for point in range(1, 7)
+    }
+    for frame_index, point_index, pixel in zip(seen.frame_index, seen.point_index, seen.pixels, strict=True):
+        frame = capture.frames[frame_index]
+        in_cam = rigid.apply(rigid.inverse(frame.world_from_cam), capture.points[point_index])
+        np.testing.assert_allclose(frame.camera.project(in_cam)[0][0], pixel, rtol=0, atol=1e-9)
+
+
+def test_an_identity_camera_by_hand(tmp_path):
+    # It looks along world -z with +y up. The point (1, 2, -10) is 10 px to the right and 20 px above the middle.
+    text = "# Bundle file v0.3\n1 1\n100 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n1 2 -10\n1 2 3\n1 0 5 10.0 20.0\n"
+    capture = parse(write(tmp_path, text, ["./a.jpg 0 1234.5"]))
+    frame = capture.frames[0]
+    assert frame.name == "a.jpg"
+    assert frame.camera == Camera("PINHOLE", 64, 48, (100, 100, 32, 24))
+    np.testing.assert_array_equal(frame.world_from_cam, np.diag([1.0, -1, -1, 1]))
+    assert capture.observations is not None
+    np.testing.assert_array_equal(capture.observations.pixels, [[42.0, 4.0]])
+
+
+def test_unregistered_and_missing_photos_are_no_frames(tmp_path):
+    lines = model_text().splitlines()
+    lines[2:7] = ["0 0 0"] * 5
+    unseen = [line if len(line.split()) < 12 else "2 " + line.split(maxsplit=5)[5] for line in lines]
+    capture = parse(write(tmp_path, "\n".join(unseen), on_disk=["ü.jpg"]))
+    assert [frame.name for frame in capture.frames] == ["ü.jpg"]
+    assert capture.missing == ("b c.jpg",)
+    assert capture.observations is not None
+    np.testing.assert_array_equal(capture.observations.frame_index, np.zeros(6))
+    np.testing.assert_array_equal(capture.observations.point_index, np.arange(1, 7))
+
+
+def test_the_list_is_found_where_colmap_writes_it(tmp_path):
+    path = write(tmp_path, model_text())
+    (tmp_path / "list.txt").rename(tmp_path / "bundle" / "model.list.txt")
+    with pytest.raises(UserError, match="there is no list of images"):
+        parse(path)
+    path = path.rename(path.with_name("model.bundle.out"))
+    assert len(parse_bundler(path, measure, images=tmp_path).frames) == 3
+    given = parse_bundler(path, measure, images=tmp_path, image_list=tmp_path / "bundle" / "model.list.txt")
+    assert [frame.image for frame in given.frames] == [tmp_path / name for name in NAMES]
+
+
+def edited(number: int, line: str | None) -> str:
+    lines = model_text().splitlines()
+    lines[number - 1 : number] = [] if line is None else [line]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "what"),
+    [
+        ("", NAMES, "does not begin with # Bundle file"),
+        (edited(1, "# Bundle file v0.2"), NAMES, "line 1: is of another version"),
+        (edited(2, "3"), NAMES, "line 2: has 1 numbers"),
+        (edited(2, "3 -7"), NAMES, "line 2: announces 3 cameras and -7 points"),
+        (edited(2, "900000000000 7"), NAMES, "announces 900000000000 cameras and 7 points, but the file has 37"),
+        (edited(20, None), NAMES, "but the file has 36 lines"),
+        (edited(3, "-60 0 0"), NAMES, "line 3: .*make no camera"),
+        (edited(3, "60 0"), NAMES, "line 3: has 2 numbers"),
+        (edited(4, "1 1 1"), NAMES, "line 4: its upper left 3x3 is no rotation"),
+        (edited(7, "1 nan 1"), NAMES, "line 7: 'nan' is not finite"),
+        (edited(18, "1 2 x"), NAMES, "line 18: 'x' is no number"),
+        (edited(20, "1 0 5 10"), NAMES, "line 20: announces 1 views, but has 3 numbers"),
+        (edited(20, "1 3 5 10 20"), NAMES, "line 20: a view has a camera that is not there"),
+        (edited(20, "1 0.5 5 10 20"), NAMES, "line 20: a view has a camera that is not there"),
+        (model_text(), NAMES[:2], r"has 3 cameras, but .*list\.txt has 2 images"),
+        (model_text(), ["a.jpg", "a.jpg", "b c.jpg"], r"list\.txt: image 'a.jpg' is listed twice"),
+        (model_text(), ["x", "y", "z"], "none of the 3 photos"),
+    ],
+)
+def test_malformed_files_are_refused_with_file_and_line(tmp_path, text, names, what):
+    path = write(tmp_path, text, names)
+    with pytest.raises(UserError, match=what) as caught:
+        parse(path)
+    assert caught.value.exit_code == BAD_INPUT
+    assert str(tmp_path) in caught.value.message
+
+
+@pytest.mark.parametrize("damaged", ["bundle/bundle.out", "list.txt"])
+def test_two_hundred_damaged_files_are_refused_or_sound(tmp_path, damaged):
+    path = write(tmp_path, model_text())
+    data = (tmp_path / damaged).read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(200):
+        (tmp_path / damaged).write_bytes(corrupted_text(data, rng))
+        refused += assert_refused_or_sound(lambda: parse(path), tmp_path)
+    assert refused > (100 if damaged != "list.txt" else 30)
