@@ -1,10 +1,11 @@
-"""Converting a capture: parse, apply what the user knows, refuse or accept losses, write, verify, and only then keep."""
+"""Converting a capture: parse, apply what the user knows, refuse or accept losses, write, verify, and keep only then.
+"""
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -119,7 +120,11 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wante
     if form.write is None or form.losses is None:
         raise UserError(f"{form.name} can be read, not written", "choose another format with --to", exit_code=2)
     convention = _convention(form, wanted)
-    path = target if not form.default_name or target.suffix == Path(form.default_name).suffix else target / form.default_name
+    path = (
+        target
+        if not form.default_name or target.suffix == Path(form.default_name).suffix
+        else target / form.default_name
+    )
     losses = form.losses(capture)
     if losses and not wanted.allow_loss:
         raise UserError(
@@ -162,9 +167,7 @@ def _convention(form: Format, wanted: Wanted) -> Convention:
     return Convention(axes, pixel_centre=pixel_centre)
 
 
-def _verification(
-    left: Capture, path: Path, form: Format, convention: Convention, tolerance_px: float
-) -> Verification:
+def _verification(left: Capture, path: Path, form: Format, convention: Convention, tolerance_px: float) -> Verification:
     if form.name == "ply":
         return verify_points(left, read_ply_points(path), tolerance_px=tolerance_px)
     listed = listed_order(left, form.name)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nerfcli.cameras import rigid
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import Convention, all_axes, opencv_from_axes, poses_of, reinterpreted_poses
 from nerfcli.convert.evidence import FrustumEvidence, Intrinsics, MatchEvidence, ObservationEvidence
@@ -85,7 +84,9 @@ class Detection:
     @property
     def as_format_says(self) -> bool:
         """Whether nothing speaks against the format's own convention."""
-        return self.convention == self.declared and not any(question.verdict == "none holds" for question in self.questions)
+        return self.convention == self.declared and not any(
+            question.verdict == "none holds" for question in self.questions
+        )
 
 
 def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None]) -> Detection:
@@ -205,7 +206,9 @@ def _question(
     by_share = not 0 < answers[0].median_px < np.inf and not answers[0].median_px < answers[1].median_px
     if by_share:
         ratio = answers[0].inlier_share / max(answers[1].inlier_share, 1e-9)
-        low, high = _interval(best, second, evidence.groups, lambda errors: -float(np.mean(errors <= evidence.threshold_px)))
+        low, high = _interval(
+            best, second, evidence.groups, lambda errors: -float(np.mean(errors <= evidence.threshold_px))
+        )
         what = f"the shares differ by {100 * (answers[0].inlier_share - answers[1].inlier_share):.1f} %"
     else:
         ratio = answers[1].median_px / max(answers[0].median_px, 1e-9)

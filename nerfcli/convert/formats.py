@@ -49,6 +49,7 @@ from nerfcli.convert.finding import (
 from nerfcli.errors import UserError
 from nerfcli.media.images import list_images, read_exif
 
+
 @dataclass(frozen=True)
 class Given:
     """What the user gives besides the capture's own files.
@@ -119,7 +120,9 @@ def format_named(name: str) -> Format:
     for form in FORMATS:
         if form.name == name:
             return form
-    raise UserError(f"unknown format {name!r}", f"choose one of {', '.join(form.name for form in FORMATS)}", exit_code=2)
+    raise UserError(
+        f"unknown format {name!r}", f"choose one of {', '.join(form.name for form in FORMATS)}", exit_code=2
+    )
 
 
 def with_photos(capture: Capture, folder: Path) -> Capture:

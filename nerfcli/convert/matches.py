@@ -68,7 +68,9 @@ def match_neighbours(
     present.sort(key=lambda index: frames[index].name)
     steps = [(place, place + 1 + place % 2) for place in range(len(present) - 1)]  # next, next but one, in turn
     steps = [(present[a], present[b]) for a, b in steps if b < len(present)]
-    chosen = [steps[k] for k in np.unique(np.linspace(0, len(steps) - 1, MOST_PAIRS).round().astype(int))] if steps else []
+    chosen = (
+        [steps[k] for k in np.unique(np.linspace(0, len(steps) - 1, MOST_PAIRS).round().astype(int))] if steps else []
+    )
     photos: dict[int, Photo] = {}
     pairs = []
     for done, (first, second) in enumerate(chosen):

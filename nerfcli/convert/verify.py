@@ -53,9 +53,7 @@ class Verification:
         return not self.fault and self.max_px <= self.tolerance_px
 
 
-def verify(
-    capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px: float = TOLERANCE_PX
-) -> Verification:
+def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px: float = TOLERANCE_PX) -> Verification:
     """Compare a capture with what was read back from the file that it was written to.
 
     Every 3D point that a view sees is projected by both, or a random choice of them where pairs of views and points are
