@@ -40,6 +40,7 @@ PARAMS = {
     "EQUIRECTANGULAR": (100, 80),
 }
 WITH_FOCAL = [model for model in PARAMS if model != "EQUIRECTANGULAR"]
+ENDS_AT_90 = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "FOV")
 
 
 def camera_of(model: str) -> Camera:
@@ -197,9 +198,14 @@ def test_answers_are_finite_whatever_is_asked(model):
     assert camera.project(np.zeros((0, 3)))[0].shape == (0, 2)
 
 
+@pytest.mark.parametrize("model", ENDS_AT_90)
+def test_perspective_models_do_not_see_behind_the_camera(model):
+    assert not camera_of(model).project(np.array([[0.1, 0.1, -1.0], [0, 0, -1.0], [1, 0, 0]]))[1].any()
+
+
 @pytest.mark.parametrize("model", WITH_FOCAL)
-def test_what_is_behind_the_camera_is_not_seen(model):
-    assert not camera_of(model).project(np.array([[0.1, 0.1, -1.0], [0, 0, -1.0]]))[1].any()
+def test_no_model_sees_straight_behind(model):
+    assert not camera_of(model).project(np.array([[0, 0, -1.0]]))[1].any()
 
 
 @pytest.mark.parametrize("model", PARAMS)
@@ -235,6 +241,8 @@ def test_field_of_view_and_focal_length_by_hand():
     assert Camera("PINHOLE", 10, 10, (90.0, 110.0, 5.0, 5.0)).focal_px == 100
     sphere = camera_of("EQUIRECTANGULAR")
     assert sphere.fov_deg == (360, 180)
+    beyond_half_a_turn = Camera("SIMPLE_FISHEYE", 400, 100, (100.0, 100.0, 50.0))  # the left edge is 57 degrees off
+    np.testing.assert_allclose(beyond_half_a_turn.fov_deg, np.degrees((4.0, 1.0)))
     assert sphere.focal_px == pytest.approx(100 / (2 * np.pi))
     assert sphere.undistorted().model == "PINHOLE"
 
@@ -256,6 +264,11 @@ def test_a_camera_survives_json_and_is_a_key():
         ("PINHOLE", (0, 4), (1, 1, 1, 1), "0x4 pixels"),
         ("PINHOLE", (4, 4), (1, -1, 1, 1), "make no camera"),
         ("SIMPLE_PINHOLE", (4, 4), (float("nan"), 1, 1), "make no camera"),
+        ("SIMPLE_RADIAL", (4, 4), (1, 1, 1, 1e31), "make no camera"),
+        ("EUCM", (4, 4), (1, 1, 1, 1, 1.01, 1), "make no camera"),
+        ("EUCM", (4, 4), (1, 1, 1, 1, 0.5, 0), "make no camera"),
+        ("FOV", (4, 4), (1, 1, 1, 1, 3.2), "make no camera"),
+        ("EQUIRECTANGULAR", (4, 4), (4, 0), "make no camera"),
     ],
 )
 def test_what_is_no_camera_is_refused(model, size, params, what):

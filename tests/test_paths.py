@@ -10,7 +10,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of, surrounds, up_direction, views_of
-from nerfcli.cameras.paths import focus_point, interpolate, orbit, spiral
+from nerfcli.cameras.paths import ellipse, focus_point, interpolate, orbit, spiral
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 
@@ -155,6 +155,39 @@ def test_orbit_of_an_elongated_ring_is_its_ellipse():
     )
 
 
+@given(seed=seeds)
+@few
+def test_an_ellipse_through_cameras_on_an_ellipse_is_that_ellipse(seed):
+    """In any frame of the world; where all cameras are as far out as the farthest on each axis, it is theirs."""
+    rng = np.random.default_rng(seed)
+    similarity = Similarity(
+        10.0 ** rng.uniform(-2, 2), Rotation.from_quat(rng.normal(size=4)).as_matrix(), rng.normal(size=3)
+    )
+    a, b = 3.0, 2.0
+    angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    # 90 % of |cos| are below cos(0.05 pi): the ellipse is smaller than the cameras' by that.
+    inside = np.cos(0.05 * np.pi)
+    centres = np.stack([a * np.cos(angle), b * np.sin(angle), np.tile([0.8, 1.2], 200)], axis=1) / [inside, inside, 1]
+    path = ellipse(moved(frames_at(centres, np.zeros(3)), similarity), count=50)
+    local = (centres_of(path) - similarity.translation) @ similarity.rotation / similarity.scale
+    np.testing.assert_allclose((local[:, 0] / a) ** 2 + (local[:, 1] / b) ** 2, 1.0, rtol=0, atol=1e-2)
+    np.testing.assert_allclose(local[:, 2], 1.0, rtol=0, atol=1e-6)
+    steps = steps_of(path, closed=True)
+    assert steps.max() < 1.01 * steps.min()  # chords of equal arcs
+    np.testing.assert_allclose(np.cross(views_of(path) @ similarity.rotation, local), 0, rtol=0, atol=1e-4)
+
+
+def test_an_ellipse_ignores_the_farthest_tenth_and_goes_around_where_the_cameras_stand_on_one_side():
+    far = frames_at(np.array([[50.0, 0, 1]]), np.zeros(3))
+    path = ellipse([*ring(np.zeros(3), count=60), *far], count=32)
+    assert np.linalg.norm(centres_of(path), axis=1).max() < 2.5
+    behind = centres_of(ellipse(facing(10.0), count=32))[:, 1]
+    np.testing.assert_allclose([behind.min(), behind.max()], [0, 20], rtol=0, atol=1e-6)
+    line = np.array([[0.0, -y, 0] for y in (1.0, 2.0, 3.0)])
+    with pytest.raises(UserError, match="make no ellipse about what they look at"):
+        ellipse(frames_at(line, np.zeros(3)), count=8)
+
+
 @pytest.mark.parametrize("make", [orbit, spiral])
 def test_a_path_before_a_forward_facing_capture_stays_where_the_cameras_were(make):
     frames = facing()
@@ -249,7 +282,7 @@ def test_every_path_of_every_layout_is_finite_rigid_and_undistorted(make, layout
         assert frame.image is None
 
 
-@pytest.mark.parametrize("make", [orbit, spiral, interpolate])
+@pytest.mark.parametrize("make", [orbit, ellipse, spiral, interpolate])
 def test_a_path_needs_frames_and_views(make):
     with pytest.raises(ValueError, match="got 0 frames and count 5"):
         make([], count=5)

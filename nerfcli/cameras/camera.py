@@ -4,6 +4,7 @@ A model has COLMAP's name and COLMAP's order of parameters. The centre of the to
 picture spans [0, width] x [0, height]. Camera axes are OpenCV's: +x right, +y down, +z forward.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -11,16 +12,17 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from nerfcli.cameras.lens import DISTORTIONS, Lens, lens_of
 from nerfcli.errors import UserError
 
 # COLMAP warns through glog on stderr; what matters comes back as an exception or as NaN.
 pycolmap.logging.minloglevel = 2
 
-# A direction counts as the pixel's own only if it projects back onto it.
-MAX_MISMATCH_PX = 1e-3
+# Rows that are worked on at a time.
+BLOCK_SIZE = 2**15
 
-# COLMAP's undistortion stops at 1e-7 px or so; a Newton step on what is left brings it to rounding.
-POLISH_ABOVE_PX = 1e-11
+# No lens comes near; beyond, powers of the coefficients overflow.
+LARGEST_PARAMETER = 1e30
 
 
 @dataclass(frozen=True)
@@ -42,10 +44,10 @@ class Camera:
     params: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if self.model not in pycolmap.CameraModelId.__members__ or self.model == "INVALID":
+        if self.model not in DISTORTIONS:
             raise UserError(
                 f"unknown camera model {self.model!r}",
-                f"expected one of COLMAP's: {', '.join(sorted(set(pycolmap.CameraModelId.__members__) - {'INVALID'}))}",
+                f"expected one of COLMAP's: {', '.join(sorted(DISTORTIONS))}",
             )
         if self.width < 1 or self.height < 1:
             raise UserError(
@@ -59,12 +61,9 @@ class Camera:
                 f"camera model {self.model} has {len(names)} parameters, got {len(self.params)}",
                 f"expected {', '.join(names)}, in this order",
             )
-        focal = [self.params[i] for i in _colmap_camera(self).focal_length_idxs()]
-        if not np.isfinite(self.params).all() or min(focal, default=1.0) <= 0:
-            raise UserError(
-                f"camera parameters {self.params} of model {self.model} make no camera",
-                "focal lengths must be above 0 and every parameter a finite number",
-            )
+        values = dict(zip(names, self.params, strict=True))
+        if complaint := _complaint(self.model, values):
+            raise UserError(f"camera parameters {self.params} of model {self.model} make no camera", complaint)
 
     @staticmethod
     def pinhole(width: int, height: int, focal_px: float) -> "Camera":
@@ -107,30 +106,20 @@ class Camera:
             pixels: (N, 2) positions x, y in pixels.
 
         Returns:
-            directions (N, 3), unit, camera axes; valid (N,) bool. Where the model has no direction for a pixel (beyond
-            the radius at which a distortion polynomial turns back, or beyond 90 degrees for the models that end
-            there), valid is False and the direction (0, 0, 1). It is never NaN and never a wrong root.
+            directions (N, 3), unit, camera axes, behind the camera too where the lens sees there; valid (N,) bool.
+            Where the model has no direction for a pixel (beyond the radius at which its distortion turns back, or
+            beyond the angle at which the model ends), valid is False and the direction (0, 0, 1). It is never NaN and
+            never a wrong root.
 
         Accuracy: projecting a valid direction gives the pixel to 1e-9 px.
         """
-        pixels = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 2)
-        finite = np.asarray(np.isfinite(pixels).all(axis=1))
-        if not finite.all():
-            pixels = np.where(finite[:, None], pixels, 0.0)
-        colmap = _colmap_camera(self)
-        directions = np.asarray(colmap.cam_ray_from_img(pixels))
-        mismatch = _mismatch_px(colmap, directions, pixels)
-        for _ in range(3):
-            coarse = np.flatnonzero((mismatch > POLISH_ABOVE_PX) & (mismatch < np.inf))
-            if not len(coarse):
-                break
-            better = _newton_step(colmap, directions[coarse], pixels[coarse])
-            mismatch_better = _mismatch_px(colmap, better, pixels[coarse])
-            gain = mismatch_better < mismatch[coarse]
-            directions[coarse[gain]] = better[gain]
-            mismatch[coarse[gain]] = mismatch_better[gain]
-        valid = finite & (mismatch < MAX_MISMATCH_PX) & self._within_domain(directions)
-        directions[~valid] = (0.0, 0.0, 1.0)
+        pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        directions, valid = np.empty((len(pixels), 3)), np.empty(len(pixels), dtype=bool)
+        for block in _blocks(len(pixels)):
+            finite = np.isfinite(pixels[block]).all(axis=1)
+            seen, found = _lens(self).unproject(np.where(finite, pixels[block].T, 0.0))
+            seen[:, ~finite] = np.array([[0.0], [0.0], [1.0]])
+            directions[block], valid[block] = seen.T, found & finite
         return directions, valid
 
     def project(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,17 +129,79 @@ class Camera:
             points_cam: (N, 3) in camera axes.
 
         Returns:
-            pixels (N, 2), which may lie outside the picture; valid (N,) bool. A point behind the camera, at its centre,
-            or beyond the angle at which the lens model turns back has valid False and the pixel (0, 0), never NaN.
+            pixels (N, 2), which may lie outside the picture; valid (N,) bool. A point at the camera's centre, beyond
+            the angle at which the lens model ends (90 degrees from the axis for the perspective models) or beyond the
+            one at which it turns back has valid False and the pixel (0, 0), never NaN.
         """
-        points_cam = np.ascontiguousarray(points_cam, dtype=np.float64).reshape(-1, 3)
-        length = np.linalg.norm(points_cam, axis=1, keepdims=True)
-        seen = np.isfinite(length[:, 0]) & (length[:, 0] > 0)
-        directions = np.where(seen[:, None], points_cam, (0.0, 0.0, 1.0)) / np.where(seen[:, None], length, 1.0)
-        pixels = _projected(_colmap_camera(self), directions)
-        valid = seen & self._within_domain(directions) & np.isfinite(pixels).all(axis=1)
-        pixels[~valid] = 0.0
+        points_cam = np.asarray(points_cam, dtype=np.float64).reshape(-1, 3)
+        pixels, valid = np.empty((len(points_cam), 2)), np.empty(len(points_cam), dtype=bool)
+        for block in _blocks(len(points_cam)):
+            directions, length = _towards(points_cam[block])
+            found, seen = _lens(self).project(directions)
+            found[:, length == 0] = 0.0
+            pixels[block], valid[block] = found.T, seen & (length > 0)
         return pixels, valid
+
+    def project_jacobian(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How the pixels of points move with the points and with the camera's parameters.
+
+        Args:
+            points_cam: (N, 3) in camera axes.
+
+        Returns:
+            d pixel / d point (N, 2, 3), pixels per unit of the points; d pixel / d parameters (N, 2, P) in the order of
+            `params`; valid (N,) bool. Where `project` is not valid both are zero.
+
+        Accuracy: closed forms; relative error of a few 1e-13, of each column to its own size.
+        """
+        directions, length = _towards(np.asarray(points_cam, dtype=np.float64).reshape(-1, 3))
+        by_direction, by_parameters, valid = _lens(self).jacobians(directions)
+        valid &= length > 0
+        # A direction's length does not change its pixel: the derivative at the point is that at the unit direction,
+        # divided by the distance.
+        by_point = by_direction * valid / np.where(valid, length, 1.0)
+        return np.moveaxis(by_point, -1, 0), np.moveaxis(by_parameters * valid, -1, 0), valid
+
+    def bearing_jacobian(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How the directions of pixels turn as the pixels move.
+
+        Args:
+            pixels: (N, 2).
+
+        Returns:
+            d direction / d pixel (N, 3, 2) in radians per pixel, whose columns are normal to the direction; valid (N,)
+            bool as of `bearings`. Zero where not valid.
+
+        The inverse of d pixel / d direction on the plane normal to the direction: J^T (J J^T)^-1.
+        """
+        directions, valid = self.bearings(pixels)
+        by_direction, _, smooth = self.project_jacobian(directions)
+        valid &= smooth
+        by_direction[~valid] = np.eye(2, 3)
+        # With the rows a and b of J: (|b|^2 a - (a.b) b, |a|^2 b - (a.b) a) / |a x b|^2.
+        a, b = by_direction[:, 0], by_direction[:, 1]
+        mixed = (a * b).sum(axis=1, keepdims=True)
+        area = (np.cross(a, b) ** 2).sum(axis=1, keepdims=True)
+        by_x = ((b * b).sum(axis=1, keepdims=True) * a - mixed * b) / area
+        by_y = ((a * a).sum(axis=1, keepdims=True) * b - mixed * a) / area
+        return np.stack([by_x, by_y], axis=-1) * valid[:, None, None], valid
+
+    def pixel_footprint(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The solid angle that a pixel covers, as large as at its centre: 1 / |a x b| with the rows of d pixel / d d.
+
+        A cone of the same solid angle has the radius sqrt(footprint / pi) at distance 1.
+
+        Args:
+            pixels: (N, 2).
+
+        Returns:
+            solid angles (N,) in steradians; valid (N,) bool as of `bearings`. Zero where not valid.
+        """
+        directions, valid = self.bearings(pixels)
+        by_direction, _, smooth = self.project_jacobian(directions)
+        valid &= smooth
+        by_direction[~valid] = np.eye(2, 3)
+        return valid / np.linalg.norm(np.cross(by_direction[:, 0], by_direction[:, 1]), axis=1), valid
 
     def pixel_bearings(self) -> tuple[np.ndarray, np.ndarray]:
         """`bearings` of all pixel centres, row by row: directions (height * width, 3), valid (height * width,)."""
@@ -207,18 +258,14 @@ class Camera:
             ) from error
         return Camera(model, width, height, params)
 
-    def _within_domain(self, directions: np.ndarray) -> np.ndarray:
-        """Whether unit directions lie on the branch of the lens model that starts at the optical axis; (N,) bool."""
-        if self.is_spherical:
-            return np.asarray(np.isfinite(directions).all(axis=1))
-        return directions[:, 2] > _least_cosine(self)
-
     def _opening_deg(self, pixels: np.ndarray) -> float:
         directions, valid = self.bearings(pixels)
         if not valid.any():
             return 0.0
-        first, last = directions[valid][[0, -1]]
-        return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(first, last)), first @ last)))
+        # Step by step, so that more than a half turn is counted as such.
+        seen = directions[valid]
+        sine = np.linalg.norm(np.cross(seen[:-1], seen[1:]), axis=1)
+        return float(np.degrees(np.arctan2(sine, (seen[:-1] * seen[1:]).sum(axis=1)).sum()))
 
 
 @lru_cache(maxsize=256)
@@ -228,59 +275,42 @@ def parameter_names(model: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in camera.params_info.split(","))
 
 
+def _complaint(model: str, values: dict[str, float]) -> str:
+    """What is expected of parameters that make no camera; empty where they make one."""
+    focal = [values[name] for name in ("f", "fx", "fy", "w", "h") if name in values]
+    if not (np.abs(list(values.values())) < LARGEST_PARAMETER).all() or min(focal) <= 0:
+        return "focal lengths must be above 0 and every parameter a finite number"
+    if model == "EUCM" and not (0 <= values["alpha"] <= 1 and values["beta"] > 0):
+        return "alpha must lie in [0, 1] and beta above 0"
+    if model == "FOV" and not abs(values["omega"]) < np.pi:
+        return "omega is an angle in radians and must lie between -pi and pi"
+    return ""
+
+
 @lru_cache(maxsize=256)
 def _colmap_camera(camera: Camera) -> pycolmap.Camera:
     return pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
 
 
 @lru_cache(maxsize=256)
-def _least_cosine(camera: Camera) -> float:
-    """Cosine of the angle from the optical axis up to which the picture's radius grows with the angle.
-
-    A distortion polynomial may turn back: from there on two directions share a pixel, and only the inner one is real.
-    The angle is found by following 24 meridians outwards in steps of 1/20 degree; at the turn the radius is flat, so
-    that the pixels lost to the step are less than 1e-3 px wide.
-    """
-    angles = np.radians(np.arange(0, 1800) / 20.0)  # below 90 degrees
-    azimuths = np.linspace(0, 2 * np.pi, 24, endpoint=False)[:, None]
-    directions = np.stack(
-        np.broadcast_arrays(np.sin(angles) * np.cos(azimuths), np.sin(angles) * np.sin(azimuths), np.cos(angles)),
-        axis=-1,
-    )
-    pixels = _projected(_colmap_camera(camera), directions.reshape(-1, 3))
-    radius = np.linalg.norm(pixels - camera.principal_point, axis=1).reshape(len(azimuths), -1)
-    grows = np.diff(radius, axis=1) > 0  # False at NaN
-    steps = np.where(grows.all(axis=1), len(angles), np.argmin(grows, axis=1)).min()
-    return float(np.cos(angles[steps])) if steps < len(angles) else 0.0
+def _lens(camera: Camera) -> Lens:
+    return lens_of(camera.model, dict(zip(parameter_names(camera.model), camera.params, strict=True)))
 
 
-def _projected(colmap: pycolmap.Camera, directions: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) of directions (N, 3) by the bare formula, for directions behind the camera too; may be NaN."""
-    return np.asarray(colmap.img_from_cam(directions, check_cheirality=False))
+def _blocks(count: int) -> Iterator[slice]:
+    """Slices that cover `count` rows in pieces whose intermediate results stay in the processor's cache."""
+    return (slice(first, first + BLOCK_SIZE) for first in range(0, count, BLOCK_SIZE))
 
 
-def _mismatch_px(colmap: pycolmap.Camera, directions: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """How far from their pixels directions project; infinite where one of them is NaN. (N,)"""
-    mismatch = np.linalg.norm(_projected(colmap, directions) - pixels, axis=1)
-    return np.where(np.isfinite(mismatch), mismatch, np.inf)
-
-
-def _newton_step(colmap: pycolmap.Camera, directions: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """One step of Newton's method towards the pixels, in the plane tangent to the sphere at each direction."""
-    axis = np.where(np.abs(directions[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    first = np.cross(directions, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(directions, first)
-    here = _projected(colmap, directions)
-    step = 1e-6
-    columns = [(_projected(colmap, directions + step * tangent) - here) / step for tangent in (first, second)]
-    (a, c), (b, d) = columns[0].T, columns[1].T
-    x, y = (pixels - here).T
-    determinant = a * d - b * c
-    with np.errstate(divide="ignore", invalid="ignore"):
-        moved = (
-            directions
-            + ((d * x - b * y) / determinant)[:, None] * first
-            + ((a * y - c * x) / determinant)[:, None] * second
-        )
-        return moved / np.linalg.norm(moved, axis=1, keepdims=True)
+def _towards(points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions (3, N) of points (N, 3) and their distances (N,); (0, 0, 1) and 0 where there is no direction."""
+    points = np.ascontiguousarray(points_cam.T)
+    # Scaled first, so that no square overflows or vanishes.
+    largest = np.abs(points).max(axis=0)
+    there = (largest > 0) & (largest < np.inf)  # False at NaN
+    if not there.all():
+        points = np.where(there, points, np.array([[0.0], [0.0], [1.0]]))
+        largest = np.where(there, largest, 1.0)
+    points = points / largest
+    length = np.sqrt((points * points).sum(axis=0))
+    return points / length, np.where(there, length * largest, 0.0)

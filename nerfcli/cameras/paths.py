@@ -1,4 +1,4 @@
-"""Camera paths for renders and videos: an orbit, a spiral, and a flight through the frames.
+"""Camera paths for renders and videos: an orbit, an ellipse, a spiral, and a flight through the frames.
 
 All move at a constant speed and have the first frame's picture size and focal length, without its distortion.
 """
@@ -6,10 +6,9 @@ All move at a constant speed and have the first frame's picture size and focal l
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from nerfcli.cameras import rigid
+from nerfcli.cameras.flight import fly
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import (
     centres_of,
@@ -22,7 +21,7 @@ from nerfcli.cameras.layout import (
 )
 from nerfcli.errors import UserError
 
-__all__ = ["focus_point", "interpolate", "orbit", "spiral"]
+__all__ = ["ellipse", "focus_point", "interpolate", "orbit", "spiral"]
 
 # Samples of a curve from which its arc length is measured; the speed is constant to about 1e-5.
 _CURVE_SAMPLES = 8192
@@ -66,6 +65,49 @@ def orbit(
         curve = _sway(offsets, distances, up)
     centres = focus + _equal_steps(curve, count, closed=True)
     return _looking_at(frames, centres, focus, up=up, name="orbit")
+
+
+def ellipse(
+    frames: Sequence[Frame], *, count: int, depth_hint: float | None = None, up: np.ndarray | None = None
+) -> tuple[Frame, ...]:
+    """A closed level ellipse about the focus point, at the cameras' mean height, looking at the focus.
+
+    Its axes are the principal axes of the cameras on the ground, and each reaches as far to both sides of the focus as
+    nine of ten cameras do. Unlike `orbit` it goes once around wherever the cameras stand: behind the scene too.
+
+    Args:
+        frames: the capture's frames, at least one.
+        count: number of views; the last one is followed by the first.
+        depth_hint: the distance to the focus, in scene units, for cameras with parallel axes.
+        up: (3,) what is up in the world; the cameras' own up if None.
+
+    Raises:
+        ValueError: no frame, or count below 1.
+        UserError: the cameras stand on a line with the focus: there is no ellipse.
+
+    Source: generate_ellipse_path of google-research/multinerf, internal/camera_utils.py (mip-NeRF 360, Zip-NeRF), whose
+    up is the third principal axis of all centres; here it is the cameras' own.
+    """
+    _check(frames, count)
+    focus = focus_point(frames, depth_hint=depth_hint)
+    up = up_direction(frames) if up is None else np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    centres = centres_of(frames)
+    ground = np.stack(horizontal_axes(up), axis=-1)  # (3, 2)
+    flat = (centres - centres.mean(axis=0)) @ ground
+    axes = ground @ np.linalg.eigh(flat.T @ flat)[1]
+    half = np.percentile(np.abs((centres - focus) @ axes), 90, axis=0)
+    if half.min() <= 1e-6 * np.linalg.norm(centres - focus, axis=1).max():
+        raise UserError(
+            f"the cameras make no ellipse about what they look at: its half axes are {half[1]:.3g} and {half[0]:.3g}",
+            "choose the path that sways in front of it (orbit), or the one through the frames (interpolate)",
+        )
+    middle = focus + ((centres - focus) @ up).mean() * up
+
+    def curve(t: np.ndarray) -> np.ndarray:
+        angle = 2 * np.pi * t
+        return middle + np.stack([np.cos(angle), np.sin(angle)], axis=-1) * half @ axes.T
+
+    return _looking_at(frames, _equal_steps(curve, count, closed=True), focus, up=up, name="ellipse")
 
 
 def spiral(
@@ -112,37 +154,13 @@ def spiral(
 
 
 def interpolate(frames: Sequence[Frame], *, count: int) -> tuple[Frame, ...]:
-    """A smooth flight through the frames in their order, from the first to the last, at constant speed.
-
-    Centres follow a cubic spline over centripetal lengths (which does not overshoot between near frames), rotations a
-    spline of the same smoothness. Where the camera turns almost on the spot, turning takes its time too.
+    """A smooth flight through the frames in their order, from the first to the last, at constant speed: see `fly`.
 
     Raises:
         ValueError: no frame, or count below 1.
     """
     _check(frames, count)
-    frames = _without_repeats(frames)
-    if len(frames) == 1:
-        return tuple(_path_frame(frames[0], frames[0].world_from_cam, f"flight_{i:04d}") for i in range(count))
-    centres = centres_of(frames)
-    rotations = Rotation.from_matrix(np.stack([frame.world_from_cam[:3, :3] for frame in frames]))
-    moved = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    angles = (rotations[:-1].inv() * rotations[1:]).magnitude()
-    # What a radian counts beside lengths: a quarter of what moving counts on the whole path.
-    per_radian = 0.25 * moved.sum() / max(angles.sum(), 1e-12) if moved.sum() > 0 else 1.0
-    knots = np.concatenate([[0.0], np.cumsum(np.sqrt(np.maximum(moved, per_radian * angles)))])
-    position = CubicSpline(knots, centres, bc_type="natural")
-    rotation = RotationSpline(knots, rotations) if len(frames) > 2 else Slerp(knots, rotations)
-
-    t = np.linspace(0.0, knots[-1], _CURVE_SAMPLES + 1)
-    along = rotation(t)
-    steps = np.maximum(
-        np.linalg.norm(np.diff(position(t), axis=0), axis=1),
-        per_radian * (along[:-1].inv() * along[1:]).magnitude(),
-    )
-    length = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.interp(np.linspace(0.0, length[-1], count), length, t)
-    poses = rigid.from_parts(rotation(at).as_matrix(), position(at))
+    poses = fly(np.stack([frame.world_from_cam for frame in frames]), count)
     return tuple(_path_frame(frames[0], pose, f"flight_{i:04d}") for i, pose in enumerate(poses))
 
 
@@ -225,12 +243,3 @@ def _looking_at(
 
 def _path_frame(like: Frame, world_from_cam: np.ndarray, name: str) -> Frame:
     return Frame(name, like.camera.undistorted(), world_from_cam)
-
-
-def _without_repeats(frames: Sequence[Frame]) -> list[Frame]:
-    """The frames without those that repeat the pose before them: a spline needs its knots apart."""
-    kept = [frames[0]]
-    for frame in frames[1:]:
-        if np.abs(frame.world_from_cam - kept[-1].world_from_cam).max() > 1e-9:
-            kept.append(frame)
-    return kept

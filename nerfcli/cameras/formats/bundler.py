@@ -159,13 +159,14 @@ def _points(
             raise malformed(
                 where, f"announces {count:g} views, but has {len(words) - 1} numbers", "expected 4 for each view"
             )
-        values = numbers(words[1:], len(words) - 1, where)
-        if not all(0 <= camera < num_cameras and camera == int(camera) for camera in values[::4]):
-            raise malformed(where, "a view has a camera that is not there", f"expected 0 to {num_cameras - 1}")
-        views += values
+        views += numbers(words[1:], len(words) - 1, where)
         owners += [index] * int(count)
     table = np.array(views, dtype=np.float64).reshape(-1, 4)
     table[:, 1] = owners
+    known = (table[:, 0] >= 0) & (table[:, 0] < num_cameras) & (table[:, 0] == np.floor(table[:, 0]))
+    if not known.all():
+        where = _line(lines, 3 * owners[int(np.argmin(known))] + 2, 0, path)[2]
+        raise malformed(where, "a view has a camera that is not there", f"expected 0 to {num_cameras - 1}")
     return points, np.clip(np.rint(colours), 0, 255).astype(np.uint8), table
 
 

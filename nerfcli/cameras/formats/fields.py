@@ -81,7 +81,8 @@ def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
         values = list(map(float, words))
     except ValueError:
         values = []
-    if len(values) == count and all(-LARGEST <= value <= LARGEST for value in values):  # False for NaN too
+    in_range = min(values, default=0) >= -LARGEST and max(values, default=0) <= LARGEST
+    if len(values) == count and in_range and math.isfinite(sum(values)):  # NaN may escape the comparisons, not the sum
         return values
     _refuse_number(words, where)
 

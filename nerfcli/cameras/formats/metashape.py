@@ -116,7 +116,7 @@ def _is_aligned(record: Element) -> bool:
 
 def _worlds_from_chunk(chunk: Element, path: Path) -> dict[str | None, rigid.Similarity | None]:
     """`world_from_chunk` by component id; under None that of cameras that belong to no component."""
-    worlds = {None: _similarity(chunk.find("transform"), f"{path}: chunk")}
+    worlds: dict[str | None, rigid.Similarity | None] = {None: _similarity(chunk.find("transform"), f"{path}: chunk")}
     for component in chunk.iterfind("components/component"):
         key = component.get("id")
         worlds[key] = _similarity(component.find("transform"), f"{path}: component {shown(key)}")

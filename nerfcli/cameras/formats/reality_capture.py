@@ -64,7 +64,7 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
     frames = []
     for index, name in enumerate(names):
         if name in sizes:
-            intrinsics = dict(zip(_NUMBERS[6:], rows[index, 6:].tolist(), strict=True))
+            intrinsics: dict[str, float] = dict(zip(_NUMBERS[6:], rows[index, 6:].tolist(), strict=True))
             camera = _camera(intrinsics, sizes[name][0], places[index])
             frames.append(Frame(name, camera, poses[index], image=sizes[name][1]))
     return Capture(tuple(frames), np.zeros((0, 3)), missing, None, "reality_capture")
@@ -110,7 +110,7 @@ def _cells(line: str, where: str) -> list[str]:
 
 def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camera:
     scale = max(size)
-    focal = (value["f"] / 36 * scale,) * 2
+    focal_px = value["f"] / 36 * scale
     centre = (size[0] / 2 + value["px"] * scale, size[1] / 2 + value["py"] * scale)
     if value["k4"] != 0:
         raise malformed(
@@ -120,7 +120,7 @@ def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camer
         )
     return lenses.brown_camera(
         size,
-        focal,
+        (focal_px, focal_px),
         centre,
         radial=(value["k1"], value["k2"], value["k3"]),
         tangential=(value["t2"], value["t1"]),

@@ -1,0 +1,162 @@
+"""A lens: a projection, then a distortion or two, then focal length and principal point, as COLMAP's models name them.
+
+Coordinates come first here: directions are (3, N), pixels (2, N).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras.distortion import Distortion
+from nerfcli.cameras.projections import (
+    Division,
+    EnhancedUnified,
+    Equidistant,
+    Equirectangular,
+    FieldOfView,
+    Perspective,
+    Projection,
+)
+
+# The parameters of each model's distortions, by the name of the term: one group for F(q), a second for F2(F1(q)).
+# OpenCV's tangential terms are du = 2 p1 u v + p2 (s + 2 u^2), dv = 2 p2 u v + p1 (s + 2 v^2): the vector is (p2, p1).
+DISTORTIONS: dict[str, tuple[dict[str, tuple[str, ...]], ...]] = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ({"radial": ("k",)},),
+    "RADIAL": ({"radial": ("k1", "k2")},),
+    "OPENCV": ({"radial": ("k1", "k2"), "tangential": ("p2", "p1")},),
+    "FULL_OPENCV": ({"radial": ("k1", "k2", "k3"), "divisor": ("k4", "k5", "k6"), "tangential": ("p2", "p1")},),
+    "SIMPLE_FISHEYE": (),
+    "FISHEYE": (),
+    "SIMPLE_RADIAL_FISHEYE": ({"radial": ("k",)},),
+    "RADIAL_FISHEYE": ({"radial": ("k1", "k2")},),
+    "OPENCV_FISHEYE": ({"radial": ("k1", "k2", "k3", "k4")},),
+    "THIN_PRISM_FISHEYE": ({"radial": ("k1", "k2", "k3", "k4"), "tangential": ("p2", "p1"), "prism": ("sx1", "sy1")},),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        {"radial": ("k0", "k1", "k2", "k3", "k4", "k5")},
+        {"tangential": ("p0", "p1"), "prism": ("s0", "s2"), "prism_fourth": ("s1", "s3")},
+    ),
+    "FOV": (),
+    "SIMPLE_DIVISION": (),
+    "DIVISION": (),
+    "EUCM": (),
+    "EQUIRECTANGULAR": (),
+}
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The map between directions and pixels; `lens_of` makes one.
+
+    Args:
+        projection: from directions to the plane.
+        distortions: of the plane, the innermost first.
+        focal_px: (2, 1).
+        principal_point: (2, 1) in pixels.
+        spread: (inner, parameters), d inner / d parameters: the inner parameters are those of the projection, of the
+            distortions in their order, fx, fy, cx and cy.
+    """
+
+    projection: Projection
+    distortions: tuple[Distortion, ...]
+    focal_px: np.ndarray
+    principal_point: np.ndarray
+    spread: np.ndarray
+
+    def project(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (2, N) of unit directions (3, N), and whether the lens sees them, (N,) bool; zeros where not."""
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            valid = self.projection.sees(directions)
+            plane = self.projection.plane(_where_seen(directions, valid))
+            for distortion in self.distortions:
+                valid = valid & _within(plane, distortion.reach)
+                plane = distortion.apply(plane)
+            pixels = plane * self.focal_px + self.principal_point
+        valid = valid & np.isfinite(pixels).all(axis=0)
+        pixels[:, ~valid] = 0.0
+        return pixels, valid
+
+    def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Unit directions (3, N) of finite pixels (2, N), and whether the lens has one, (N,) bool; +z where not."""
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            plane = (pixels - self.principal_point) / self.focal_px
+            valid = np.ones(pixels.shape[1], dtype=bool)
+            for distortion in reversed(self.distortions):
+                plane, found = distortion.invert(plane)
+                valid &= found
+            directions, found = self.projection.directions(plane)
+            # Rounding may put a pixel at the very edge of the domain beyond it.
+            valid &= found & np.isfinite(directions).all(axis=0) & self.projection.sees(directions)
+        directions[:, ~valid] = np.array([[0.0], [0.0], [1.0]])
+        return directions, valid
+
+    def jacobians(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives of `project` at unit directions (3, N).
+
+        Returns:
+            d pixel / d direction (2, 3, N) and d pixel / d parameters (2, P, N), zeros where the lens does not see;
+            whether it does, (N,) bool.
+        """
+        _, valid = self.project(directions)
+        directions = _where_seen(directions, valid)
+        plane = self.projection.plane(directions)
+        by_direction = self.projection.jacobian(directions)
+        columns = self.projection.parameter_jacobian(directions)
+        for distortion in self.distortions:
+            by_plane = distortion.jacobian(plane)
+            by_direction = np.einsum("ijn,jkn->ikn", by_plane, by_direction)
+            columns = np.einsum("ijn,jkn->ikn", by_plane, columns)
+            columns = np.concatenate([columns, distortion.coefficient_jacobian(plane)], axis=1)
+            plane = distortion.apply(plane)
+        axes = np.repeat(np.eye(2)[:, :, None], plane.shape[1], axis=2)
+        columns = np.concatenate([columns * self.focal_px[:, :, None], axes * plane[:, None], axes], axis=1)
+        by_parameters = np.einsum("ikn,kp->ipn", columns, self.spread)
+        return by_direction * self.focal_px[:, :, None] * valid, by_parameters * valid, valid
+
+
+def lens_of(model: str, values: dict[str, float]) -> Lens:
+    """The lens of one of COLMAP's models.
+
+    Args:
+        model: one of `DISTORTIONS`.
+        values: the parameters by COLMAP's names, in COLMAP's order.
+    """
+    groups = DISTORTIONS[model]
+    distortions = tuple(
+        Distortion(**{term: tuple(values[name] for name in names) for term, names in group.items()}) for group in groups
+    )
+    projection, inner = _projection(model, values)
+    inner += [{name: 1.0} for group in groups for names in group.values() for name in names]
+    if model == "EQUIRECTANGULAR":
+        width, height = values["w"], values["h"]
+        focal, centre = (width, height), (width / 2, height / 2)
+        inner += [{"w": 1.0}, {"h": 1.0}, {"w": 0.5}, {"h": 0.5}]
+    else:
+        focal_names = ("f", "f") if "f" in values else ("fx", "fy")
+        focal, centre = tuple(values[name] for name in focal_names), (values["cx"], values["cy"])
+        inner += [{name: 1.0} for name in (*focal_names, "cx", "cy")]
+    spread = np.array([[shares.get(name, 0.0) for name in values] for shares in inner])
+    return Lens(projection, distortions, np.array(focal)[:, None], np.array(centre)[:, None], spread)
+
+
+def _projection(model: str, values: dict[str, float]) -> tuple[Projection, list[dict[str, float]]]:
+    """A model's projection, and of each of its parameters the share that each of the model's has in it."""
+    if model == "EQUIRECTANGULAR":
+        return Equirectangular(), []
+    if model == "FOV":
+        return FieldOfView(values["omega"]), [{"omega": 1.0}]
+    if model == "EUCM":
+        return EnhancedUnified(values["alpha"], values["beta"]), [{"alpha": 1.0}, {"beta": 1.0}]
+    if model in ("SIMPLE_DIVISION", "DIVISION"):
+        return Division(values["k"]), [{"k": 1.0}]
+    return (Equidistant() if model.endswith("FISHEYE") else Perspective()), []
+
+
+def _where_seen(directions: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The directions, with the optical axis in place of those that are not seen."""
+    return np.where(seen, directions, np.array([[0.0], [0.0], [1.0]]))
+
+
+def _within(plane: np.ndarray, reach: float) -> np.ndarray:
+    return np.sqrt(plane[0] ** 2 + plane[1] ** 2) < reach

@@ -1,0 +1,41 @@
+"""Frames by the names that people type."""
+
+from collections.abc import Sequence
+from difflib import get_close_matches
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+
+
+def frames_named(frames: Sequence[Frame], names: Sequence[str]) -> tuple[Frame, ...]:
+    """The frames with these names, in the order of the names; one may come twice.
+
+    A name is the frame's whole name, or its last parts where only one frame ends so: photo.jpg for images/photo.jpg,
+    or photo for images/photo.jpg.
+
+    Raises:
+        UserError: no frame has the name, or several end so; the nearest names are told.
+    """
+    whole = {frame.name: frame for frame in frames}
+    endings: dict[str, list[Frame]] = {}
+    for frame in frames:
+        parts = frame.name.split("/")
+        stem = parts[-1].rpartition(".")[0]
+        for start in range(len(parts)):
+            endings.setdefault("/".join(parts[start:]), []).append(frame)
+            if stem:
+                endings.setdefault("/".join([*parts[start:-1], stem]), []).append(frame)
+    return tuple(_named(name, whole, endings) for name in names)
+
+
+def _named(name: str, whole: dict[str, Frame], endings: dict[str, list[Frame]]) -> Frame:
+    if name in whole:
+        return whole[name]
+    found = endings.get(name, [])
+    if len(found) == 1:
+        return found[0]
+    if found:
+        several = ", ".join(frame.name for frame in found[:3])
+        raise UserError(f"{len(found)} images are called {name}: {several}", "give more of the name")
+    near = get_close_matches(name, whole, n=3, cutoff=0.5) or list(whole)[:3]
+    raise UserError(f"no image is called {name!r}", f"there are {len(whole)}, such as {', '.join(near)}")

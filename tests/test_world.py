@@ -1,0 +1,150 @@
+"""Another world frame: what a similarity changes of a capture and what not; up, origin, and the smallest rotation."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.layout import up_direction
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.world import WORLD_AXES, moved_to_origin, smallest_rotation, transformed, turned_up
+from nerfcli.errors import UserError
+
+few = settings(max_examples=30, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+LENS = Camera("OPENCV", 64, 48, (50, 52, 33, 23, -0.1, 0.02, 0.001, 0.002))
+
+
+def capture_of(rng: np.random.Generator, *, count: int = 8, unit: str = "arbitrary") -> Capture:
+    """Cameras around (1, 2, 3) that look at it, +y up, and points about it."""
+    focus = np.array([1.0, 2.0, 3.0])
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    centres = focus + np.stack([3 * np.cos(angle), np.full(count, 1.0), 3 * np.sin(angle)], axis=1)
+    frames = tuple(
+        Frame(f"{i}.jpg", LENS, rigid.look_at(c, focus, np.array([0.0, 1, 0]))) for i, c in enumerate(centres)
+    )
+    points = focus + 0.3 * rng.normal(size=(20, 3))
+    seen = Observations(np.zeros(20, dtype=np.int64), np.arange(20), rng.random((20, 2)))
+    depths = np.stack([rigid.apply(rigid.inverse(frame.world_from_cam), points)[:, 2] for frame in frames])
+    bounds = np.stack([depths.min(axis=1), depths.max(axis=1)], axis=1)
+    colours = rng.integers(0, 256, (20, 3)).astype(np.uint8)
+    return Capture(frames, points, ("gone.jpg",), bounds, "test", colours, seen, unit)
+
+
+def random_similarity(rng: np.random.Generator, scale: float) -> Similarity:
+    return Similarity(scale, Rotation.from_quat(rng.normal(size=4)).as_matrix(), scale * rng.normal(size=3))
+
+
+def pixels_of(capture: Capture) -> np.ndarray:
+    return np.stack(
+        [f.camera.project(rigid.apply(rigid.inverse(f.world_from_cam), capture.points))[0] for f in capture.frames]
+    )
+
+
+@given(seed=seeds, scale=st.sampled_from([1e-3, 0.7, 1.0, 1e3]))
+@few
+def test_a_similarity_changes_no_pixel_and_scales_depths(seed, scale):
+    rng = np.random.default_rng(seed)
+    before = capture_of(rng, unit="metre")
+    after = transformed(before, random_similarity(rng, scale))
+    np.testing.assert_allclose(pixels_of(after), pixels_of(before), rtol=0, atol=1e-9)
+    depths = np.stack([rigid.apply(rigid.inverse(f.world_from_cam), after.points)[:, 2] for f in after.frames])
+    assert after.depth_bounds is not None
+    np.testing.assert_allclose(after.depth_bounds[:, 0], depths.min(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(after.depth_bounds[:, 1], depths.max(axis=1), rtol=1e-12)
+    assert after.unit == ("metre" if scale == 1 else "arbitrary")
+    assert (after.missing, after.kind, after.colours) == (before.missing, before.kind, before.colours)
+    assert after.observations is before.observations
+    assert [frame.camera for frame in after.frames] == [frame.camera for frame in before.frames]
+
+
+@given(seed=seeds, scale=st.sampled_from([1e-3, 1.0, 1e3]))
+@few
+def test_there_and_back_through_json_is_where_it_was(seed, scale):
+    rng = np.random.default_rng(seed)
+    before, similarity = capture_of(rng), random_similarity(rng, scale)
+    back = Similarity.from_json(similarity.to_json()).inverse()
+    after = transformed(transformed(before, similarity), back)
+    np.testing.assert_allclose(after.points, before.points, rtol=0, atol=1e-12)
+    for one, other in zip(after.frames, before.frames, strict=True):
+        np.testing.assert_allclose(one.world_from_cam, other.world_from_cam, rtol=0, atol=1e-12)
+
+
+def test_a_capture_without_frames_or_bounds_keeps_none():
+    points = np.array([[1.0, 0, 0]])
+    after = transformed(Capture((), points, (), None, "ply"), Similarity(2.0, np.eye(3), np.zeros(3)))
+    assert (after.frames, after.depth_bounds) == ((), None)
+    np.testing.assert_array_equal(after.points, 2 * points)
+
+
+@given(seed=seeds, axis=st.sampled_from(sorted(WORLD_AXES)))
+@few
+def test_up_points_along_the_axis_and_nothing_else_changes_size(seed, axis):
+    rng = np.random.default_rng(seed)
+    capture = transformed(capture_of(rng), random_similarity(rng, 2.0))
+    turn = turned_up(capture.frames, axis)
+    assert turn.scale == 1
+    np.testing.assert_array_equal(turn.translation, 0)
+    np.testing.assert_allclose(up_direction(transformed(capture, turn).frames), WORLD_AXES[axis], rtol=0, atol=1e-9)
+    known = rng.normal(size=3)
+    turn = turned_up([], axis, up=known)
+    np.testing.assert_allclose(turn.rotation @ known, np.linalg.norm(known) * WORLD_AXES[axis], rtol=0, atol=1e-14)
+
+
+def test_axes_by_hand():
+    np.testing.assert_array_equal(WORLD_AXES["-y"], [0, -1, 0])
+    np.testing.assert_array_equal(WORLD_AXES["z"], [0, 0, 1])
+    # y up becomes z up by a quarter turn about x: z goes to -y.
+    np.testing.assert_allclose(
+        turned_up([], "z", up=np.array([0.0, 3, 0])).rotation @ [0, 0, 1], [0, -1, 0], atol=1e-15
+    )
+
+
+@given(
+    seed=seeds, angle=st.sampled_from([0.0, 1e-12, 1e-6, 1.0, 2.2, np.pi - 1e-6, np.pi - 1e-9, np.pi - 1e-15, np.pi])
+)
+@few
+def test_the_smallest_rotation_at_every_angle(seed, angle):
+    """Against the definition: it turns a into b, by the angle between them; scipy measures the angle."""
+    rng = np.random.default_rng(seed)
+    a, other = rng.normal(size=(2, 3))
+    a /= np.linalg.norm(a)
+    across = np.cross(a, other)
+    b = np.cos(angle) * a + np.sin(angle) * across / np.linalg.norm(across)
+    b /= np.linalg.norm(b)
+    rotation = smallest_rotation(a, b)
+    np.testing.assert_allclose(rotation @ a, b, rtol=0, atol=2e-15)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=2e-15)
+    np.testing.assert_allclose(np.linalg.det(rotation), 1.0, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(Rotation.from_matrix(rotation).magnitude(), angle, rtol=0, atol=3e-8)
+
+
+def test_origins():
+    capture = capture_of(np.random.default_rng(0))
+    for origin, expected in (("focus", [1, 2, 3]), ("centre-of-cameras", [1, 3, 3]), ("0.5,-1e1, 2", [0.5, -10, 2])):
+        moved = moved_to_origin(capture.frames, origin)
+        np.testing.assert_allclose(moved.apply(np.array(expected)), 0, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(moved.rotation, np.eye(3))
+        assert moved.scale == 1
+
+
+@pytest.mark.parametrize(
+    ("make", "what"),
+    [
+        (lambda: turned_up([], "up", up=np.ones(3)), "no axis 'up'"),
+        (lambda: turned_up([], "z"), "no cameras that would tell which way is up"),
+        (lambda: turned_up([], "z", up=np.zeros(3)), "is no direction"),
+        (lambda: turned_up([], "z", up=np.array([np.nan, 0, 1])), "is no direction"),
+        (lambda: moved_to_origin([], "focus"), "no cameras that would tell the focus"),
+        (lambda: moved_to_origin([], "middle"), "'middle' is no point"),
+        (lambda: moved_to_origin([], "1,2"), "no point of three finite numbers"),
+        (lambda: moved_to_origin([], "1,2,inf"), "no point of three finite numbers"),
+    ],
+)
+def test_what_is_no_direction_or_place_is_refused(make, what):
+    with pytest.raises(UserError, match=what):
+        make()
