@@ -47,6 +47,21 @@ def convert(
     intrinsics: Annotated[
         Path | None, typer.Option(help="The camera of tum and kitti: cameras.txt, a JSON camera, or a capture.")
     ] = None,
+    world_up: Annotated[
+        str | None, typer.Option(help="Turn the world so that up is its x, y, z, -x, -y or -z axis.")
+    ] = None,
+    origin: Annotated[
+        str | None, typer.Option(help="Move the world's origin to centre-of-cameras, focus, or x,y,z of IN.")
+    ] = None,
+    scale: Annotated[
+        str | None, typer.Option(help="Multiply lengths by a number; gps: to metres, by the photos' EXIF.")
+    ] = None,
+    distance: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='A known distance, to metres: "A B 1.25", A and B images or points x,y,z; many may be given.'
+        ),
+    ] = None,
     allow_loss: Annotated[
         bool, typer.Option("--allow-loss", help="Leave out what the format cannot hold (it is listed).")
     ] = False,
@@ -80,6 +95,7 @@ def convert(
       nerfcli convert fern poses.txt --to kitti --allow-loss
       nerfcli convert poses.txt capture.npz --to npz --intrinsics cameras.txt
       nerfcli convert transforms.json opencv.json --to transforms --axes opencv --pixel-center 0
+      nerfcli convert scene/ metric.npz --to npz --world-up z --origin focus --distance "a.jpg b.jpg 1.25"
       nerfcli convert strange/ --detect
       nerfcli convert strange/ mended.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
@@ -102,6 +118,7 @@ def convert(
             raise typer.BadParameter(f"{to!r}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         if target is None:
             raise typer.BadParameter("say where the result goes", param_hint="OUT")
+        world = {"up": world_up, "origin": origin, "scale": scale, "distances": tuple(distance or ())}
         wanted = {
             "axes": axes,
             "pixel_centre": _pixel_centre(pixel_center, "--pixel-center"),
@@ -114,7 +131,15 @@ def convert(
         def work(path: Path, one_of_many: bool) -> None:
             place = target / _named_for(path).resolve().name if one_of_many else target
             convert_one(
-                path, place, to=to, images=images, intrinsics=intrinsics, doubt=doubt, wanted=wanted, console=console
+                path,
+                place,
+                to=to,
+                images=images,
+                intrinsics=intrinsics,
+                doubt=doubt,
+                world=world,
+                wanted=wanted,
+                console=console,
             )
 
     for_each_input(source, work)
@@ -128,6 +153,7 @@ def convert_one(
     images: Path | None,
     intrinsics: Path | None,
     doubt: dict[str, Any],
+    world: dict[str, Any],
     wanted: dict[str, Any],
     console: Console,
 ) -> None:
@@ -135,17 +161,27 @@ def convert_one(
     from nerfcli.convert.conversion import Doubt, Wanted, convert, load
     from nerfcli.convert.formats import Given, format_named
     from nerfcli.convert.intrinsics import read_intrinsics
+    from nerfcli.convert.world_frame import WorldFrame, in_world_frame
 
     given = Given(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
     form, found, capture = load(source, given, Doubt(**doubt))
     console.note(f"{found}: {form.name}, {_contents(capture)}")
+    capture, new_from_old, scale = in_world_frame(capture, WorldFrame(**world))
+    if scale is not None:
+        error = "" if scale.standard_error is None else f" +- {scale.standard_error:.2g}"
+        unit = "%" if scale.residual_unit == "percent" else "m"
+        console.note(
+            f"a unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; "
+            f"residual {scale.rms_residual:.2g} {unit}"
+        )
     done = convert(capture, target, source_format=form.name, wanted=Wanted(format_named(to), **wanted))
     for loss in done.losses:
         console.warn(f"{to} cannot hold {loss}")
     if done.loss_px:
         console.warn(f"without the lost terms of lenses, pixels are off by up to {done.loss_px:.3g} px")
     _tell_verification(done, console)
-    console.result(done.path, _record(done, to))
+    record = _record(done, to) | {"new_from_old": new_from_old.to_json()}
+    console.result(done.path, record if scale is None else record | {"scale": scale.to_json()})
 
 
 def detect_one(

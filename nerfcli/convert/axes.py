@@ -15,8 +15,8 @@ from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError
 
-# Sources: docs.opencv.org calib3d; docs.nerf.studio "Data conventions"; Fyusion/LLFF README; pytorch3d.org/docs/cameras;
-# ROS REP 103, body frames.
+# Sources: docs.opencv.org calib3d; docs.nerf.studio "Data conventions"; Fyusion/LLFF README;
+# pytorch3d.org/docs/cameras; ROS REP 103, body frames.
 NAMED_AXES = {"opencv": "rdf", "opengl": "rub", "llff": "drb", "pytorch3d": "luf", "ros": "flu"}
 
 _DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "d": (0, 1, 0), "u": (0, -1, 0), "f": (0, 0, 1), "b": (0, 0, -1)}
@@ -36,7 +36,7 @@ def opencv_from_axes(axes: str) -> np.ndarray:
     if columns.shape != (3, 3) or abs(np.linalg.det(columns)) < 0.5:
         raise UserError(
             f"unknown camera axes {axes!r}",
-            f"choose {', '.join(NAMED_AXES)}, or three letters for where x, y and z point, out of r l, d u and f b: rdf",
+            f"choose {', '.join(NAMED_AXES)}, or three letters for where x, y and z point: rdf, rub, ...",
         )
     if np.linalg.det(columns) < 0:
         raise UserError(

@@ -1,5 +1,4 @@
-"""Converting a capture: parse, apply what the user knows, refuse or accept losses, write, verify, and keep only then.
-"""
+"""Converting a capture: parse, apply what the user knows, refuse or accept losses, write, verify, keep."""
 
 import os
 import shutil
@@ -14,9 +13,9 @@ from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import NAMED_AXES, Convention, expressed, opencv_from_axes, reinterpreted
 from nerfcli.convert.formats import Format, Given, recognise, with_photos
 from nerfcli.convert.probes import probes_of, projected
-from nerfcli.convert.readback import READERS, Meant, UnreadableError, read_ply_points
+from nerfcli.convert.readback import READERS, Meant, read_ply_points
 from nerfcli.convert.reduction import reduced
-from nerfcli.convert.verify import TOLERANCE_PX, Verification, listed_order, verify, verify_points
+from nerfcli.convert.verify import TOLERANCE_PX, Verification, listed_order, unreadable, verify, verify_points
 from nerfcli.errors import GATE_NOT_MET, UserError
 
 
@@ -175,18 +174,20 @@ def _verification(left: Capture, path: Path, form: Format, convention: Conventio
     letters = NAMED_AXES.get(convention.axes, convention.axes)
     try:
         back = READERS[form.name](path, Meant(letters, convention.pixel_centre, sizes))
-    except (KeyError, IndexError, ValueError, RuntimeError, OSError) as error:
-        raise UnreadableError(f"{type(error).__name__}: {error}") from error
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OSError) as error:
+        return unreadable(left, f"it cannot be read back ({type(error).__name__}: {error})", tolerance_px=tolerance_px)
     return verify(left, back, listed=listed, tolerance_px=tolerance_px)
 
 
 def _does_not_hold(path: Path, verification: Verification) -> UserError:
     what = verification.fault or (
         f"a point of {verification.worst} is off by {verification.max_px:.3g} px "
-        f"(rotations by {verification.max_deg:.3g} degrees, centres by {verification.max_centre_shift:.3g} of the scene)"
+        f"(rotations by {verification.max_deg:.3g} degrees, "
+        f"centres by {verification.max_centre_shift:.3g} of the scene's size); "
+        f"tolerance {verification.tolerance_px:.3g} px"
     )
     return UserError(
-        f"{path} did not hold what it should: {what}; tolerance {verification.tolerance_px:.3g} px",
+        f"{path} did not hold what it should: {what}",
         "nothing was kept; this is a fault of nerfcli, please report it (--no-verify writes the file all the same)",
         exit_code=GATE_NOT_MET,
     )
@@ -213,7 +214,7 @@ def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterat
     Folders that were made on the way are removed with it.
     """
     missing = [folder for folder in (path, *path.parents) if not folder.exists()]
-    place = path.with_name(f".{path.name}.old-{os.getpid()}")
+    place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder takes
     aside = {file: place / file.name for file in there}
     if there:
         place.mkdir()

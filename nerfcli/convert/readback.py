@@ -86,7 +86,7 @@ def read_blender(path: Path, meant: Meant) -> ReadBack:
 
 def read_llff(path: Path, meant: Meant) -> ReadBack:
     """poses_bounds.npy, by NumPy: 17 numbers a view, of which the fifth column of 3 x 5 is height, width, focal."""
-    rows = np.load(path)
+    rows = np.load(path / "poses_bounds.npy")
     matrices = rows[:, :15].reshape(-1, 3, 5)
     rotations, centres = _views_from_world_from_cam(matrices[:, :, :4], meant.axes)
     lenses = []
@@ -219,7 +219,7 @@ def _views_from_world_from_cam(matrices: Any, axes: str) -> tuple[np.ndarray, np
 
 
 def _pointing(poses: np.ndarray, axes: str, along: str, against: str) -> np.ndarray:
-    """The direction in the world (views, 3) that a camera calls e.g. right, "r", where its axes have it or its opposite."""
+    """Where in the world (views, 3) a direction of the camera points, of which the axes have it or its opposite."""
     if along in axes:
         return poses[:, :3, axes.index(along)]
     return -poses[:, :3, axes.index(against)]

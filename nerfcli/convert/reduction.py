@@ -1,4 +1,5 @@
-"""What is left of a capture in a format that cannot hold all of it: the cameras, without the terms that are lost.
+"""What is left of a capture in a format that cannot hold all of it: the cameras, without the terms that are lost, and
+names, as far as other programs read them.
 
 A written file is compared with this when losses were accepted. It says in its own words what a writer keeps, so that a
 writer that loses something else is found out.
@@ -17,7 +18,9 @@ _BROWN = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
 def reduced(capture: Capture, format_name: str) -> Capture:
-    """The capture with the cameras that a format can hold; the same capture where it can hold every camera."""
+    """The capture with the cameras and names that a format can hold."""
+    if format_name == "colmap-text":
+        return replace(capture, frames=tuple(replace(f, name=f.name.split(" ")[0]) for f in capture.frames))
     if format_name == "blender":
         return _with_one_angle(_with_cameras(capture, _pinhole))
     change = {"transforms": _to_transforms, "llff": _pinhole, "opensfm": _to_opensfm}.get(format_name)

@@ -31,8 +31,10 @@ class Verification:
         max_centre_shift: the largest distance between the two centres of a view, over the size of the scene.
         max_point_shift: the largest distance between the two positions of a point, over the size of the scene.
         worst: the name of the view that has max_px, or of the one in error.
-        num_views, num_points, num_projections: compared.
-        tolerance_px: what max_px may be; max_deg may turn a picture's corner by as much.
+        num_views, num_points, num_projections: compared. The poses of all views are, those without a point too.
+        tolerance_px: what max_px may be.
+        tolerance_rad: the same as an angle at the longest focal length; what rotations may differ by, and positions in
+            sizes of the scene.
         fault: what is wrong with the file beside numbers, such as a view that is not there; "" if nothing.
     """
 
@@ -45,12 +47,14 @@ class Verification:
     num_points: int
     num_projections: int
     tolerance_px: float
+    tolerance_rad: float
     fault: str = ""
 
     @property
     def holds(self) -> bool:
         """Whether the file says the same as the capture."""
-        return not self.fault and self.max_px <= self.tolerance_px
+        moved = max(np.radians(self.max_deg), self.max_centre_shift, self.max_point_shift)
+        return not self.fault and self.max_px <= self.tolerance_px and moved <= self.tolerance_rad
 
 
 def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px: float = TOLERANCE_PX) -> Verification:
@@ -67,18 +71,14 @@ def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px
         tolerance_px: the largest residual that passes.
     """
     probes = probes_of(capture)
-    points = capture.points if back.points is not None else np.zeros((0, 3))
-    empty = Verification(
-        max_px=np.inf,
-        max_deg=np.inf,
-        max_centre_shift=np.inf,
-        max_point_shift=np.inf,
-        worst="",
-        num_views=len(capture.frames),
+    tolerance_px = max(tolerance_px, _rounding_px(capture, probes))
+    empty = replace(
+        unreadable(capture, "", tolerance_px=tolerance_px),
+        num_views=len(np.unique(probes.frame_index)),
         num_points=len(np.unique(probes.point_index[probes.point_index >= 0])),
         num_projections=len(probes.points),
-        tolerance_px=max(tolerance_px, _rounding_px(capture, probes)),
     )
+    points = capture.points
     try:
         order = _order(capture, back, listed)
         if back.points is not None and back.points.shape != points.shape:
@@ -103,12 +103,21 @@ def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px
     )
 
 
+def unreadable(capture: Capture, fault: str, *, tolerance_px: float = TOLERANCE_PX) -> Verification:
+    """What is to be said of a file that could not be compared."""
+    tolerance_rad = tolerance_px / max(frame.camera.focal_px for frame in capture.frames)
+    return Verification(np.inf, np.inf, np.inf, np.inf, "", 0, 0, 0, tolerance_px, tolerance_rad, fault)
+
+
 def verify_points(capture: Capture, points: np.ndarray, *, tolerance_px: float = TOLERANCE_PX) -> Verification:
     """Compare the points alone, for a format that holds nothing else: they must be the same to the last bit."""
     same = points.shape == capture.points.shape
     shift = float(np.abs(points - capture.points).max(initial=0.0) / _size(capture)) if same else np.inf
     fault = "" if shift == 0 else f"its points are off by {shift:.3g} of the scene"
-    return Verification(0.0, 0.0, 0.0, shift, "", 0, len(capture.points), 0, tolerance_px, fault)
+    told = unreadable(capture, fault, tolerance_px=tolerance_px)
+    return replace(
+        told, max_px=0.0, max_deg=0.0, max_centre_shift=0.0, max_point_shift=shift, num_points=len(capture.points)
+    )
 
 
 def listed_order(capture: Capture, format_name: str) -> np.ndarray:
@@ -132,7 +141,7 @@ def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
         raise UnreadableError(f"it holds {len(back.centres)} views instead of {len(capture.frames)}")
     names = [frame.name for frame in capture.frames]
     places = {label: index for index, label in enumerate(back.labels or ())}
-    if set(places) == set(names):
+    if len(places) == len(names) and set(places) == set(names):
         return np.array([places[name] for name in names])
     if back.labels is not None:  # paths as seen from the file, or without a suffix
         for frame_index, label in zip(listed, back.labels, strict=True):
