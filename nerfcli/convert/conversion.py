@@ -195,7 +195,7 @@ def _does_not_hold(path: Path, verification: Verification) -> UserError:
 
 def _loss_px(capture: Capture, left: Capture) -> float:
     """How far apart a capture and what is left of it show the same points, at most, within the first one's pictures."""
-    if left is capture:
+    if all(one.camera == other.camera for one, other in zip(capture.frames, left.frames, strict=True)):
         return 0.0
     probes = probes_of(capture)
     return float(np.linalg.norm(projected(left, probes)[0] - probes.pixels, axis=1).max(initial=0.0))

@@ -92,7 +92,7 @@ def _photo(frame: Frame) -> Photo:
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1 else grey
     # Without the precise upscaling, OpenCV's keypoints lie a quarter of a pixel off.
-    sift = cv2.SIFT_create(nfeatures=MOST_FEATURES, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=MOST_FEATURES, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(small, None)
     if descriptors is None:
         return Photo(camera, np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32))
@@ -131,7 +131,7 @@ def _matched(first: Photo, second: Photo) -> tuple[np.ndarray, np.ndarray] | Non
     # In units of the size in which features were sought, so that the threshold means the same for every photo.
     scales = [LONGER_SIDE_PX / max(photo.camera.width, photo.camera.height) for photo in (first, second)]
     scaled = [position * min(1.0, scale) for position, scale in zip(pixels, scales, strict=True)]
-    _, agree = cv2.findFundamentalMat(*scaled, cv2.USAC_MAGSAC, _EPIPOLAR_PX, 0.999, 5000)
+    _, agree = cv2.findFundamentalMat(scaled[0], scaled[1], cv2.USAC_MAGSAC, _EPIPOLAR_PX, 0.999, 5000)
     if agree is None or agree.sum() < _LEAST_MATCHES:
         return None
     kept = agree.ravel().astype(bool)

@@ -12,8 +12,8 @@ from nerfcli.convert.axes import poses_of
 # Pairs of a view and a point that are tried; where there are more, each view gets a random choice of the points.
 MOST_PAIRS = 500_000
 
-# Synthetic points per view: pixels spread over the picture, at depths from half to twice the capture's own.
-SYNTHETIC_PER_VIEW = 16
+# Synthetic points per view that are tried, at distances from half to twice the capture's own.
+SYNTHETIC_PER_VIEW = 24
 
 
 @dataclass(frozen=True)
@@ -82,17 +82,23 @@ def scene_distance(capture: Capture) -> float:
 
 
 def _synthetic(capture: Capture, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Frame indices (M,) and points (M, 3) in the world, on the rays of random pixels of every view."""
-    cameras, camera_of_frame = distinct([frame.camera for frame in capture.frames])
-    share = rng.random((SYNTHETIC_PER_VIEW, 2))
-    poses, distance = poses_of(capture), scene_distance(capture)
-    all_frames, all_points = [], []
-    for camera, frames in zip(cameras, rows_of_each(camera_of_frame, len(cameras)), strict=True):
-        directions, valid = camera.bearings(share * (camera.width, camera.height))
-        distances = distance * 2.0 ** rng.uniform(-1, 1, (len(frames), int(valid.sum()), 1))
-        all_points.append(rigid.apply(poses[frames], directions[valid] * distances).reshape(-1, 3))
-        all_frames.append(np.repeat(frames, int(valid.sum())))
-    return np.concatenate(all_frames), np.concatenate(all_points)
+    """Frame indices (M,) and points (M, 3) in the world, in directions that reach beyond the picture of each view.
+
+    They are those of an equidistant lens of the camera's focal length, theta = radius / focal: of a perspective picture
+    they are the wider ones, and of a panorama all around. No lens needs to be inverted for that, which is slow where
+    every photo has its own.
+    """
+    cameras = [frame.camera for frame in capture.frames]
+    size = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
+    centre = np.array([camera.principal_point for camera in cameras])
+    focal_px = np.array([camera.focal_px for camera in cameras])
+    share = rng.random((len(cameras), SYNTHETIC_PER_VIEW, 2))
+    across = (share * size[:, None] - centre[:, None]) / focal_px[:, None, None]
+    theta = np.linalg.norm(across, axis=2, keepdims=True)
+    directions = np.concatenate([across * np.sinc(theta / np.pi), np.cos(theta)], axis=2)
+    distances = scene_distance(capture) * 2.0 ** rng.uniform(-1, 1, theta.shape)
+    points = rigid.apply(poses_of(capture), directions * distances)
+    return np.repeat(np.arange(len(cameras)), SYNTHETIC_PER_VIEW), points.reshape(-1, 3)
 
 
 def _seen(capture: Capture, frame_index: np.ndarray, point_index: np.ndarray, points: np.ndarray) -> Probes:

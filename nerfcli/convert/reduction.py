@@ -7,14 +7,17 @@ writer that loses something else is found out.
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.frame import Capture
 
-# Models whose parameters behind the principal point are the first of OpenCV's; the others have different formulas.
-_BROWN = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+# Models that transforms.json holds whole.
+_HELD = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"),
+)
 
 
 def reduced(capture: Capture, format_name: str) -> Capture:
@@ -55,30 +58,31 @@ def _pinhole(camera: Camera) -> Camera:
 
 
 def _to_transforms(camera: Camera) -> Camera:
-    """OpenCV's k1, k2, p1, p2, k3, or its fisheye's k1 to k4."""
-    if camera.is_spherical:
-        return camera
+    """OpenCV's k1, k2, p1, p2, k3, or its fisheye's k1 to k4; a camera that has no other terms is left as it is."""
     value = dict(zip(parameter_names(camera.model), camera.params, strict=True))
-    head = (value.get("fx", value.get("f", 0.0)), value.get("fy", value.get("f", 0.0)), value["cx"], value["cy"])
+    if camera.is_spherical or camera.model in _HELD:
+        return camera
+    head = (value["fx"] if "fx" in value else value["f"], value["fy"] if "fy" in value else value["f"])
+    head = (*head, value["cx"], value["cy"])
     if "FISHEYE" in camera.model:
-        if camera.model.startswith("RAD_TAN"):
-            terms = [value[key] for key in ("k0", "k1", "k2", "k3")]
-        else:
-            terms = [value.get("k", value.get("k1", 0.0)), *(value.get(key, 0.0) for key in ("k2", "k3", "k4"))]
-        return Camera("OPENCV_FISHEYE", camera.width, camera.height, (*head, *terms))
-    if camera.model not in _BROWN:
-        return Camera("PINHOLE", camera.width, camera.height, head)
-    k1 = value.get("k", value.get("k1", 0.0))
-    terms = (k1, *(value.get(key, 0.0) for key in ("k2", "p1", "p2", "k3")), 0.0, 0.0, 0.0)
-    return Camera("FULL_OPENCV", camera.width, camera.height, (*head, *terms))
+        keys = ("k0", "k1", "k2", "k3") if camera.model.startswith("RAD_TAN") else ("k1", "k2", "k3", "k4")
+        return Camera("OPENCV_FISHEYE", camera.width, camera.height, (*head, *(value.get(key, 0.0) for key in keys)))
+    if camera.model == "FULL_OPENCV":
+        return _without(camera, ("k4", "k5", "k6"))
+    return Camera("PINHOLE", camera.width, camera.height, head)
 
 
 def _to_opensfm(camera: Camera) -> Camera:
     """Brown's terms without the denominator's, or six radial ones of the fisheye."""
-    lost = {
-        "FULL_OPENCV": ("k4", "k5", "k6"),
-        "RAD_TAN_THIN_PRISM_FISHEYE": ("p0", "p1", "s0", "s1", "s2", "s3"),
-    }.get(camera.model, ())
+    if camera.model == "FULL_OPENCV":
+        return _without(camera, ("k4", "k5", "k6"))
+    if camera.model == "RAD_TAN_THIN_PRISM_FISHEYE":
+        return _without(camera, ("p0", "p1", "s0", "s1", "s2", "s3"))
+    return camera
+
+
+def _without(camera: Camera, lost: Collection[str]) -> Camera:
+    """The camera with some terms 0."""
     values = zip(parameter_names(camera.model), camera.params, strict=True)
     params = tuple(0.0 if name in lost else value for name, value in values)
     return Camera(camera.model, camera.width, camera.height, params)
