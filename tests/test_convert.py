@@ -18,6 +18,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import OPENCV_FROM_LLFF, OPENCV_FROM_OPENGL
 from nerfcli.cameras.formats import blender, colmap_binary, llff, opensfm, trajectories, transforms, transforms_cameras
 from nerfcli.cameras.formats.archive import write_npz
+from nerfcli.cameras.formats.ply import write_ply
 from nerfcli.cameras.frame import Capture
 from nerfcli.cli.convert import FORMATS_WRITTEN
 from nerfcli.convert import lenses
@@ -401,6 +402,28 @@ def test_coordinates_of_the_globe_are_compared_as_finely_as_float64_can(tmp_path
     assert 1e-6 < done.verification.tolerance_px <= _ROUNDINGS * 505 * 5000010 / 0.9
 
 
+def test_points_alone(tmp_path):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    result = nerfcli("convert", source, tmp_path / "points.ply", "--to", "ply", "--allow-loss")
+    assert result.exit_code == 0, result.stderr
+    assert "6 cameras and their poses" in result.stderr
+    assert "its 60 points are those of" in result.stderr
+    capture = capture_of([PINHOLE])
+    shifted = replace(capture, points=capture.points + 1e-9)
+    wrong = replace(format_named("ply"), write=lambda _, path: write_ply(shifted, path))
+    with pytest.raises(UserError, match="its points are off by"):
+        convert(capture, tmp_path / "2.ply", source_format="npz", wanted=Wanted(wrong, allow_loss=True))
+
+
+def test_points_beside_a_transforms_json_are_compared_too(tmp_path, monkeypatch):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    right = transforms.write_ply
+    monkeypatch.setattr(transforms, "write_ply", lambda c, path: right(replace(c, points=c.points[:, ::-1]), path))
+    result = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss")
+    assert result.exit_code == GATE_NOT_MET
+    assert set(listing(tmp_path)) == {"in.npz"}
+
+
 # The command
 
 
@@ -458,6 +481,18 @@ def test_wrong_usage(options, named, tmp_path):
     result = nerfcli("convert", npz_of(tmp_path, capture_of([PINHOLE])), *options)
     assert result.exit_code == USAGE
     assert named in result.stderr
+
+
+@pytest.mark.parametrize("prefix", ["", "images/"])
+def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, tmp_path):
+    capture = replace(capture_of([PINHOLE]), observations=None)
+    write_photos(tmp_path / "images", capture)
+    capture = replace(capture, frames=tuple(replace(f, name=prefix + f.name) for f in capture.frames))
+    convert(capture, tmp_path / "sparse" / "0", source_format="made", wanted=Wanted(format_named("colmap")))
+    result = nerfcli("convert", tmp_path, tmp_path / "elsewhere" / "transforms.json", "--to", "transforms")
+    assert result.exit_code == 0, result.stderr
+    content = json.loads((tmp_path / "elsewhere" / "transforms.json").read_text())
+    assert content["frames"][0]["file_path"] == "../images/photo 00.png"
 
 
 def test_what_was_looked_for_is_told(tmp_path):

@@ -177,7 +177,7 @@ def convert_one(
     done = convert(capture, target, source_format=form.name, wanted=Wanted(format_named(to), **wanted))
     for loss in done.losses:
         console.warn(f"{to} cannot hold {loss}")
-    if done.loss_px:
+    if done.loss_px > wanted["tolerance_px"]:
         console.warn(f"without the lost terms of lenses, pixels are off by up to {done.loss_px:.3g} px")
     _tell_verification(done, console)
     record = _record(done, to) | {"new_from_old": new_from_old.to_json()}
@@ -257,7 +257,7 @@ def _record(done: "Conversion", to: str) -> dict[str, Any]:
 
 def _table(found: "Detection") -> list[str]:
     """Per question the hypotheses that matter: the best ones, and the one that the format prescribes."""
-    lines = [f"  {'hypothesis':<44}{'median error':>14}{'inliers':>9}  verdict"]
+    lines = [f"  {'hypothesis':<52}{'median error':>14}{'inliers':>9}  verdict"]
     for question in found.questions:
         lines.append(f"  {question.name}")
         for place, answer in enumerate(question.answers):
@@ -265,7 +265,7 @@ def _table(found: "Detection") -> list[str]:
                 verdict = _verdict(question) if place == 0 else ""
                 error = "behind" if answer.median_px == float("inf") else f"{answer.median_px:.3f} px"
                 line = (
-                    f"    {_hypothesis(question, answer):<42}{error:>14}{100 * answer.inlier_share:>7.1f} %  {verdict}"
+                    f"    {_hypothesis(question, answer):<50}{error:>14}{100 * answer.inlier_share:>7.1f} %  {verdict}"
                 )
                 lines.append(line.rstrip())
     if found.as_format_says:

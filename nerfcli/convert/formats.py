@@ -156,9 +156,16 @@ def _parse_scene(path: Path, given: Given) -> Capture:
 
 
 def _parse_model(path: Path, given: Given) -> Capture:
+    """A COLMAP model, with the photos where its names lead to one: below images/ beside it, or below its project."""
+    capture = parse_colmap(path)
     homes = (path, *path.resolve().parents[:3])
-    beside = (home / name for home in homes for name in IMAGE_FOLDERS)
-    return parse_colmap(path, given.images or next((folder for folder in beside if folder.is_dir()), None))
+    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
+    places = [given.images] if given.images is not None else [*folders, *homes]
+    leading = [place for place in places if any((place / frame.name).is_file() for frame in capture.frames[:100])]
+    place = next(iter([*leading, *folders]), None)
+    if place is None:
+        return capture
+    return replace(capture, frames=tuple(replace(frame, image=place / frame.name) for frame in capture.frames))
 
 
 FORMATS = (

@@ -7,7 +7,7 @@ reads only what nerfcli writes, so it is short and checks nothing: whatever is w
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +71,11 @@ def read_colmap(path: Path, meant: Meant) -> ReadBack:
 
 
 def read_transforms(path: Path, meant: Meant) -> ReadBack:
-    """transforms.json, by the json module."""
-    return _from_transforms([json.loads(path.read_text(encoding="utf-8"))], meant)
+    """transforms.json, by the json module, and the PLY file of points that it names."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    cloud = content.get("ply_file_path")
+    points = np.zeros((0, 3)) if cloud is None else read_ply_points(path.parent / cloud)
+    return replace(_from_transforms([content], meant), points=points)
 
 
 def read_blender(path: Path, meant: Meant) -> ReadBack:
