@@ -178,12 +178,12 @@ def test_what_is_lost_is_said(tmp_path):
     assert losses_opensfm(full) == (
         "k4 of 1 camera",
         "k6 of 1 camera",
-        "lens of 1 camera (FOV)",
+        "the FOV lens of 1 camera",
+        "1 masks",
         "3 observations",
-        "1 mask",
-        "held-out split",
-        "depth bounds of 6 frames",
-        "unit of length (metre)",
+        "the split of 1 frames",
+        "depth bounds",
+        "the unit of length (metre)",
     )
     with pytest.raises(UserError, match="FOV cannot be written"):
         write_opensfm(full, tmp_path / "reconstruction.json")

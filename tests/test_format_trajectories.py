@@ -78,7 +78,8 @@ def test_round_trip_reprojects_to_a_millionth_of_a_pixel(tmp_path, kind):
         (["rgb/0.5.png", "rgb/1.25.png"], ["0.5", "1.25"]),
         (["a.png", "b.png"], ["0", "1"]),
         (["left/1.png", "right/1.png"], ["0", "1"]),  # no two poses at the same time
-        (["1e3", "nan"], ["0", "1"]),
+        (["1e3", "2E-4"], ["1e3", "2E-4"]),
+        (["1", "nan"], ["0", "1"]),
     ],
 )
 def test_timestamps_are_the_names_where_these_are_numbers(tmp_path, names, timestamps):
@@ -93,10 +94,10 @@ def test_timestamps_are_the_names_where_these_are_numbers(tmp_path, names, times
 def test_what_is_lost_is_said():
     frame = Frame("000000", CAMERA, np.eye(4), mask=Path("m.png"), split="train")
     capture = Capture((frame,), np.ones((5, 3)), (), None, "x", colours=np.zeros((5, 3), dtype=np.uint8), unit="metre")
-    rest = ("5 points", "1 mask", "held-out split", "unit of length (metre)")
+    rest = ("1 masks", "5 points", "colours of 5 points", "the split of 1 frames", "the unit of length (metre)")
     for losses in LOSSES.values():
         assert losses(capture) == ("intrinsics of 1 camera", *rest)
-    assert losses_kitti(capture_of(["a"])) == ("intrinsics of 1 camera", "names of 1 frame")
+    assert losses_kitti(capture_of(["a"])) == ("intrinsics of 1 camera", "names of 1 frames")
 
 
 @pytest.mark.parametrize("kind", PARSERS)
@@ -117,6 +118,7 @@ def test_without_a_camera_the_user_is_asked_for_one(tmp_path, kind):
         ("tum", "\n1 0 0 0 0 0 0 x\n", "line 2: 'x' is no number"),
         ("tum", "1 0 0 0 0 0 0 nan\n", "'nan' is not finite"),
         ("tum", "1 1e200 0 0 0 0 0 1\n", "'1e200' is too large"),
+        ("tum", "noon 0 0 0 0 0 0 1\n", "its timestamp is 'noon'"),
         ("tum", "1 0 0 0 0 0 0 2\n", "quaternion has length 2"),
         ("tum", "1 0 0 0 0 0 0 0\n", "quaternion has length 0"),
         ("tum", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "'1' is listed twice"),

@@ -18,7 +18,7 @@ from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats import lenses
 from nerfcli.cameras.formats.fields import filled_lines, malformed, name_of, numbers, read_text, refuse_twins
 from nerfcli.cameras.formats.photos import measured_sizes
-from nerfcli.cameras.formats.transforms import rigid_pose
+from nerfcli.cameras.formats.poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.orientation import Measure
 
@@ -27,7 +27,7 @@ _EXPECTED = f'expected a file of Bundler, which begins with "{_HEADER}"'
 _LIST_EXPECTED = "expected Bundler's list of images, one name per line"
 
 # In the list a name may be followed by a zero and the focal length in pixels that EXIF suggests.
-_FOCAL_GUESS = re.compile(r"\s+\d+\s+[\d.eE+-]+$|\s+0$", re.ASCII)
+_FOCAL_GUESS = re.compile(r"[\d.eE+-]+", re.ASCII)
 
 Numbered = tuple[int, str]
 
@@ -124,7 +124,10 @@ def _list_lines(path: Path) -> list[Numbered]:
 
 
 def _listed(line: str, where: str) -> str:
-    return name_of(_FOCAL_GUESS.sub("", line.strip()), where).removeprefix("./")
+    words = line.rsplit(maxsplit=2)
+    if len(words) == 3 and words[1] == "0" and _FOCAL_GUESS.fullmatch(words[2]):
+        line = words[0]
+    return name_of(line, where).removeprefix("./")
 
 
 def _frame(name: str, lines: list[Numbered], size: tuple[int, int], image: Path, path: Path) -> Frame:

@@ -11,13 +11,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from nerfcli.cameras.formats.limits import MOST_PIXELS, MOST_UNITS
 from nerfcli.errors import UserError
-
-# No coordinate, angle or lens parameter is larger; beyond, products of a few of them would overflow.
-LARGEST = 1e100
-
-# No picture is wider or higher.
-LARGEST_SIZE_PX = 10**7
 
 _LONGEST_NAME = 1000
 
@@ -81,7 +76,7 @@ def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
         values = list(map(float, words))
     except ValueError:
         values = []
-    in_range = min(values, default=0) >= -LARGEST and max(values, default=0) <= LARGEST
+    in_range = min(values, default=0) >= -MOST_UNITS and max(values, default=0) <= MOST_UNITS
     if len(values) == count and in_range and math.isfinite(sum(values)):  # NaN may escape the comparisons, not the sum
         return values
     _refuse_number(words, where)
@@ -131,7 +126,7 @@ def size_of(width: float, height: float, where: str) -> tuple[int, int]:
     Raises:
         UserError: one of them is no whole number from 1 to the largest picture there is.
     """
-    if not all(1 <= side <= LARGEST_SIZE_PX and side == int(side) for side in (width, height)):
+    if not all(1 <= side <= MOST_PIXELS and side == int(side) for side in (width, height)):
         what = f"width and height are {shown(width)} and {shown(height)}"
         raise malformed(where, what, "expected the picture's size in whole pixels")
     return int(width), int(height)
@@ -164,7 +159,7 @@ def refuse_twins(names: Iterable[str], path: Path) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST <= value <= LARGEST
+    return isinstance(value, int | float) and not isinstance(value, bool) and -MOST_UNITS <= value <= MOST_UNITS
 
 
 def _is_plain(text: str) -> bool:
@@ -175,7 +170,7 @@ def _is_plain(text: str) -> bool:
 def _refuse_number(words: Iterable[str], where: str) -> NoReturn:
     for word in words:
         try:
-            if -LARGEST <= float(word) <= LARGEST:
+            if -MOST_UNITS <= float(word) <= MOST_UNITS:
                 continue
             what = f"{shown(word)} is not finite" if not math.isfinite(float(word)) else f"{shown(word)} is too large"
         except ValueError:

@@ -5,7 +5,7 @@ Letters: focal lengths fx, fy and principal point cx, cy in pixels; k radial, p 
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import malformed
-from nerfcli.errors import UserError
+from nerfcli.cameras.formats.limits import stated_camera
 
 Pair = tuple[float, float]
 
@@ -32,14 +32,16 @@ def brown_camera(
     """
     k1, k2, k3 = radial
     if k3:
-        return _camera("FULL_OPENCV", size, (*focal, *centre, k1, k2, *tangential, k3, 0.0, 0.0, 0.0), where)
+        return stated_camera(
+            "FULL_OPENCV", *size, (*focal, *centre, k1, k2, *tangential, k3, 0.0, 0.0, 0.0), where=where
+        )
     if any(tangential) or (focal[0] != focal[1] and (k1 or k2)):
-        return _camera("OPENCV", size, (*focal, *centre, k1, k2, *tangential), where)
+        return stated_camera("OPENCV", *size, (*focal, *centre, k1, k2, *tangential), where=where)
     if k2:
-        return _camera("RADIAL", size, (focal[0], *centre, k1, k2), where)
+        return stated_camera("RADIAL", *size, (focal[0], *centre, k1, k2), where=where)
     if k1:
-        return _camera("SIMPLE_RADIAL", size, (focal[0], *centre, k1), where)
-    return _camera("PINHOLE", size, (*focal, *centre), where)
+        return stated_camera("SIMPLE_RADIAL", *size, (focal[0], *centre, k1), where=where)
+    return stated_camera("PINHOLE", *size, (*focal, *centre), where=where)
 
 
 def fisheye_camera(
@@ -65,8 +67,8 @@ def fisheye_camera(
     """
     if any(tangential) or any(prism):
         params = (*focal, *centre, *radial[:2], *tangential, *radial[2:], *prism)
-        return _camera("THIN_PRISM_FISHEYE", size, params, where)
-    return _camera("OPENCV_FISHEYE", size, (*focal, *centre, *radial), where)
+        return stated_camera("THIN_PRISM_FISHEYE", *size, params, where=where)
+    return stated_camera("OPENCV_FISHEYE", *size, (*focal, *centre, *radial), where=where)
 
 
 def long_fisheye_camera(
@@ -78,7 +80,7 @@ def long_fisheye_camera(
         UserError: numbers that make no camera; `where` is named.
     """
     params = (*focal, *centre, *radial, *(0.0,) * 6)
-    return _camera("RAD_TAN_THIN_PRISM_FISHEYE", size, params, where)
+    return stated_camera("RAD_TAN_THIN_PRISM_FISHEYE", *size, params, where=where)
 
 
 def spherical_camera(size: tuple[int, int], where: str) -> Camera:
@@ -91,11 +93,4 @@ def spherical_camera(size: tuple[int, int], where: str) -> Camera:
         raise malformed(
             where, f"a spherical picture of {size[0]}x{size[1]} pixels", "expected one twice as wide as it is high"
         )
-    return _camera("EQUIRECTANGULAR", size, (float(size[0]), float(size[1])), where)
-
-
-def _camera(model: str, size: tuple[int, int], params: tuple[float, ...], where: str) -> Camera:
-    try:
-        return Camera(model, *size, params)
-    except UserError as error:
-        raise malformed(where, error.message, error.hint) from error
+    return stated_camera("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), where=where)

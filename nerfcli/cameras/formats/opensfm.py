@@ -21,7 +21,6 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.formats import lenses
 from nerfcli.cameras.formats.fields import (
-    LARGEST,
     malformed,
     name_of,
     number,
@@ -32,7 +31,8 @@ from nerfcli.cameras.formats.fields import (
     size_of,
     vector,
 )
-from nerfcli.cameras.formats.losses import counted, lost
+from nerfcli.cameras.formats.limits import plausible
+from nerfcli.cameras.formats.losses import distortion, lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
 
@@ -82,17 +82,7 @@ def parse_opensfm(path: Path) -> Capture:
 
 def losses_opensfm(capture: Capture) -> tuple[str, ...]:
     """What reconstruction.json cannot hold of a capture. Observations stand in OpenSfM's tracks.csv, not there."""
-    clauses = []
-    for model, terms in _LOST_TERMS.items():
-        names = parameter_names(model)
-        cameras = {frame.camera for frame in capture.frames if frame.camera.model == model}
-        for term in terms:
-            used = sum(camera.params[names.index(term)] != 0 for camera in cameras)
-            clauses += [f"{term} of {counted(used, 'camera')}"] if used else []
-    for model in _NO_WORDS:
-        used = len({frame.camera for frame in capture.frames if frame.camera.model == model})
-        clauses += [f"lens of {counted(used, 'camera')} ({model})"] if used else []
-    return (*clauses, *lost(capture, holds=("points", "colours")))
+    return (*lost_of_cameras(capture, _lost_of), *lost_parts(capture, holds=("points", "colours")))
 
 
 def write_opensfm(capture: Capture, path: Path) -> None:
@@ -118,6 +108,13 @@ def write_opensfm(capture: Capture, path: Path) -> None:
     content = [{"cameras": cameras, "shots": shots, "points": points}]
     with atomic_path(path) as partial:  # on one line: ten times quicker than indented, for millions of points
         partial.write_text(json.dumps(content, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _lost_of(camera: Camera) -> list[str]:
+    """The distortion terms of a camera that OpenSfM has no key for, or its model where there is nothing like it."""
+    if camera.model in _NO_WORDS:
+        return [f"the {camera.model} lens"]
+    return [name for name in distortion(camera) if name in _LOST_TERMS.get(camera.model, ())]
 
 
 def _largest(path: Path) -> dict[str, Any]:
@@ -259,7 +256,7 @@ def _points(content: dict[str, Any], path: Path) -> tuple[np.ndarray, np.ndarray
 def _rows(values: list[Any]) -> np.ndarray:
     """Lists of three numbers as one array; quicker than `vector` on each. Raises where one of them is none."""
     rows = np.array(values, dtype=np.float64)
-    if rows.shape != (len(values), 3) or not (np.abs(rows) <= LARGEST).all():
+    if rows.shape != (len(values), 3) or not plausible(rows).all():
         raise ValueError("not three finite numbers each")
     return rows
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
@@ -246,5 +246,5 @@ def _typical_gap(centres: np.ndarray) -> float:
     """Median distance from a camera to its nearest neighbour; 1 where all stand in one place."""
     if len(centres) < 2:
         return 1.0
-    gap = float(np.median(cKDTree(centres).query(centres, k=2)[0][:, 1]))
+    gap = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
     return gap if gap > 0 else 1.0

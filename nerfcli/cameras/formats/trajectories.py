@@ -14,9 +14,9 @@ import numpy as np
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.fields import filled_lines, malformed, numbers, read_text, refuse_twins
-from nerfcli.cameras.formats.losses import counted, lost
-from nerfcli.cameras.formats.transforms import rigid_pose
+from nerfcli.cameras.formats.fields import filled_lines, malformed, numbers, read_text, refuse_twins, shown
+from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts
+from nerfcli.cameras.formats.poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
 
@@ -26,7 +26,7 @@ _KITTI_EXPECTED = "expected lines of 12 numbers, the first three rows of a 4x4 m
 # How far the length of a quaternion may be from 1: files print 4 digits or more; beyond is a mistake, not rounding.
 _MAX_BEND = 1e-2
 
-_NUMBER = re.compile(r"[+-]?\d{1,20}(\.\d{0,20})?", re.ASCII)
+_NUMBER = re.compile(r"[+-]?\d{1,20}(\.\d{0,20})?([eE][+-]?\d{1,2})?", re.ASCII)
 _PICTURE = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)
 
 
@@ -118,11 +118,15 @@ def _parse(
 
 
 def _tum_pose(_: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
-    values = np.array(numbers(words, 8, where))
-    xyzw = values[4:]
+    if len(words) != 8:
+        raise malformed(where, f"has {len(words)} numbers", "expected 8")
+    values = np.array(numbers(words[1:], 7, where))
+    xyzw = values[3:]
     if abs(np.linalg.norm(xyzw) - 1.0) > _MAX_BEND:
         raise malformed(where, f"its quaternion has length {np.linalg.norm(xyzw):.4g}", "expected length 1")
-    return words[0], rigid.from_parts(rigid.rotation_from_quaternion(xyzw[[3, 0, 1, 2]]), values[1:4])
+    if not _NUMBER.fullmatch(words[0]):
+        raise malformed(where, f"its timestamp is {shown(words[0])}", "expected seconds, such as 1305031102.1753")
+    return words[0], rigid.from_parts(rigid.rotation_from_quaternion(xyzw[[3, 0, 1, 2]]), values[:3])
 
 
 def _kitti_pose(index: int, words: list[str], where: str) -> tuple[str, np.ndarray]:
@@ -142,9 +146,8 @@ def _timestamps(capture: Capture) -> list[str]:
 
 
 def _losses(capture: Capture, *, named: bool) -> tuple[str, ...]:
-    cameras = len({frame.camera for frame in capture.frames})
-    names = [] if named else [f"names of {counted(len(capture.frames), 'frame')}"]
-    return (f"intrinsics of {counted(cameras, 'camera')}", *names, *lost(capture))
+    names = [] if named else [f"names of {len(capture.frames)} frames"]
+    return (*lost_of_cameras(capture, lambda _: ["intrinsics"]), *names, *lost_parts(capture, holds=()))
 
 
 def _write(lines: list[str], path: Path) -> None:

@@ -1,0 +1,108 @@
+"""Small captures with known truth, of every camera model, for the tests of capture formats; and what equality means."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture, Frame, Observations
+
+# Every model of COLMAP, with all of its terms in use.
+CAMERAS = {
+    "SIMPLE_PINHOLE": Camera("SIMPLE_PINHOLE", 640, 480, (500.0, 321.0, 239.0)),
+    "PINHOLE": Camera("PINHOLE", 640, 480, (500.0, 501.0, 321.0, 239.0)),
+    "SIMPLE_RADIAL": Camera("SIMPLE_RADIAL", 640, 480, (500.0, 321.0, 239.0, 0.05)),
+    "RADIAL": Camera("RADIAL", 640, 480, (500.0, 321.0, 239.0, 0.05, -0.02)),
+    "OPENCV": Camera("OPENCV", 640, 480, (500.0, 501.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002)),
+    "FULL_OPENCV": Camera(
+        "FULL_OPENCV", 640, 480, (500.0, 501.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002, 0.01, 0.02, 0.01, 0.003)
+    ),
+    "SIMPLE_FISHEYE": Camera("SIMPLE_FISHEYE", 640, 480, (300.0, 321.0, 239.0)),
+    "FISHEYE": Camera("FISHEYE", 640, 480, (300.0, 301.0, 321.0, 239.0)),
+    "SIMPLE_RADIAL_FISHEYE": Camera("SIMPLE_RADIAL_FISHEYE", 640, 480, (300.0, 321.0, 239.0, 0.05)),
+    "RADIAL_FISHEYE": Camera("RADIAL_FISHEYE", 640, 480, (300.0, 321.0, 239.0, 0.05, -0.02)),
+    "OPENCV_FISHEYE": Camera("OPENCV_FISHEYE", 640, 480, (300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.01, -0.003)),
+    "THIN_PRISM_FISHEYE": Camera(
+        "THIN_PRISM_FISHEYE",
+        *(640, 480),
+        (300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.001, 0.002, 0.01, -0.003, 0.001, 0.002),
+    ),
+    "RAD_TAN_THIN_PRISM_FISHEYE": Camera(
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        *(640, 480),
+        (300.0, 301.0, 321.0, 239.0, 0.05, -0.02, 0.01, -0.003, 0.001, 0.0005, 0.001, 0.002, 0.001, 2e-4, 0.002, 1e-4),
+    ),
+    "FOV": Camera("FOV", 640, 480, (500.0, 501.0, 321.0, 239.0, 0.5)),
+    "SIMPLE_DIVISION": Camera("SIMPLE_DIVISION", 640, 480, (500.0, 321.0, 239.0, -0.1)),
+    "DIVISION": Camera("DIVISION", 640, 480, (500.0, 501.0, 321.0, 239.0, -0.1)),
+    "EUCM": Camera("EUCM", 640, 480, (500.0, 501.0, 321.0, 239.0, 0.6, 1.1)),
+    "EQUIRECTANGULAR": Camera("EQUIRECTANGULAR", 640, 320, (640.0, 320.0)),
+}
+
+
+def ring(*cameras: Camera, num_frames: int = 6, num_points: int = 40, seed: int = 0) -> Capture:
+    """Cameras around a cloud of coloured points near the origin, with all that a COLMAP model holds.
+
+    Frames take turns with the cameras. Every point that a frame sees is observed where it projects, and each frame has
+    two features without a point. Names have spaces and letters beyond ASCII.
+    """
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.7, 0.7, size=(num_points, 3))
+    frames, frame_index, point_index, pixels = [], [], [], []
+    for index in range(num_frames):
+        angle = 2 * np.pi * index / num_frames
+        centre = np.array([3 * np.cos(angle), 3 * np.sin(angle), rng.uniform(0.2, 1.0)])
+        pose = rigid.look_at(centre, rng.normal(scale=0.1, size=3), np.array([0.0, 0.0, 1.0]))
+        camera = cameras[index % len(cameras)]
+        frames.append(Frame(f"my photos/ä {index:02d}.jpg", camera, pose))
+        projected, valid = camera.project(rigid.apply(rigid.inverse(pose), points))
+        frame_index += [index] * (int(valid.sum()) + 2)
+        point_index += [*np.flatnonzero(valid), -1, -1]
+        pixels += [*projected[valid], *rng.uniform(0, 300, size=(2, 2))]
+    observations = Observations(np.array(frame_index), np.array(point_index), np.array(pixels).reshape(-1, 2))
+    colours = rng.integers(1, 256, size=(num_points, 3), dtype=np.uint8)
+    return Capture(tuple(frames), points, (), None, "colmap", colours=colours, observations=observations)
+
+
+def with_photos(capture: Capture, folder: Path) -> Capture:
+    """The capture with its images said to be in a folder, under the frames' names."""
+    return replace(capture, frames=tuple(replace(frame, image=folder / frame.name) for frame in capture.frames))
+
+
+def reprojection_px(truth: Capture, other: Capture) -> float:
+    """The largest distance in pixels between where two captures' frames see the points of the first one.
+
+    Frames are compared in their order; pictures of another size are compared in pixels of the first capture's.
+    """
+    assert len(truth.frames) == len(other.frames)
+    worst = 0.0
+    for frame, again in zip(truth.frames, other.frames, strict=True):
+        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), truth.points))
+        camera = again.camera.resized(frame.camera.width, frame.camera.height)
+        pixels_again, valid_again = camera.project(rigid.apply(rigid.inverse(again.world_from_cam), truth.points))
+        assert valid.sum() > 10
+        np.testing.assert_array_equal(valid_again, valid)
+        worst = max(worst, float(np.linalg.norm(pixels_again - pixels, axis=1)[valid].max()))
+    return worst
+
+
+def assert_same(capture: Capture, other: Capture, *, pose_tolerance: float = 0.0) -> None:
+    """All parts of two captures agree exactly, poses to a tolerance."""
+    assert len(capture.frames) == len(other.frames)
+    for frame, again in zip(capture.frames, other.frames, strict=True):
+        assert (again.name, again.camera, again.split) == (frame.name, frame.camera, frame.split)
+        assert (again.image, again.mask) == (frame.image, frame.mask)
+        np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=pose_tolerance)
+    np.testing.assert_array_equal(other.points, capture.points)
+    assert (other.unit, other.missing) == (capture.unit, capture.missing)
+    for mine, theirs in ((capture.colours, other.colours), (capture.depth_bounds, other.depth_bounds)):
+        assert (mine is None) == (theirs is None)
+        if mine is not None and theirs is not None:
+            np.testing.assert_array_equal(theirs, mine)
+    assert (capture.observations is None) == (other.observations is None)
+    if capture.observations is not None and other.observations is not None:
+        np.testing.assert_array_equal(other.observations.frame_index, capture.observations.frame_index)
+        np.testing.assert_array_equal(other.observations.point_index, capture.observations.point_index)
+        np.testing.assert_array_equal(other.observations.pixels, capture.observations.pixels)

@@ -1,0 +1,203 @@
+"""COLMAP models written and read, against pycolmap and by round trips; and two hundred kinds of damage to each file."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from captures import CAMERAS, assert_same, reprojection_px, ring
+from corruption import assert_refused_or_sound, corrupted_binary, corrupted_text
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.formats.colmap import parse_colmap
+from nerfcli.cameras.formats.colmap_write import (
+    losses_colmap,
+    losses_colmap_text,
+    write_colmap_binary,
+    write_colmap_text,
+)
+from nerfcli.cameras.frame import Capture, Observations
+from nerfcli.errors import UserError
+
+WRITERS = {"bin": write_colmap_binary, "txt": write_colmap_text}
+
+
+def without_spaces(capture: Capture) -> Capture:
+    frames = tuple(replace(frame, name=frame.name.replace(" ", "_")) for frame in capture.frames)
+    return replace(capture, frames=frames)
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_pycolmap_reads_what_is_written(tmp_path, suffix):
+    """Cameras of all models, poses, points, colours, features and tracks, against COLMAP's own reader."""
+    capture = ring(*CAMERAS.values(), num_frames=2 * len(CAMERAS))
+    if suffix == "txt":
+        capture = without_spaces(capture)  # pycolmap cuts names at the first space
+    WRITERS[suffix](capture, tmp_path / "model")
+    model = pycolmap.Reconstruction(str(tmp_path / "model"))
+    assert len(model.cameras) == len(CAMERAS)
+    assert len(model.images) == len(capture.frames) == model.num_reg_images()
+    seen = capture.observations
+    assert seen is not None
+    for index, frame in enumerate(capture.frames):
+        image = model.images[index + 1]
+        assert image.name == frame.name
+        camera = model.cameras[image.camera_id]
+        assert (camera.model.name, camera.width, camera.height) == (
+            frame.camera.model,
+            frame.camera.width,
+            frame.camera.height,
+        )
+        np.testing.assert_array_equal(camera.params, frame.camera.params)
+        expected = rigid.inverse(frame.world_from_cam)[:3]
+        np.testing.assert_allclose(image.cam_from_world().matrix(), expected, rtol=0, atol=1e-14)
+        own = seen.frame_index == index
+        np.testing.assert_array_equal([p.xy for p in image.points2D], seen.pixels[own])
+        ids = [p.point3D_id if p.has_point3D() else 0 for p in image.points2D]
+        np.testing.assert_array_equal(ids, seen.point_index[own] + 1)
+    assert capture.colours is not None
+    for index, (point, colour) in enumerate(zip(capture.points, capture.colours, strict=True)):
+        written = model.points3D[index + 1]
+        np.testing.assert_array_equal(written.xyz, point)
+        np.testing.assert_array_equal(written.color, colour)
+        track = sorted((element.image_id, element.point2D_idx) for element in written.track.elements)
+        places = np.flatnonzero(seen.point_index == index)
+        starts = np.searchsorted(seen.frame_index, seen.frame_index[places])
+        assert track == [(f + 1, p - s) for f, p, s in zip(seen.frame_index[places], places, starts, strict=True)]
+    assert model.compute_mean_reprojection_error() < 1e-9
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_a_written_model_is_read_back_exactly(tmp_path, suffix):
+    capture = ring(*CAMERAS.values(), num_frames=len(CAMERAS) + 3)
+    WRITERS[suffix](capture, tmp_path / "model")
+    back = parse_colmap(tmp_path / "model")
+    assert_same(capture, back, pose_tolerance=2e-15)
+    assert reprojection_px(capture, back) < 1e-10
+    assert back.frames[0].camera is back.frames[len(CAMERAS)].camera
+    with_images = parse_colmap(tmp_path / "model", tmp_path / "photos")
+    assert with_images.frames[3].image == tmp_path / "photos/my photos/ä 03.jpg"
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_a_model_of_a_rig_is_read_as_pycolmap_wrote_it(tmp_path, suffix):
+    """COLMAP 4 with rigs.bin and frames.bin: poses are the images' own; features and tracks are COLMAP's."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 3, 4
+    options.num_points3D = 30
+    options.sensor_from_rig_translation_stddev, options.sensor_from_rig_rotation_stddev = 0.3, 20.0
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    rig = model.rigs[min(model.rigs)]
+    assert max(np.abs(s.translation).max() for s in rig.non_ref_sensors.values() if s is not None) > 0.1
+    (model.write_binary if suffix == "bin" else model.write_text)(str(tmp_path))
+    assert (tmp_path / f"rigs.{suffix}").is_file()
+    capture = parse_colmap(tmp_path)
+    assert capture.observations is not None
+    assert capture.colours is None  # COLMAP left them black
+    images = [model.images[image_id] for image_id in sorted(model.images)]
+    assert [frame.name for frame in capture.frames] == [image.name for image in images]
+    point_ids = sorted(model.points3D)
+    np.testing.assert_array_equal(capture.points, [model.points3D[point_id].xyz for point_id in point_ids])
+    for index, (frame, image) in enumerate(zip(capture.frames, images, strict=True)):
+        expected = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        np.testing.assert_allclose(rigid.inverse(frame.world_from_cam), expected, rtol=0, atol=1e-14)
+        own = capture.observations.frame_index == index
+        np.testing.assert_array_equal(capture.observations.pixels[own], [p.xy for p in image.points2D])
+        places = [point_ids.index(p.point3D_id) if p.has_point3D() else -1 for p in image.points2D]
+        np.testing.assert_array_equal(capture.observations.point_index[own], places)
+        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points))
+        assert valid.all()
+        with_point = own & (capture.observations.point_index >= 0)
+        observed = capture.observations.pixels[with_point]
+        seen = pixels[capture.observations.point_index[with_point]]
+        np.testing.assert_allclose(seen, observed, rtol=0, atol=1e-9)
+
+
+def test_features_whose_points_are_gone(tmp_path):
+    """A model whose points were all removed still has features; one where some are missing is not of one piece."""
+    capture = ring(CAMERAS["PINHOLE"])
+    assert capture.observations is not None
+    write_colmap_text(capture, tmp_path / "model")
+    lines = (tmp_path / "model/points3D.txt").read_text().splitlines()
+    (tmp_path / "model/points3D.txt").write_text("\n".join(lines[:-1]))
+    with pytest.raises(UserError, match=r"images\.txt and points3D\.txt .* a feature has the point 40, which is not"):
+        parse_colmap(tmp_path / "model")
+    (tmp_path / "model/points3D.txt").write_text("\n".join([*lines, lines[-1]]))
+    with pytest.raises(UserError, match=r"points3D\.txt .*: two points have the id 40"):
+        parse_colmap(tmp_path / "model")
+    (tmp_path / "model/points3D.txt").write_text("")
+    bare = parse_colmap(tmp_path / "model")
+    assert bare.points.shape == (0, 3)
+    assert bare.observations is not None
+    np.testing.assert_array_equal(bare.observations.pixels, capture.observations.pixels)
+    assert (bare.observations.point_index == -1).all()
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_observations_in_any_order_and_none_at_all(tmp_path, suffix):
+    capture = ring(CAMERAS["PINHOLE"])
+    seen = capture.observations
+    assert seen is not None
+    shuffle = np.random.default_rng(0).permutation(len(seen.pixels))
+    shuffled = Observations(seen.frame_index[shuffle], seen.point_index[shuffle], seen.pixels[shuffle])
+    WRITERS[suffix](replace(capture, observations=shuffled), tmp_path / "a")
+    back = parse_colmap(tmp_path / "a").observations
+    assert back is not None
+    rows = np.column_stack([seen.frame_index, seen.point_index, seen.pixels])
+    rows_back = np.column_stack([back.frame_index, back.point_index, back.pixels])
+    np.testing.assert_array_equal(rows_back[np.lexsort(rows_back.T)], rows[np.lexsort(rows.T)])
+    bare = replace(capture, observations=None, colours=None, points=np.zeros((0, 3)))
+    WRITERS[suffix](bare, tmp_path / "b")
+    assert_same(bare, parse_colmap(tmp_path / "b"), pose_tolerance=2e-15)
+    assert len(pycolmap.Reconstruction(str(tmp_path / "b")).images) == 6
+
+
+def test_what_a_model_cannot_hold_is_listed(tmp_path):
+    capture = ring(CAMERAS["PINHOLE"])
+    assert losses_colmap(capture) == ()
+    assert losses_colmap_text(capture) == ("6 names with spaces (COLMAP reads them up to the first space)",)
+    first = replace(capture.frames[0], mask=tmp_path / "m.png", split="test")
+    more = replace(capture, frames=(first, *capture.frames[1:]), unit="metre", depth_bounds=np.tile([1.0, 2.0], (6, 1)))
+    assert losses_colmap(more) == ("1 masks", "the split of 1 frames", "depth bounds", "the unit of length (metre)")
+
+
+def test_a_folder_with_other_files_is_left_alone(tmp_path):
+    capture = ring(CAMERAS["PINHOLE"])
+    (tmp_path / "a.jpg").write_bytes(b"photo")
+    with pytest.raises(UserError, match=r"holds other files than a COLMAP model, such as a\.jpg"):
+        write_colmap_binary(capture, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.jpg"]
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model/rigs.bin").write_bytes(b"of the model that is replaced")
+    write_colmap_binary(capture, tmp_path / "model")
+    names = sorted(path.name for path in (tmp_path / "model").iterdir())
+    assert names == ["cameras.bin", "images.bin", "points3D.bin"]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "name"), [("bin", "a\0b"), ("bin", ""), ("txt", "a\nb"), ("txt", " a"), ("txt", "")]
+)
+def test_names_that_a_model_cannot_hold_are_refused(tmp_path, suffix, name):
+    capture = ring(CAMERAS["PINHOLE"])
+    named = replace(capture, frames=(replace(capture.frames[0], name=name), *capture.frames[1:]))
+    with pytest.raises(UserError, match="cannot be written to a COLMAP model"):
+        WRITERS[suffix](named, tmp_path / "model")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_two_hundred_corruptions(tmp_path, suffix):
+    capture = ring(CAMERAS["PINHOLE"], CAMERAS["OPENCV"], CAMERAS["RADIAL_FISHEYE"], num_points=12)
+    corrupted = corrupted_binary if suffix == "bin" else corrupted_text
+    WRITERS[suffix](capture, tmp_path / "whole")
+    rng = np.random.default_rng(4)
+    refused, folder = 0, tmp_path / "damaged"
+    for _ in range(200):
+        shutil.copytree(tmp_path / "whole", folder)
+        path = folder / f"{rng.choice(['cameras', 'images', 'points3D'])}.{suffix}"
+        path.write_bytes(corrupted(path.read_bytes(), rng))
+        refused += assert_refused_or_sound(lambda: parse_colmap(folder), folder)
+        shutil.rmtree(folder)
+    assert refused > 100

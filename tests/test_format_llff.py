@@ -1,0 +1,124 @@
+"""LLFF's poses_bounds.npy as a capture: what it holds and loses, depth bounds by hand, two hundred kinds of damage."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from captures import CAMERAS, reprojection_px, ring
+from corruption import assert_refused_or_sound, corrupted_binary
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
+from nerfcli.cameras.formats.llff import losses_llff, parse_llff, write_llff
+from nerfcli.cameras.frame import Capture, Observations
+from nerfcli.errors import UserError
+
+
+def list_files(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir())
+
+
+def pinhole_ring() -> Capture:
+    return ring(Camera.pinhole(640, 480, 500.0), Camera.pinhole(400, 480, 450.0))
+
+
+def test_axes_by_hand():
+    """A camera at (1, 2, 3) that looks along -x with +z up: LLFF's columns are down -z, right +y, backward +x."""
+    llff = [[0.0, 0.0, 1.0, 1.0], [0.0, 1.0, 0.0, 2.0], [-1.0, 0.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+    opencv = [[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, -1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+    np.testing.assert_array_equal(llff_from_opencv_pose(np.array(opencv)), llff)
+    np.testing.assert_array_equal(opencv_from_llff_pose(np.array(llff)), opencv)
+
+
+def test_a_written_array_is_read_back(tmp_path):
+    capture = replace(pinhole_ring(), depth_bounds=np.column_stack([np.arange(1.0, 7.0), np.full(6, 9.0)]))
+    write_llff(capture, tmp_path)
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    assert rows.shape == (6, 17)
+    np.testing.assert_array_equal(rows[:, [4, 9, 14]], [[480, 640, 500], [480, 400, 450]] * 3)
+    back = parse_llff(tmp_path, list_files)
+    assert reprojection_px(capture, back) < 1e-10
+    np.testing.assert_array_equal(back.depth_bounds, capture.depth_bounds)
+    assert [frame.name for frame in back.frames] == [f"image{index:03d}" for index in range(6)]
+    assert all(frame.image is None for frame in back.frames)
+    (tmp_path / "images").mkdir()
+    for frame in capture.frames:
+        (tmp_path / "images" / Path(frame.name).name).write_bytes(b"")
+    back = parse_llff(tmp_path, list_files)
+    assert [frame.image for frame in back.frames] == sorted((tmp_path / "images").iterdir())
+    assert back.frames[0].name == "images/ä 00.jpg"
+    (tmp_path / "images/more.jpg").write_bytes(b"")
+    with pytest.raises(UserError, match=r"has 6 rows, but images/ has 7"):
+        parse_llff(tmp_path, list_files)
+
+
+def test_rows_are_in_the_order_of_the_photos_names(tmp_path):
+    capture = pinhole_ring()
+    write_llff(capture, tmp_path / "a")
+    write_llff(replace(capture, frames=capture.frames[::-1], observations=None), tmp_path / "b")
+    rows, reversed_rows = (np.load(tmp_path / name / "poses_bounds.npy")[:, :15] for name in "ab")
+    np.testing.assert_array_equal(reversed_rows, rows)
+
+
+def test_depth_bounds_are_percentiles_of_what_each_view_sees(tmp_path):
+    """Three cameras on a line; the points that they observe, lie within their picture, or neither."""
+    camera = Camera.pinhole(64, 48, 50.0)
+    capture = ring(camera, num_frames=3)
+    frames = tuple(
+        replace(frame, world_from_cam=rigid.from_parts(np.eye(3), np.array([0.0, 0.0, -index])))
+        for index, frame in enumerate(capture.frames)
+    )
+    depths = np.linspace(2.0, 5.0, 31)
+    points = np.column_stack([np.zeros(31), np.zeros(31), depths])
+    points[30, 0] = 100.0  # beside every picture
+    observations = Observations(np.array([1, 0, 0, 1, 0]), np.array([3, 0, 30, 4, -1]), np.zeros((5, 2)))
+    seen = replace(capture, frames=frames, points=points, colours=None, observations=observations)
+    write_llff(seen, tmp_path)
+    bounds = np.load(tmp_path / "poses_bounds.npy")[:, 15:]
+    np.testing.assert_allclose(bounds[0], np.percentile([2.0, 5.0], [0.1, 99.9]), rtol=1e-14)
+    np.testing.assert_allclose(bounds[1], np.percentile([3.3, 3.4], [0.1, 99.9]), rtol=1e-14)
+    np.testing.assert_allclose(bounds[2], [bounds[0, 0], bounds[0, 1]], rtol=1e-14)  # observes nothing: the widest
+    write_llff(replace(seen, observations=None), tmp_path)
+    bounds = np.load(tmp_path / "poses_bounds.npy")[:, 15:]
+    for index in range(3):
+        np.testing.assert_allclose(bounds[index], np.percentile(depths[:30] + index, [0.1, 99.9]), rtol=1e-14)
+
+
+def test_neither_points_nor_bounds_is_refused(tmp_path):
+    capture = replace(pinhole_ring(), points=np.zeros((0, 3)), colours=None, observations=None)
+    with pytest.raises(UserError, match="needs depths, but no view of the 6 sees two of the 0 points"):
+        write_llff(capture, tmp_path)
+    with pytest.raises(UserError, match="spherical picture"):
+        write_llff(ring(CAMERAS["EQUIRECTANGULAR"]), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_array_cannot_hold_is_listed():
+    bare = replace(pinhole_ring(), points=np.zeros((0, 3)), colours=None, observations=None)
+    assert losses_llff(replace(bare, depth_bounds=np.tile([1.0, 2.0], (6, 1)))) == ()
+    capture = ring(CAMERAS["RADIAL"], CAMERAS["PINHOLE"])
+    moved = (replace(capture.frames[0], name="other/x.jpg", split="test"), *capture.frames[1:])
+    num_observations = len(capture.observations.pixels)  # pyright: ignore[reportOptionalMemberAccess]
+    assert losses_llff(replace(capture, frames=moved)) == (
+        "k1 of 1 camera",
+        "k2 of 1 camera",
+        "the principal point of 2 cameras",
+        "the second focal length of 1 camera",
+        "the photos' 2 folders",
+        "40 points",
+        "colours of 40 points",
+        f"{num_observations} observations",
+        "the split of 1 frames",
+    )
+
+
+def test_two_hundred_corruptions(tmp_path):
+    write_llff(pinhole_ring(), tmp_path)
+    path, refused, rng = tmp_path / "poses_bounds.npy", 0, np.random.default_rng(7)
+    whole = path.read_bytes()
+    for _ in range(200):
+        path.write_bytes(corrupted_binary(whole, rng))
+        refused += assert_refused_or_sound(lambda: parse_llff(tmp_path, list_files), path)
+    assert refused > 100

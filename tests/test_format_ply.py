@@ -1,0 +1,180 @@
+"""PLY files of points and of cameras: by hand in all encodings, against pycolmap's, two hundred kinds of damage."""
+
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+from captures import CAMERAS, ring
+from corruption import assert_refused_or_sound, corrupted_binary, corrupted_text
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.ply import losses_ply, read_ply_points, write_camera_ply, write_ply
+from nerfcli.cameras.frame import Capture
+from nerfcli.errors import UserError
+
+POINTS = np.array([[1.5, -2.0, 3.0], [4.0, 5.0, -6.25]])
+COLOURS = np.array([[255, 128, 0], [1, 2, 3]], dtype=np.uint8)
+
+
+def header(encoding: str, *lines: str) -> bytes:
+    return "\n".join(["ply", f"format {encoding} 1.0", *lines, "end_header", ""]).encode()
+
+
+def by_hand(encoding: str) -> bytes:
+    """Properties in an odd order, an element before the vertices and faces after them."""
+    start = header(
+        encoding,
+        "comment made by hand",
+        *("element camera 1", "property float fov"),
+        *("element vertex 2", "property uchar red", "property double z", "property uchar blue", "property float x"),
+        *("property short quality", "property float y", "property uint8 green"),
+        *("element face 1", "property list uchar int vertex_indices"),
+    )
+    if encoding == "ascii":
+        return start + b"0.9\n255 3.0 0 1.5 7 -2 128\n1 -6.25 3 4 7 5.0 2\n3 0 1 0\n"
+    order = "<" if "little" in encoding else ">"
+    body = struct.pack(f"{order}f", 0.9)
+    for (x, y, z), (red, green, blue) in zip(POINTS, COLOURS.tolist(), strict=True):
+        body += struct.pack(f"{order}BdBfhfB", red, z, blue, x, 7, y, green)
+    return start + body + struct.pack(f"{order}B3i", 3, 0, 1, 0)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_points_by_hand(tmp_path, encoding):
+    (tmp_path / "ä b.ply").write_bytes(by_hand(encoding))
+    points, colours = read_ply_points(tmp_path / "ä b.ply")
+    np.testing.assert_array_equal(points, POINTS)
+    np.testing.assert_array_equal(colours, COLOURS)
+    (tmp_path / "dos.ply").write_bytes(by_hand(encoding).replace(b"\n", b"\r\n", by_hand(encoding).count(b"\n") - 1))
+    if encoding == "ascii":
+        np.testing.assert_array_equal(read_ply_points(tmp_path / "dos.ply")[0], POINTS)
+
+
+def test_colours_as_floats_and_none(tmp_path):
+    names = ("x", "y", "z", "red", "green", "blue")
+    start = header("ascii", "element vertex 1", *(f"property float {name}" for name in names))
+    (tmp_path / "a.ply").write_bytes(start + b"1 2 3 1.0 0.5 0\n")
+    np.testing.assert_array_equal(read_ply_points(tmp_path / "a.ply")[1], [[255, 128, 0]])
+    start = header("ascii", "element vertex 1", *(f"property float {name}" for name in names[:5]))
+    (tmp_path / "a.ply").write_bytes(start + b"1 2 3 1.0 0.5\n")
+    assert read_ply_points(tmp_path / "a.ply")[1] is None
+    (tmp_path / "a.ply").write_bytes(header("ascii", "element vertex 0", *(f"property float {n}" for n in "xyz")))
+    assert read_ply_points(tmp_path / "a.ply")[0].shape == (0, 3)
+
+
+def test_written_points_are_read_back(tmp_path):
+    capture = ring(CAMERAS["OPENCV"])
+    write_ply(capture, tmp_path / "a.ply")
+    points, colours = read_ply_points(tmp_path / "a.ply")
+    np.testing.assert_array_equal(points, capture.points)
+    np.testing.assert_array_equal(colours, capture.colours)
+    write_ply(replace(capture, colours=None), tmp_path / "b.ply")
+    points, colours = read_ply_points(tmp_path / "b.ply")
+    np.testing.assert_array_equal(points, capture.points)
+    assert colours is None
+    assert losses_ply(capture)[0] == "6 cameras and their poses"
+
+
+def test_points_that_colmap_exports(tmp_path):
+    """An independent writer: binary, float32 positions and uchar colours."""
+    capture = ring(CAMERAS["OPENCV"])
+    write_colmap_binary(capture, tmp_path / "model")
+    pycolmap.Reconstruction(str(tmp_path / "model")).export_PLY(str(tmp_path / "a.ply"))
+    points, colours = read_ply_points(tmp_path / "a.ply")
+    order, expected = np.argsort(points[:, 0]), np.argsort(capture.points[:, 0])
+    assert capture.colours is not None
+    assert colours is not None
+    np.testing.assert_array_equal(points[order], capture.points.astype(np.float32)[expected])
+    np.testing.assert_array_equal(colours[order], capture.colours[expected])
+
+
+def edges_of(data: bytes, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    start = data.index(b"end_header\n") + 11
+    vertices = np.frombuffer(data, "<f8", 3 * num_vertices, start).reshape(-1, 5, 3)
+    return vertices, np.frombuffer(data, "<i4", offset=start + 24 * num_vertices).reshape(-1, 8, 2)
+
+
+def test_frusta_of_cameras(tmp_path):
+    """A pinhole's frustum by hand; every camera's corners on the rays of its picture's corners."""
+    camera = Camera.pinhole(600, 400, 300.0)
+    pose = rigid.from_parts(np.eye(3), np.array([10.0, 20.0, 30.0]))
+    frame = replace(ring(camera, num_frames=1).frames[0], world_from_cam=pose)
+    write_camera_ply(Capture((frame,), np.zeros((0, 3)), (), None, "x"), tmp_path / "a.ply", depth=np.sqrt(22.0))
+    vertices, edges = edges_of((tmp_path / "a.ply").read_bytes(), 5)
+    expected = [[0, 0, 0], [-3, -2, 3], [3, -2, 3], [3, 2, 3], [-3, 2, 3]]
+    np.testing.assert_allclose(vertices[0] - frame.centre, expected, rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(edges[0], [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+
+    capture = ring(*CAMERAS.values(), num_frames=len(CAMERAS))
+    write_camera_ply(capture, tmp_path / "b.ply")
+    vertices, edges = edges_of((tmp_path / "b.ply").read_bytes(), 5 * len(CAMERAS))
+    np.testing.assert_array_equal(edges // 5, np.broadcast_to(np.arange(len(CAMERAS))[:, None, None], edges.shape))
+    np.testing.assert_array_equal(read_ply_points(tmp_path / "b.ply")[0], vertices.reshape(-1, 3))
+    for frame, corners in zip(capture.frames, vertices, strict=True):
+        np.testing.assert_array_equal(corners[0], frame.centre)
+        if frame.camera.is_spherical:
+            continue
+        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), corners[1:]))
+        assert valid.all()
+        np.testing.assert_allclose(pixels, [[0, 0], [640, 0], [640, 480], [0, 480]], rtol=0, atol=1e-8)
+
+
+def test_frusta_of_a_lens_that_does_not_see_the_corners(tmp_path):
+    camera = Camera("OPENCV_FISHEYE", 640, 480, (100.0, 100.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
+    assert not camera.bearings(np.zeros((1, 2)))[1].any()
+    capture = ring(camera, num_frames=1)
+    write_camera_ply(capture, tmp_path / "a.ply")
+    vertices, _ = edges_of((tmp_path / "a.ply").read_bytes(), 5)
+    pixels, valid = camera.project(rigid.apply(rigid.inverse(capture.frames[0].world_from_cam), vertices[0, 1:]))
+    assert valid.all()
+    offsets = pixels - [320, 240]
+    np.testing.assert_allclose(offsets[:, 0] * [-1, 1, 1, -1] * 240, offsets[:, 1] * [-1, -1, 1, 1] * 320, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        (b"", "does not begin with the word ply"),
+        (b"ply\nformat ascii 1.0\nelement vertex 1\n", "header has no end"),
+        (header("ascii", "element face 1", "property float x"), "no element vertex"),
+        (header("ascii", "element vertex 1", "property float x"), "vertices have the properties x"),
+        (header("ascii", "element vertex many"), "invalid literal"),
+        (header("ascii", "element vertex 1", *(f"property float {n}" for n in "xyz")) + b"1 2\n", "fewer than 3"),
+        (header("ascii", "element vertex 9", *(f"property float {n}" for n in "xyz")) + b"1 2 3\n", "1 lines are"),
+        (
+            header("binary_little_endian", "element vertex 999999999999", *(f"property float {n}" for n in "xyz")),
+            "announces 999999999999 vertices, but 0 bytes",
+        ),
+        (
+            header("binary_little_endian", "element a 1", "property list uchar int b", "element vertex 0").replace(
+                b"end_header", b"property float x\nproperty float y\nproperty float z\nend_header"
+            ),
+            "element a holds lists",
+        ),
+        (header("pdf", "element vertex 0"), "its format is 'pdf'"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(tmp_path, data, what):
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(UserError, match=what) as caught:
+        read_ply_points(tmp_path / "a.ply")
+    assert str(tmp_path / "a.ply") in caught.value.message
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_two_hundred_corruptions(tmp_path, encoding):
+    whole, path, refused, rng = by_hand(encoding), tmp_path / "a.ply", 0, np.random.default_rng(10)
+    frame = ring(CAMERAS["PINHOLE"], num_frames=1).frames
+
+    def read() -> Capture:
+        points, colours = read_ply_points(path)
+        return Capture(frame, points, (), None, "ply", colours=colours)
+
+    for _ in range(200):
+        path.write_bytes((corrupted_text if encoding == "ascii" else corrupted_binary)(whole, rng))
+        refused += assert_refused_or_sound(read, path)
+    assert refused > 80

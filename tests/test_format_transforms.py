@@ -1,0 +1,289 @@
+"""transforms.json and Blender's files as captures: what they hold, what they lose, and two hundred kinds of damage."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from captures import CAMERAS, assert_same, reprojection_px, ring, with_photos
+from corruption import assert_refused_or_sound, corrupted_binary, corrupted_json
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.blender import losses_blender, parse_blender, write_blender
+from nerfcli.cameras.formats.transforms import (
+    ignored_transforms,
+    losses_transforms,
+    parse_transforms,
+    read_camera_path,
+    read_transforms,
+    write_transforms,
+)
+from nerfcli.cameras.frame import Capture
+from nerfcli.errors import UserError
+
+# The models whose lens a transforms.json holds whole.
+HELD = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "SIMPLE_FISHEYE", "FISHEYE"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "EQUIRECTANGULAR"),
+)
+LOST = {
+    "FULL_OPENCV": ("k4", "k5", "k6"),
+    "THIN_PRISM_FISHEYE": ("p1", "p2", "sx1", "sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": ("k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3"),
+    "FOV": ("omega",),
+    "SIMPLE_DIVISION": ("k",),
+    "DIVISION": ("k",),
+    "EUCM": ("alpha", "beta"),
+}
+
+# A camera at (1, 2, 3) that looks along -x with +z up: OpenGL axes, and OpenCV axes.
+OPENGL_POSE = [[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+OPENCV_POSE = [[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, -1.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+
+
+def measure(_: Path) -> tuple[int, int, int]:
+    """Stands for media: every image is 64 x 48 and upright."""
+    return 64, 48, 1
+
+
+def write_json(path: Path, **content: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def pinhole_ring() -> Capture:
+    """A capture that Blender's files hold, apart from its points."""
+    capture = ring(Camera.pinhole(640, 480, 500.0))
+    return replace(capture, points=np.zeros((0, 3)), colours=None, observations=None)
+
+
+@pytest.mark.parametrize("model", HELD)
+def test_a_written_lens_is_read_back(tmp_path, model):
+    capture = ring(CAMERAS[model])
+    assert losses_transforms(replace(capture, observations=None)) == ()
+    write_transforms(capture, tmp_path / "transforms.json")
+    back = parse_transforms(tmp_path / "transforms.json")
+    assert reprojection_px(capture, back) < 1e-10
+    assert [frame.name for frame in back.frames] == [frame.name for frame in capture.frames]
+    np.testing.assert_array_equal(back.points, capture.points)
+    np.testing.assert_array_equal(back.colours, capture.colours)
+    directions, valid = capture.frames[0].camera.pixel_bearings()
+    directions_back, valid_back = back.frames[0].camera.pixel_bearings()
+    np.testing.assert_array_equal(valid_back, valid)
+    np.testing.assert_allclose(directions_back, directions, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", LOST)
+def test_a_lens_without_keys_is_listed_and_the_rest_of_it_written(tmp_path, model):
+    assert set(HELD) | set(LOST) == set(CAMERAS)
+    capture = replace(ring(CAMERAS[model], CAMERAS["PINHOLE"]), observations=None)
+    assert losses_transforms(capture) == tuple(f"{name} of 1 camera" for name in LOST[model])
+    write_transforms(capture, tmp_path / "transforms.json")
+    back = parse_transforms(tmp_path / "transforms.json")
+    assert losses_transforms(back) == ()
+    camera, camera_back = capture.frames[0].camera, back.frames[0].camera
+    assert camera_back.focal_px == camera.focal_px
+    assert camera_back.principal_point == camera.principal_point
+    assert (
+        reprojection_px(replace(capture, frames=capture.frames[1::2]), replace(back, frames=back.frames[1::2])) < 1e-10
+    )
+    if model == "THIN_PRISM_FISHEYE":
+        assert camera_back.params == (*camera.params[:6], *camera.params[8:10])
+    if model == "RAD_TAN_THIN_PRISM_FISHEYE":
+        assert camera_back.params == camera.params[:8]
+
+
+def test_images_masks_splits_and_cameras_per_image(tmp_path):
+    capture = with_photos(ring(CAMERAS["OPENCV"], CAMERAS["OPENCV_FISHEYE"]), tmp_path / "photos ü")
+    splits = ("train", "train", "val", "test", "train", "test")
+    frames = [replace(frame, split=split) for frame, split in zip(capture.frames, splits, strict=True)]
+    frames[1] = replace(frames[1], mask=tmp_path / "masks/ö.png")
+    capture = replace(capture, frames=tuple(frames))
+    assert losses_transforms(capture) == (f"{len(capture.observations.pixels)} observations",)  # pyright: ignore[reportOptionalMemberAccess]
+    path = tmp_path / "out" / "my transforms.json"
+    write_transforms(capture, path)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert content["frames"][1]["file_path"] == "../photos ü/my photos/ä 01.jpg"
+    assert content["frames"][1]["mask_path"] == "../masks/ö.png"
+    assert content["test_filenames"] == ["../photos ü/my photos/ä 03.jpg", "../photos ü/my photos/ä 05.jpg"]
+    assert "fl_x" not in content
+    assert content["ply_file_path"] == "my transforms_points.ply"
+    back = parse_transforms(path)
+    assert [frame.split for frame in back.frames] == list(splits)
+    assert [frame.camera for frame in back.frames] == [frame.camera for frame in capture.frames]
+    assert len({id(frame.camera) for frame in back.frames}) == 2
+    for frame, again in zip(capture.frames, back.frames, strict=True):
+        assert frame.image is not None
+        assert again.image is not None
+        assert again.image.resolve() == frame.image.resolve()
+        assert (again.mask is None) == (frame.mask is None)
+
+
+def test_poses_stay_in_the_files_world_and_what_is_ignored_is_listed(tmp_path):
+    applied = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 5.0], [0.0, -1.0, 0.0, 0.0]]
+    frames = [{"file_path": f"{i}.jpg", "transform_matrix": OPENGL_POSE, "sharpness": 3} for i in range(2)]
+    path = write_json(
+        tmp_path / "transforms.json",
+        fl_x=50,
+        w=64,
+        h=48,
+        applied_transform=applied,
+        aabb_scale=4,
+        offset=[0, 0, 0],
+        frames=frames,
+    )
+    capture = parse_transforms(path)
+    np.testing.assert_array_equal(capture.frames[0].world_from_cam, OPENCV_POSE)
+    assert ignored_transforms(path) == ("aabb_scale", "applied_transform", "offset", "sharpness of 2 frames")
+
+
+def test_names_and_sizes_without_the_photos(tmp_path):
+    """Suffixes are taken from what is on disk; a size that is not given is measured, or the one of the other photos."""
+    entries = ["./images\\a b.jpg", "images/no_suffix", "images/gone", "/home/you/c.d/x.png"]
+    frames = [{"file_path": name, "transform_matrix": OPENGL_POSE} for name in entries]
+    path = write_json(tmp_path / "transforms.json", camera_angle_x=1.0, frames=frames)
+    with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing"):
+        parse_transforms(path)
+    with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing, and .*images/a b.jpg is not there"):
+        parse_transforms(path, measure)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images/no_suffix.JPG").write_bytes(b"")
+    capture = parse_transforms(path, measure)
+    assert [frame.name for frame in capture.frames] == [
+        "images/a b.jpg",
+        "images/no_suffix.JPG",
+        "images/gone",
+        "x.png",
+    ]
+    assert capture.frames[0].image == tmp_path / "images/a b.jpg"
+    assert {frame.camera for frame in capture.frames} == {Camera.pinhole(64, 48, 32 / math.tan(0.5))}
+
+
+def test_a_listed_cloud_must_be_there(tmp_path):
+    frames = [{"file_path": "a.png", "transform_matrix": OPENGL_POSE}]
+    shared = {"fl_x": 50, "w": 64, "h": 48, "frames": frames}
+    path = write_json(tmp_path / "transforms.json", **shared, ply_file_path="sparse_pc.ply")
+    with pytest.raises(UserError, match=r"transforms\.json: ply_file_path: .*sparse_pc\.ply: No such file"):
+        parse_transforms(path)
+    with pytest.raises(UserError, match="ply_file_path is 3"):
+        parse_transforms(write_json(path, **shared, ply_file_path=3))
+    with pytest.raises(UserError, match="the lens model of ftheta_p0 is not supported"):
+        parse_transforms(write_json(path, **shared, ftheta_p0=0.1))
+
+
+def test_a_written_file_serves_for_training_and_as_a_camera_path(tmp_path):
+    capture = with_photos(ring(CAMERAS["OPENCV"]), tmp_path)
+    write_transforms(capture, tmp_path / "transforms.json")
+    (tmp_path / "my photos").mkdir()
+    for frame in capture.frames[1:]:
+        assert frame.image is not None
+        frame.image.write_bytes(b"")
+    scene = read_transforms(tmp_path / "transforms.json", lambda _: (640, 480, 1))
+    assert scene.missing == (capture.frames[0].name,)
+    for frame, again in zip(capture.frames[1:], scene.frames, strict=True):
+        assert (again.name, again.camera) == (frame.name, frame.camera)
+        np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
+    path = read_camera_path(tmp_path / "transforms.json")
+    assert [frame.camera for frame in path] == [frame.camera for frame in capture.frames]
+
+
+def test_blender_files_are_read_back(tmp_path):
+    capture = with_photos(pinhole_ring(), tmp_path)
+    splits = ("train", "train", "train", "val", "test", "test")
+    frames = [replace(frame, split=split) for frame, split in zip(capture.frames, splits, strict=True)]
+    png = tmp_path / "train/r 0.png"
+    frames[0] = replace(frames[0], name="train/r 0.png", image=png)
+    capture = replace(capture, frames=tuple(frames))
+    assert losses_blender(capture) == ()
+    write_blender(capture, tmp_path)
+    content = json.loads((tmp_path / "transforms_train.json").read_text(encoding="utf-8"))
+    assert set(content) == {"camera_angle_x", "frames"}
+    assert math.isclose(content["camera_angle_x"], 2 * math.atan(0.64))
+    assert [record["file_path"] for record in content["frames"]][:2] == ["./train/r 0", "./my photos/ä 01.jpg"]
+    (tmp_path / "my photos").mkdir()
+    (tmp_path / "train").mkdir()
+    for path in (png, tmp_path / "my photos/ä 03.jpg", tmp_path / "my photos/ä 05.jpg"):
+        path.write_bytes(b"")
+    back = parse_blender(tmp_path, lambda _: (640, 480, 1))
+    for frame, again in zip(capture.frames, back.frames, strict=True):
+        assert (again.name, again.image, again.split) == (frame.name, frame.image, frame.split)
+        np.testing.assert_allclose(again.camera.params, frame.camera.params, rtol=1e-14)
+        np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
+    png.unlink()  # the name of a picture that is not there ends as NeRF's loader has it
+    (tmp_path / "my photos/ä 02.jpg").write_bytes(b"")
+    assert parse_blender(tmp_path, lambda _: (640, 480, 1)).frames[0].name == "train/r 0.png"
+
+
+def test_what_blender_cannot_hold_is_listed(tmp_path):
+    cameras = (CAMERAS["OPENCV"], CAMERAS["PINHOLE"], Camera.pinhole(640, 480, 400.0))
+    capture = replace(ring(*cameras, CAMERAS["OPENCV_FISHEYE"]), unit="metre")
+    assert losses_blender(capture) == (
+        "k1 of 2 cameras",
+        "k2 of 2 cameras",
+        "k3 of 1 camera",
+        "k4 of 1 camera",
+        "p1 of 1 camera",
+        "p2 of 1 camera",
+        "the fisheye projection of 1 camera",
+        "the principal point of 3 cameras",
+        "the second focal length of 3 cameras",
+        "the field of view of 2 frames (one per file)",
+        "the picture's size of 6 frames",
+        "40 points",
+        "colours of 40 points",
+        f"{len(capture.observations.pixels)} observations",  # pyright: ignore[reportOptionalMemberAccess]
+        "the unit of length (metre)",
+    )
+    with pytest.raises(UserError, match="spherical picture"):
+        write_blender(ring(CAMERAS["EQUIRECTANGULAR"]), tmp_path)
+    write_json(tmp_path / "transforms_val.json", frames=[])
+    with pytest.raises(UserError, match=r"transforms_val\.json is there already"):
+        write_blender(capture, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["transforms_val.json"]
+    with pytest.raises(UserError, match=r"transforms_train\.json: No such file"):
+        parse_blender(tmp_path / "elsewhere", measure)
+
+
+def test_two_hundred_corruptions_of_transforms(tmp_path):
+    capture = ring(CAMERAS["OPENCV"], CAMERAS["OPENCV_FISHEYE"], num_frames=4, num_points=12)
+    split = replace(capture.frames[0], split="test", mask=tmp_path / "mask.png")
+    path, refused, rng = tmp_path / "transforms.json", 0, np.random.default_rng(5)
+    write_transforms(replace(capture, frames=(split, *capture.frames[1:])), path)
+    assert_refused_or_sound(lambda: parse_transforms(path), path)
+    whole = {item: item.read_bytes() for item in tmp_path.iterdir()}
+    for _ in range(200):
+        cloud = rng.random() < 0.2
+        damaged = path.with_name("transforms_points.ply") if cloud else path
+        damaged.write_bytes((corrupted_binary if cloud else corrupted_json)(whole[damaged], rng))
+        refused += assert_refused_or_sound(lambda: parse_transforms(path), path)
+        damaged.write_bytes(whole[damaged])
+    assert refused > 100
+
+
+def test_two_hundred_corruptions_of_blender_files(tmp_path):
+    capture = with_photos(pinhole_ring(), tmp_path)
+    frames = (replace(capture.frames[0], split="test"), *capture.frames[1:])
+    write_blender(replace(capture, frames=frames), tmp_path)
+    for frame in frames:
+        assert frame.image is not None
+        frame.image.parent.mkdir(exist_ok=True)
+        frame.image.write_bytes(b"")
+    refused, rng = 0, np.random.default_rng(6)
+    for _ in range(200):
+        path = tmp_path / f"transforms_{rng.choice(['train', 'test'])}.json"
+        whole = path.read_bytes()
+        path.write_bytes(corrupted_json(whole, rng))
+        refused += assert_refused_or_sound(lambda: parse_blender(tmp_path, measure), tmp_path)
+        path.write_bytes(whole)
+    assert refused > 100
+
+
+def test_a_file_written_twice_is_the_same(tmp_path):
+    capture = replace(ring(CAMERAS["OPENCV"]), observations=None)
+    write_transforms(capture, tmp_path / "a.json")
+    first = parse_transforms(tmp_path / "a.json")
+    write_transforms(replace(first, frames=tuple(replace(f, image=None) for f in first.frames)), tmp_path / "a.json")
+    assert_same(first, parse_transforms(tmp_path / "a.json"), pose_tolerance=0.0)
