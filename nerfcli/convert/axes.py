@@ -1,0 +1,153 @@
+"""Camera axes by name, and captures whose files are to be understood otherwise than their format says.
+
+Axes are told by three letters, of the directions in which +x, +y and +z of the camera point: r(ight) or l(eft), d(own)
+or u(p), f(orward) or b(ackward). OpenCV's are rdf. Some have names.
+"""
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.frame import Capture
+from nerfcli.errors import UserError
+
+# Sources: docs.opencv.org calib3d; docs.nerf.studio "Data conventions"; Fyusion/LLFF README;
+# pytorch3d.org/docs/cameras; ROS REP 103, body frames.
+NAMED_AXES = {"opencv": "rdf", "opengl": "rub", "llff": "drb", "pytorch3d": "luf", "ros": "flu"}
+
+_DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "d": (0, 1, 0), "u": (0, -1, 0), "f": (0, 0, 1), "b": (0, 0, -1)}
+
+
+def opencv_from_axes(axes: str) -> np.ndarray:
+    """The rotation (4, 4) whose columns say where the axes of a camera point in OpenCV's.
+
+    Args:
+        axes: a name ("opencv", "opengl", "llff", "pytorch3d", "ros") or three letters such as "rub".
+
+    Raises:
+        UserError: no such name, letters that do not span space, or a left-handed camera.
+    """
+    letters = NAMED_AXES.get(axes, axes)
+    columns = np.array([_DIRECTIONS.get(letter, (0, 0, 0)) for letter in letters], dtype=np.float64).T
+    if columns.shape != (3, 3) or abs(np.linalg.det(columns)) < 0.5:
+        raise UserError(
+            f"unknown camera axes {axes!r}",
+            f"choose {', '.join(NAMED_AXES)}, or three letters for where x, y and z point: rdf, rub, ...",
+        )
+    if np.linalg.det(columns) < 0:
+        raise UserError(
+            f"camera axes {axes!r} are left-handed", "a pose of such a camera is no rotation; turn one axis around"
+        )
+    return rigid.from_parts(columns, np.zeros(3))
+
+
+def all_axes() -> Iterator[str]:
+    """The 24 right-handed camera axes: names where they have one, else letters; the named ones first."""
+    yield from NAMED_AXES
+    for pairs in permutations(("rl", "du", "fb")):
+        for letters in product(*pairs):
+            axes = "".join(letters)
+            columns = np.array([_DIRECTIONS[letter] for letter in axes])
+            if axes not in NAMED_AXES.values() and np.linalg.det(columns) > 0:
+                yield axes
+
+
+@dataclass(frozen=True)
+class Convention:
+    """How the numbers of a file are meant, where this may differ from what the format says.
+
+    Args:
+        axes: of the camera in the file's poses.
+        inverted: whether the file holds the inverse of the transform that its format prescribes.
+        pixel_centre: where cx, cy and pixel positions put the centre of the top-left pixel: 0.5, or 0 as in OpenCV.
+        intrinsics_scale: the size of the picture that the intrinsics are for, over the size that the file says.
+    """
+
+    axes: str
+    inverted: bool = False
+    pixel_centre: float = 0.5
+    intrinsics_scale: float = 1.0
+
+
+def reinterpreted(capture: Capture, meant: Convention, *, parsed_axes: str) -> Capture:
+    """The capture that a file describes if its numbers are meant in another convention than its format's.
+
+    Args:
+        capture: as it was parsed, by the format's own convention.
+        meant: the convention that holds.
+        parsed_axes: the camera axes that the format prescribes.
+
+    Raises:
+        UserError: axes that there are not.
+    """
+    poses = reinterpreted_poses(poses_of(capture), meant, parsed_axes=parsed_axes)
+    shift = 0.5 - meant.pixel_centre
+    cameras = {
+        camera: for_picture(shifted(camera, shift), meant.intrinsics_scale)
+        for camera in {frame.camera for frame in capture.frames}
+    }
+    return _with_views(capture, poses, cameras, shift)
+
+
+def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Capture:
+    """A capture whose numbers, once written in the format's own convention, stand in the file in the wanted one.
+
+    The inverse of `reinterpreted`.
+    """
+    turn = opencv_from_axes(wanted.axes) @ rigid.inverse(opencv_from_axes(written_axes))
+    shift = wanted.pixel_centre - 0.5
+    cameras = {camera: shifted(camera, shift) for camera in {frame.camera for frame in capture.frames}}
+    return _with_views(capture, poses_of(capture) @ turn, cameras, shift)
+
+
+def reinterpreted_poses(world_from_cam: np.ndarray, meant: Convention, *, parsed_axes: str) -> np.ndarray:
+    """The poses (frames, 4, 4), OpenCV axes, that a file holds if it is meant in another convention than parsed."""
+    in_file = world_from_cam @ opencv_from_axes(parsed_axes)
+    if meant.inverted:
+        in_file = rigid.inverse(in_file)
+    return in_file @ rigid.inverse(opencv_from_axes(meant.axes))
+
+
+def poses_of(capture: Capture) -> np.ndarray:
+    """`world_from_cam` of all frames, (frames, 4, 4)."""
+    return np.stack([frame.world_from_cam for frame in capture.frames])
+
+
+def for_picture(camera: Camera, intrinsics_scale: float) -> Camera:
+    """The camera of the picture that it says, if its parameters are for one that is `intrinsics_scale` times as large.
+
+    A principal point in the very middle stays there: it is one that the file did not give.
+    """
+    if intrinsics_scale == 1 or camera.is_spherical:
+        return camera
+    in_the_middle = camera.principal_point == (camera.width / 2, camera.height / 2)
+    scaled = ("f", "fx", "fy") if in_the_middle else ("f", "fx", "fy", "cx", "cy")
+    return _changed(camera, scaled, lambda value: value / intrinsics_scale)
+
+
+def shifted(camera: Camera, shift_px: float) -> Camera:
+    """The camera with its principal point moved by the same number of pixels in x and y."""
+    if shift_px == 0 or camera.is_spherical:
+        return camera
+    return _changed(camera, ("cx", "cy"), lambda value: value + shift_px)
+
+
+def _changed(camera: Camera, names: Collection[str], change: Callable[[float], float]) -> Camera:
+    values = zip(parameter_names(camera.model), camera.params, strict=True)
+    params = tuple(change(value) if name in names else value for name, value in values)
+    return Camera(camera.model, camera.width, camera.height, params)
+
+
+def _with_views(capture: Capture, poses: np.ndarray, cameras: dict[Camera, Camera], shift: float) -> Capture:
+    frames = tuple(
+        replace(frame, camera=cameras[frame.camera], world_from_cam=pose)
+        for frame, pose in zip(capture.frames, poses, strict=True)
+    )
+    observations = capture.observations
+    if observations is not None and shift:
+        observations = replace(observations, pixels=observations.pixels + shift)
+    return replace(capture, frames=frames, observations=observations)

@@ -1,0 +1,238 @@
+"""Converting a capture: parse, apply what the user knows, refuse or accept losses, write, verify, keep."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.frame import Capture
+from nerfcli.convert.axes import NAMED_AXES, Convention, expressed, opencv_from_axes, reinterpreted
+from nerfcli.convert.formats import Format, Given, recognise, with_photos
+from nerfcli.convert.probes import probes_of, projected
+from nerfcli.convert.readback import READERS, Meant, read_ply_points
+from nerfcli.convert.reduction import reduced
+from nerfcli.convert.verify import TOLERANCE_PX, Verification, listed_order, unreadable, verify, verify_points
+from nerfcli.errors import GATE_NOT_MET, UserError
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What the user knows better about the numbers in a file than its format does; None where they do not.
+
+    Args: see `Convention`.
+    """
+
+    axes: str | None = None
+    inverted: bool = False
+    pixel_centre: float | None = None
+    intrinsics_scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the written file shall be.
+
+    Args:
+        form: its format.
+        axes, pixel_centre: see `Convention`; None for the format's own.
+        allow_loss: whether what the format cannot hold may be left out.
+        overwrite: whether a result that is there may be replaced.
+        verified: whether the file is read back and compared.
+        tolerance_px: the largest residual that passes.
+    """
+
+    form: Format
+    axes: str | None = None
+    pixel_centre: float | None = None
+    allow_loss: bool = False
+    overwrite: bool = False
+    verified: bool = True
+    tolerance_px: float = TOLERANCE_PX
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What a conversion did.
+
+    Args:
+        path: what was written.
+        source_format: the format that was read.
+        capture: what was to be written.
+        losses: what of it the format cannot hold; left out.
+        loss_px: how far the lost terms of lenses move a pixel at most.
+        verification: of the written file; None if it was not asked for.
+    """
+
+    path: Path
+    source_format: str
+    capture: Capture
+    losses: tuple[str, ...]
+    loss_px: float
+    verification: Verification | None
+
+
+def load(source: Path, given: Given, doubt: Doubt) -> tuple[Format, Path, Capture]:
+    """The capture in a file or folder, in the convention that the user knows to hold.
+
+    Returns:
+        The format, the file or folder that was parsed, the capture.
+
+    Raises:
+        UserError: no capture, a damaged one, or a convention that the format does not leave open.
+    """
+    form, found = recognise(source)
+    assert form.parse is not None
+    capture = form.parse(found, given)
+    if given.images is not None:
+        capture = with_photos(capture, given.images)
+    meant = Convention(
+        axes=form.axes if doubt.axes is None else doubt.axes,
+        inverted=doubt.inverted,
+        pixel_centre=0.5 if doubt.pixel_centre is None else doubt.pixel_centre,
+        intrinsics_scale=doubt.intrinsics_scale,
+    )
+    if meant != Convention(form.axes):
+        capture = reinterpreted(capture, meant, parsed_axes=form.axes)
+    return form, found, capture
+
+
+def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wanted) -> Conversion:
+    """Write a capture in another format, and prove that nothing but the accepted losses was lost.
+
+    The file is kept only if what was read back from it agrees; else what stood there before stands there again.
+
+    Args:
+        capture: to be written.
+        target: the file; or the folder, for formats that fill one, and where the file gets its usual name.
+        source_format: where the capture is from, for the report.
+        wanted: format, convention, and what is allowed.
+
+    Raises:
+        UserError: losses without leave, an existing result, a place that cannot be written; or with exit code 7, a file
+            that does not hold what it should.
+    """
+    form = wanted.form
+    if form.write is None or form.losses is None:
+        raise UserError(f"{form.name} can be read, not written", "choose another format with --to", exit_code=2)
+    convention = _convention(form, wanted)
+    path = (
+        target
+        if not form.default_name or target.suffix == Path(form.default_name).suffix
+        else target / form.default_name
+    )
+    losses = form.losses(capture)
+    if losses and not wanted.allow_loss:
+        raise UserError(
+            f"{form.name} cannot hold all of this capture; it would lose: {'; '.join(losses)}",
+            "add --allow-loss to leave that out, or choose another format, such as npz, which holds everything",
+        )
+    files = _files(form, path)
+    there = [file for file in files if file.exists()]
+    if there and not wanted.overwrite:
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another place")
+    left = reduced(capture, form.name) if losses else capture
+    verification = None
+    with _kept_on_success(path, there, files):
+        form.write(expressed(capture, convention, written_axes=form.axes), path)
+        if wanted.verified:
+            verification = _verification(left, path, form, convention, wanted.tolerance_px)
+            if not verification.holds:
+                raise _does_not_hold(path, verification)
+    return Conversion(path, source_format, capture, losses, _loss_px(capture, left), verification)
+
+
+def _convention(form: Format, wanted: Wanted) -> Convention:
+    """The convention of the file to be written.
+
+    Raises:
+        UserError: one that the format does not leave open.
+    """
+    axes = form.axes if wanted.axes is None else wanted.axes
+    if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
+        raise UserError(
+            f"{form.name} fixes the camera axes: {form.axes}, not {axes}",
+            "leave --axes out; every program that reads this format expects its own axes",
+        )
+    pixel_centre = 0.5 if wanted.pixel_centre is None else wanted.pixel_centre
+    if pixel_centre != 0.5 and not form.open_centre:
+        raise UserError(
+            f"{form.name} fixes where pixel positions count from: the first pixel's centre is (0.5, 0.5)",
+            "leave --pixel-center out; every program that reads this format expects it so",
+        )
+    return Convention(axes, pixel_centre=pixel_centre)
+
+
+def _verification(left: Capture, path: Path, form: Format, convention: Convention, tolerance_px: float) -> Verification:
+    if form.name == "ply":
+        return verify_points(left, read_ply_points(path), tolerance_px=tolerance_px)
+    listed = listed_order(left, form.name)
+    sizes = tuple((left.frames[index].camera.width, left.frames[index].camera.height) for index in listed)
+    letters = NAMED_AXES.get(convention.axes, convention.axes)
+    try:
+        back = READERS[form.name](path, Meant(letters, convention.pixel_centre, sizes))
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError, OSError) as error:
+        return unreadable(left, f"it cannot be read back ({type(error).__name__}: {error})", tolerance_px=tolerance_px)
+    return verify(left, back, listed=listed, tolerance_px=tolerance_px)
+
+
+def _does_not_hold(path: Path, verification: Verification) -> UserError:
+    what = verification.fault or (
+        f"a point of {verification.worst} is off by {verification.max_px:.3g} px "
+        f"(rotations by {verification.max_deg:.3g} degrees, "
+        f"centres by {verification.max_centre_shift:.3g} of the scene's size); "
+        f"tolerance {verification.tolerance_px:.3g} px"
+    )
+    return UserError(
+        f"{path} did not hold what it should: {what}",
+        "nothing was kept; this is a fault of nerfcli, please report it (--no-verify writes the file all the same)",
+        exit_code=GATE_NOT_MET,
+    )
+
+
+def _loss_px(capture: Capture, left: Capture) -> float:
+    """How far apart a capture and what is left of it show the same points, at most, within the first one's pictures."""
+    if all(one.camera == other.camera for one, other in zip(capture.frames, left.frames, strict=True)):
+        return 0.0
+    probes = probes_of(capture)
+    return float(np.linalg.norm(projected(left, probes)[0] - probes.pixels, axis=1).max(initial=0.0))
+
+
+def _files(form: Format, path: Path) -> list[Path]:
+    """All files that a format may write at `path`."""
+    folder = path.parent if form.default_name else path
+    return [folder / name.replace("*", path.stem) for name in form.files]
+
+
+@contextmanager
+def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterator[None]:
+    """Set existing files aside; on any exception remove what was written and put them back.
+
+    Folders that were made on the way are removed with it.
+    """
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder takes
+    aside = {file: place / file.name for file in there}
+    if there:
+        place.mkdir()
+    try:
+        for file, other in aside.items():
+            os.replace(file, other)
+        yield
+    except BaseException:
+        for file in files:
+            if file not in aside or aside[file].exists():
+                file.unlink(missing_ok=True)
+        for file, other in aside.items():
+            if other.exists():
+                file.parent.mkdir(parents=True, exist_ok=True)
+                os.replace(other, file)
+        for folder in missing:
+            with suppress(OSError):  # a folder that is not empty is someone else's
+                folder.rmdir()
+        raise
+    finally:
+        shutil.rmtree(place, ignore_errors=True)

@@ -1,0 +1,249 @@
+"""Which convention a capture's numbers follow, when it is in doubt: hypotheses, each with what the photos say of it.
+
+Four questions: the axes of the cameras and the direction of the transforms (which are asked together, with the size
+for which the intrinsics are), then the size alone, then the half pixel. Each question's answers are compared with the
+other questions answered best.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from nerfcli.cameras.frame import Capture
+from nerfcli.convert.axes import Convention, all_axes, opencv_from_axes, poses_of, reinterpreted_poses
+from nerfcli.convert.evidence import FrustumEvidence, Intrinsics, MatchEvidence, ObservationEvidence
+from nerfcli.convert.matches import match_neighbours
+from nerfcli.errors import UserError
+
+# Intrinsics for another size are for photos before or after a downscaling, by a power of two.
+SCALES = (1.0, 0.125, 0.25, 0.5, 2.0, 4.0, 8.0)
+
+# A hypothesis holds if at least this share of the items agrees with it, and if it is better than the next by this
+# factor and by more than the noise: the 99 % interval of the difference under resampling of photos.
+LEAST_SHARE = 0.5
+LEAST_RATIO = 1.2
+_RESAMPLES = 400
+_LEAST_GROUPS = 5
+
+Evidence = ObservationEvidence | MatchEvidence | FrustumEvidence
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One hypothesis and what speaks for it.
+
+    Args:
+        convention: that the numbers of the file are meant in.
+        as_format_says: whether it is what the format prescribes.
+        median_px: of the items' errors; infinite if most lie behind a camera.
+        inlier_share: the share of items whose error is small.
+    """
+
+    convention: Convention
+    as_format_says: bool
+    median_px: float
+    inlier_share: float
+
+
+@dataclass(frozen=True)
+class Question:
+    """One question with its answers, best first.
+
+    Args:
+        name: "axes and direction", "image size" or "pixel centre".
+        answers: the hypotheses, best first, that of the format always among them.
+        verdict: "holds", "not decidable" or "none holds".
+        ratio: how many times better the best is than the next: of medians, or of shares where medians say nothing.
+        reason: why it is not decidable, or ""
+    """
+
+    name: str
+    answers: tuple[Answer, ...]
+    verdict: str
+    ratio: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What was found out about a capture's convention.
+
+    Args:
+        evidence: what it rests on, with numbers of items.
+        questions: in the order in which they were answered.
+        convention: the answers that hold; the format's own where a question is not decidable.
+        declared: what the format says.
+    """
+
+    evidence: str
+    questions: tuple[Question, ...]
+    convention: Convention
+    declared: Convention
+
+    @property
+    def as_format_says(self) -> bool:
+        """Whether nothing speaks against the format's own convention."""
+        return self.convention == self.declared and not any(
+            question.verdict == "none holds" for question in self.questions
+        )
+
+
+def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None]) -> Detection:
+    """Score hypotheses about a capture's convention by what its photos show.
+
+    By where its photos show the 3D points, if the capture says so; else by SIFT matches between its photos; else by
+    whether its points lie in its pictures.
+
+    Args:
+        capture: as it was parsed, by its format's own convention.
+        axes: the camera axes that the format prescribes.
+        progress: told the share of the work that is done.
+
+    Raises:
+        UserError: there is nothing to judge by.
+    """
+    evidence = _evidence(capture, progress)
+    declared = Convention(axes)
+    poses = poses_of(capture)
+    conventions = [Convention(name, inverted) for inverted in (False, True) for name in _different_axes(axes)]
+    if isinstance(evidence, FrustumEvidence):
+        tried = [
+            (convention, evidence.errors_px(reinterpreted_poses(poses, convention, parsed_axes=axes)))
+            for convention in conventions
+        ]
+        question = _question("axes and direction", tried, declared, evidence)
+        found = question.answers[0].convention if question.verdict == "holds" else declared
+        return Detection(evidence.name, (question,), found, declared)
+
+    best, question = _axes_and_scale(evidence, poses, conventions, declared)
+    questions = [question]
+    for name, variants in (
+        ("image size", [replace(best, intrinsics_scale=scale) for scale in SCALES]),
+        ("pixel centre", [replace(best, pixel_centre=centre) for centre in (0.5, 0.0)]),
+    ):
+        tried = [(variant, _errors(evidence, poses, variant, axes)) for variant in variants]
+        question = _question(name, tried, declared, evidence)
+        questions.append(question)
+        if question.verdict == "holds":
+            best = question.answers[0].convention
+        else:
+            best = replace(best, **{field: getattr(declared, field) for field in _FIELDS[name]})
+    if questions[0].verdict != "holds":
+        best = declared
+    return Detection(evidence.name, tuple(questions), best, declared)
+
+
+_FIELDS = {"image size": ("intrinsics_scale",), "pixel centre": ("pixel_centre",)}
+
+
+def _evidence(capture: Capture, progress: Callable[[float, str], None]) -> Evidence:
+    seen = capture.observations
+    if seen is not None and (seen.point_index >= 0).sum() >= 20:
+        return ObservationEvidence(capture)
+    pairs, cameras = match_neighbours(capture.frames, progress=progress)
+    if pairs:
+        return MatchEvidence(pairs, cameras, len(capture.frames))
+    if len(capture.points):
+        return FrustumEvidence(capture)
+    raise UserError(
+        "there is nothing to judge the convention by: no photo on disk that matches another, and no 3D point",
+        "give the folder of the photos with --images",
+    )
+
+
+def _different_axes(declared: str) -> Iterable[str]:
+    """All camera axes, the declared ones first and under the name that they have there."""
+    yield declared
+    own = opencv_from_axes(declared)
+    yield from (axes for axes in all_axes() if not np.array_equal(opencv_from_axes(axes), own))
+
+
+def _axes_and_scale(
+    evidence: ObservationEvidence | MatchEvidence,
+    poses: np.ndarray,
+    conventions: list[Convention],
+    declared: Convention,
+) -> tuple[Convention, Question]:
+    """The best convention, its scale included, and the question for axes and direction at that scale."""
+    tried = []
+    for scale in SCALES:
+        directions = evidence.directions(Intrinsics(scale))
+        for convention in conventions:
+            errors = evidence.errors_px(directions, reinterpreted_poses(poses, convention, parsed_axes=declared.axes))
+            tried.append((replace(convention, intrinsics_scale=scale), errors))
+    best, _ = min(tried, key=lambda pair: _rank(pair[1], evidence.threshold_px))
+    at_its_scale = [pair for pair in tried if pair[0].intrinsics_scale == best.intrinsics_scale]
+    return best, _question("axes and direction", at_its_scale, declared, evidence)
+
+
+def _errors(
+    evidence: ObservationEvidence | MatchEvidence, poses: np.ndarray, convention: Convention, parsed_axes: str
+) -> np.ndarray:
+    directions = evidence.directions(Intrinsics(convention.intrinsics_scale, convention.pixel_centre))
+    return evidence.errors_px(directions, reinterpreted_poses(poses, convention, parsed_axes=parsed_axes))
+
+
+def _rank(errors: np.ndarray, threshold_px: float) -> tuple[float, float]:
+    """Smaller is better: by the median, and where most items lie behind a camera by the share that fits."""
+    return float(np.median(errors)), -float(np.mean(errors <= threshold_px))
+
+
+def _question(
+    name: str, tried: list[tuple[Convention, np.ndarray]], declared: Convention, evidence: Evidence
+) -> Question:
+    ranked = sorted(tried, key=lambda pair: _rank(pair[1], evidence.threshold_px))
+    answers = tuple(
+        Answer(
+            convention,
+            _same(name, convention, declared),
+            float(np.median(errors)),
+            float(np.mean(errors <= evidence.threshold_px)),
+        )
+        for convention, errors in ranked
+    )
+    (_, best), (_, second) = ranked[:2]
+    by_share = not 0 < answers[0].median_px < np.inf and not answers[0].median_px < answers[1].median_px
+    if by_share:
+        ratio = answers[0].inlier_share / max(answers[1].inlier_share, 1e-9)
+        low, high = _interval(
+            best, second, evidence.groups, lambda errors: -float(np.mean(errors <= evidence.threshold_px))
+        )
+        what = f"the shares differ by {100 * (answers[0].inlier_share - answers[1].inlier_share):.1f} %"
+    else:
+        ratio = answers[1].median_px / max(answers[0].median_px, 1e-9)
+        low, high = _interval(best, second, evidence.groups, lambda errors: float(np.median(errors)))
+        what = f"the medians differ by {answers[1].median_px - answers[0].median_px:.2g} px"
+    if answers[0].inlier_share < LEAST_SHARE and not isinstance(evidence, FrustumEvidence):
+        return Question(name, answers, "none holds", ratio, "most of the evidence contradicts each of them")
+    if not (low > 0 and ratio >= LEAST_RATIO):
+        noise = (high - low) / 2
+        reason = f"{what}, less than {'noise' if low <= 0 else 'a systematic error might make'} ({noise:.2g})"
+        return Question(name, answers, "not decidable", ratio, reason)
+    return Question(name, answers, "holds", ratio, "")
+
+
+def _same(name: str, convention: Convention, declared: Convention) -> bool:
+    fields = _FIELDS.get(name, ("axes", "inverted"))
+    return all(getattr(convention, field) == getattr(declared, field) for field in fields)
+
+
+def _interval(
+    best: np.ndarray, second: np.ndarray, groups: np.ndarray, statistic: Callable[[np.ndarray], float]
+) -> tuple[float, float]:
+    """The 99 % interval of how much smaller the statistic of `best` is, when the photos are drawn again.
+
+    Where there are few photos, the items themselves are drawn.
+    """
+    rng = np.random.default_rng(0)
+    members = [np.flatnonzero(groups == group) for group in np.unique(groups)]
+    if len(members) < _LEAST_GROUPS:
+        members = [np.array([index]) for index in range(len(groups))]
+    # Errors beyond any picture would make differences of infinities.
+    best, second = np.minimum(best, 1e6), np.minimum(second, 1e6)
+    differences = []
+    for _ in range(_RESAMPLES):
+        drawn = np.concatenate([members[k] for k in rng.integers(0, len(members), len(members))])
+        differences.append(statistic(second[drawn]) - statistic(best[drawn]))
+    low, high = np.quantile(differences, (0.005, 0.995))
+    return float(low), float(high)

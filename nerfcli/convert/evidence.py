@@ -1,0 +1,155 @@
+"""What tells whether a convention holds: how far, in pixels, photos and cameras contradict each other under it.
+
+Each kind of evidence turns the directions in which pixels see (which depend on the intrinsics alone) and the poses into
+one error for every item. An item that lies behind a camera has an infinite error.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture
+from nerfcli.convert.axes import for_picture, shifted
+from nerfcli.convert.matches import PairMatches
+from nerfcli.convert.probes import distinct, rows_of_each
+
+# Observations that are looked at: enough for a median, few enough to try hundreds of hypotheses.
+_MOST_OBSERVATIONS = 20_000
+_MOST_FRAMES = 60
+
+# The rays of a match must be this far from parallel for its place along them to mean anything.
+_LEAST_PARALLAX_PX = 3.0
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A hypothesis about intrinsics: see `Convention`."""
+
+    scale: float = 1.0
+    pixel_centre: float = 0.5
+
+
+class ObservationEvidence:
+    """Points in the world and where photos show them.
+
+    The error of an observation is the angle between the direction in which its pixel sees and the one to its point,
+    times the focal length.
+    """
+
+    threshold_px = 4.0
+
+    def __init__(self, capture: Capture):
+        seen = capture.observations
+        assert seen is not None
+        rows = np.flatnonzero(seen.point_index >= 0)
+        if len(rows) > _MOST_OBSERVATIONS:
+            rows = np.sort(np.random.default_rng(0).choice(rows, _MOST_OBSERVATIONS, replace=False))
+        self.groups = seen.frame_index[rows]
+        self._points = capture.points[seen.point_index[rows]]
+        self._pixels = seen.pixels[rows]
+        self._cameras = [frame.camera for frame in capture.frames]
+        self.name = f"{len(rows)} observations of points in {len(np.unique(self.groups))} photos"
+
+    def directions(self, intrinsics: Intrinsics) -> tuple[np.ndarray, ...]:
+        """What the pixels see: unit directions (M, 3), their validity and their pixels per radian."""
+        return _directions(self._cameras, self.groups, self._pixels, intrinsics)
+
+    def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
+        """The error of each observation, (M,)."""
+        seen, valid, focal_px = directions
+        cam_from_world = rigid.inverse(world_from_cam)[self.groups]
+        towards = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
+        angle = np.arctan2(np.linalg.norm(np.cross(seen, towards), axis=1), np.einsum("mi,mi->m", seen, towards))
+        # Of a pinhole camera nothing lies behind it, and of a wider one nothing a right angle off what a pixel sees.
+        return np.where(valid & (angle < np.pi / 2), focal_px * angle, np.inf)
+
+
+class MatchEvidence:
+    """Places that two photos both show.
+
+    The error of a match is its Sampson distance to the epipolar geometry of the two poses, as an angle times the focal
+    length: |b2 E b1| / sqrt(|E b1|^2 + |E^T b2|^2) with unit directions b and E = [t]x R of cam2_from_cam1.
+    Source: Hartley and Zisserman, 2nd edition, section 11.4.3; on the sphere as in Pagani and Stricker 2011.
+    """
+
+    threshold_px = 4.0
+
+    def __init__(self, pairs: Sequence[PairMatches], cameras: dict[int, Camera], num_frames: int):
+        self.groups = np.repeat(np.arange(len(pairs)), [len(pair.first_pixels) for pair in pairs])
+        self._first = np.array([pair.first for pair in pairs])[self.groups]
+        self._second = np.array([pair.second for pair in pairs])[self.groups]
+        self._first_pixels = np.concatenate([pair.first_pixels for pair in pairs])
+        self._second_pixels = np.concatenate([pair.second_pixels for pair in pairs])
+        stand_in = next(iter(cameras.values()))
+        self._cameras = [cameras.get(index, stand_in) for index in range(num_frames)]
+        self.name = f"{len(self.groups)} SIFT matches in {len(pairs)} pairs of photos"
+
+    def directions(self, intrinsics: Intrinsics) -> tuple[np.ndarray, ...]:
+        """What both pixels of the matches see: unit directions (M, 3) twice, validity, pixels per radian."""
+        first, valid1, focal1 = _directions(self._cameras, self._first, self._first_pixels, intrinsics)
+        second, valid2, focal2 = _directions(self._cameras, self._second, self._second_pixels, intrinsics)
+        return first, second, valid1 & valid2, (focal1 + focal2) / 2
+
+    def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
+        """The error of each match, (M,)."""
+        first, second, valid, focal_px = directions
+        second_from_first = rigid.inverse(world_from_cam[self._second]) @ world_from_cam[self._first]
+        rotation, t = second_from_first[:, :3, :3], second_from_first[:, :3, 3]
+        turned = np.einsum("mij,mj->mi", rotation, first)  # the first direction in the second camera's axes
+        normal1 = np.cross(t, turned)  # E b1
+        normal2 = np.cross(second, t)  # E^T b2, up to the rotation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sampson = np.abs(np.einsum("mi,mi->m", second, normal1)) / np.sqrt(
+                np.sum(normal1**2, axis=1) + np.sum(normal2**2, axis=1)
+            )
+        across = np.cross(turned, second)
+        # second d2 = turned d1 + t, so these have the signs of the distances d1 and d2.
+        behind = (np.einsum("mi,mi->m", across, normal2) < 0) | (np.einsum("mi,mi->m", across, normal1) > 0)
+        parallax = np.linalg.norm(across, axis=1) * focal_px > _LEAST_PARALLAX_PX
+        return np.where(valid & ~(behind & parallax) & np.isfinite(sampson), focal_px * sampson, np.inf)
+
+
+class FrustumEvidence:
+    """Points of the scene, of which each photo should show some: the error is 0 for a point that it shows.
+
+    It tells axes and directions, not intrinsics: the wider the pictures, the more points they show.
+    """
+
+    threshold_px = 0.0
+
+    def __init__(self, capture: Capture):
+        rng = np.random.default_rng(0)
+        frames = np.unique(np.linspace(0, len(capture.frames) - 1, _MOST_FRAMES).round().astype(int))
+        chosen = rng.choice(len(capture.points), min(len(capture.points), 300), replace=False)
+        self.groups = np.repeat(frames, len(chosen))
+        self._points = np.tile(capture.points[chosen], (len(frames), 1))
+        self._cameras = [frame.camera for frame in capture.frames]
+        self.name = f"{len(chosen)} points, whether they lie inside the pictures of {len(frames)} photos"
+
+    def errors_px(self, world_from_cam: np.ndarray) -> np.ndarray:
+        """0 or infinity for each pair of a photo and a point, (M,)."""
+        cam_from_world = rigid.inverse(world_from_cam)[self.groups]
+        in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
+        cameras, camera_of_frame = distinct(self._cameras)
+        shown = np.zeros(len(self.groups), dtype=bool)
+        for camera, rows in zip(cameras, rows_of_each(camera_of_frame[self.groups], len(cameras)), strict=True):
+            pixels, valid = camera.project(in_camera[rows])
+            shown[rows] = valid & np.all((pixels >= 0) & (pixels <= (camera.width, camera.height)), axis=1)
+        return np.where(shown, 0.0, np.inf)
+
+
+def _directions(
+    cameras: Sequence[Camera], frame_index: np.ndarray, pixels: np.ndarray, intrinsics: Intrinsics
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit directions (M, 3) in which pixels of frames see, their validity, and pixels per radian."""
+    each, camera_of_frame = distinct(cameras)
+    directions, valid = np.zeros((len(pixels), 3)), np.zeros(len(pixels), dtype=bool)
+    focal_px = np.zeros(len(pixels))
+    for camera, rows in zip(each, rows_of_each(camera_of_frame[frame_index], len(each)), strict=True):
+        meant = for_picture(shifted(camera, 0.5 - intrinsics.pixel_centre), intrinsics.scale)
+        directions[rows], valid[rows] = meant.bearings(pixels[rows])
+        focal_px[rows] = meant.focal_px
+    return directions, valid, focal_px

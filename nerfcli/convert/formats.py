@@ -1,0 +1,312 @@
+"""The formats of captures in one table: how each is recognised, parsed, written, and what it cannot hold."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from nerfcli import scene
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.archive import losses_npz, parse_npz, write_npz
+from nerfcli.cameras.formats.blender import losses_blender, parse_blender, write_blender
+from nerfcli.cameras.formats.bundler import parse_bundler
+from nerfcli.cameras.formats.colmap import parse_colmap
+from nerfcli.cameras.formats.colmap_write import (
+    losses_colmap,
+    losses_colmap_text,
+    write_colmap_binary,
+    write_colmap_text,
+)
+from nerfcli.cameras.formats.llff import IMAGE_FOLDERS, losses_llff, parse_llff, write_llff
+from nerfcli.cameras.formats.metashape import parse_metashape
+from nerfcli.cameras.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
+from nerfcli.cameras.formats.ply import losses_ply, write_ply
+from nerfcli.cameras.formats.reality_capture import parse_reality_capture
+from nerfcli.cameras.formats.trajectories import (
+    losses_kitti,
+    losses_tum,
+    parse_kitti,
+    parse_tum,
+    write_kitti,
+    write_tum,
+)
+from nerfcli.cameras.formats.transforms import (
+    losses_transforms,
+    parse_transforms,
+    read_json_object,
+    write_transforms,
+)
+from nerfcli.cameras.frame import Capture
+from nerfcli.convert.finding import (
+    MODEL_FILES,
+    by_suffix,
+    find_blender,
+    find_json,
+    find_lines,
+    find_llff,
+    find_model,
+    find_scene,
+)
+from nerfcli.errors import UserError
+from nerfcli.media.images import list_images, read_exif
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user gives besides the capture's own files.
+
+    Args:
+        images: the folder of the photos, that names are relative to.
+        camera: of all frames, for formats without cameras.
+    """
+
+    images: Path | None = None
+    camera: Camera | None = None
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of captures.
+
+    Args:
+        name: as the user says it.
+        title: what it is.
+        looked_for: the files by which a folder is recognised.
+        find: where in a path, a file or a folder, such a capture stands; None where there is none.
+        parse: reads what `find` found; None for formats that are only written.
+        axes: the camera axes of its poses, as three letters or a name.
+        open_axes: whether poses with other axes are found in such files, so that --axes makes sense.
+        open_centre: whether principal points with other pixel centres are found in such files.
+        default_name: the file that it writes if a folder is named; "" for formats that fill a folder.
+        files: the names of all files that it may write, where "*" stands for that file's name without its suffix.
+        write, losses: None for formats that are only read.
+    """
+
+    name: str
+    title: str
+    looked_for: str
+    find: Callable[[Path], Path | None]
+    parse: Callable[[Path, Given], Capture] | None
+    axes: str = "opencv"
+    open_axes: bool = False
+    open_centre: bool = False
+    default_name: str = ""
+    files: tuple[str, ...] = ()
+    write: Callable[[Capture, Path], None] | None = None
+    losses: Callable[[Capture], tuple[str, ...]] | None = None
+
+
+def recognise(path: Path) -> tuple[Format, Path]:
+    """The format of the capture in a file or folder, and the file or folder in it that is to be parsed.
+
+    Raises:
+        UserError: nothing there, or nothing that is known; what was looked for is listed.
+    """
+    if not path.exists():
+        raise UserError(f"there is no {path}", "give the file or the folder of a capture")
+    for form in FORMATS:
+        found = form.find(path)
+        if found is not None and form.parse is not None:
+            return form, found
+    looked_for = "; ".join(f"{form.name}: {form.looked_for}" for form in FORMATS if form.parse is not None)
+    raise UserError(f"{path} holds no capture in a known format", f"looked for {looked_for}")
+
+
+def format_named(name: str) -> Format:
+    """The format of that name.
+
+    Raises:
+        UserError: there is none.
+    """
+    for form in FORMATS:
+        if form.name == name:
+            return form
+    raise UserError(
+        f"unknown format {name!r}", f"choose one of {', '.join(form.name for form in FORMATS)}", exit_code=2
+    )
+
+
+def with_photos(capture: Capture, folder: Path) -> Capture:
+    """The capture with its photos looked up in another folder: under their names there, or under their file names."""
+    frames = []
+    for frame in capture.frames:
+        candidates = (folder / frame.name, folder / Path(frame.name).name)
+        frames.append(replace(frame, image=next((path for path in candidates if path.is_file()), frame.image)))
+    return replace(capture, frames=tuple(frames))
+
+
+def _measure(path: Path) -> tuple[int, int, int]:
+    exif = read_exif(path)
+    return exif.width, exif.height, exif.orientation
+
+
+def _parse_scene(path: Path, given: Given) -> Capture:
+    loaded = scene.load(path)  # which checks scene.json
+    content = read_json_object(path / scene.SCENE_FILE)
+    capture = parse_colmap(path / content["model"], (path / content["image_folder"]).resolve())
+    test_names, present = set(content["split"]["test"]), {frame.name: frame for frame in loaded.frames}
+    frames = tuple(
+        replace(
+            frame,
+            split="test" if frame.name in test_names else "train",
+            mask=present[frame.name].mask if frame.name in present else None,
+        )
+        for frame in capture.frames
+    )
+    return replace(capture, frames=frames, unit=loaded.unit)
+
+
+def _parse_model(path: Path, given: Given) -> Capture:
+    """A COLMAP model, with the photos where its names lead to one: below images/ beside it, or below its project."""
+    capture = parse_colmap(path)
+    homes = (path, *path.resolve().parents[:3])
+    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
+    places = [given.images] if given.images is not None else [*folders, *homes]
+    leading = [place for place in places if any((place / frame.name).is_file() for frame in capture.frames[:100])]
+    place = next(iter([*leading, *folders]), None)
+    if place is None:
+        return capture
+    return replace(capture, frames=tuple(replace(frame, image=place / frame.name) for frame in capture.frames))
+
+
+FORMATS = (
+    Format("nerfcli", "a scene of nerfcli poses (read)", scene.SCENE_FILE, find_scene, _parse_scene),
+    Format(
+        "colmap",
+        "a COLMAP model, binary; read also as text",
+        "cameras, images and points3D, .bin or .txt, in it or in sparse/0",
+        find_model,
+        _parse_model,
+        files=MODEL_FILES,
+        write=write_colmap_binary,
+        losses=losses_colmap,
+    ),
+    Format(
+        "colmap-text",
+        "a COLMAP model as text",
+        "as colmap",
+        find_model,
+        _parse_model,
+        files=MODEL_FILES,
+        write=write_colmap_text,
+        losses=losses_colmap_text,
+    ),
+    Format(
+        "transforms",
+        "transforms.json of nerfstudio and instant-ngp",
+        "transforms.json",
+        lambda path: find_json(path, opening="{", name="transforms.json"),
+        lambda path, given: parse_transforms(path, _measure),
+        axes="opengl",
+        open_axes=True,
+        open_centre=True,
+        default_name="transforms.json",
+        files=("*.json", "*_points.ply"),
+        write=write_transforms,
+        losses=losses_transforms,
+    ),
+    Format(
+        "blender",
+        "transforms_{train,val,test}.json of NeRF's Blender scenes",
+        "transforms_train.json",
+        find_blender,
+        lambda path, given: parse_blender(path, _measure),
+        axes="opengl",
+        open_axes=True,
+        files=("transforms_train.json", "transforms_val.json", "transforms_test.json"),
+        write=write_blender,
+        losses=losses_blender,
+    ),
+    Format(
+        "llff",
+        "poses_bounds.npy of LLFF",
+        "poses_bounds.npy",
+        find_llff,
+        lambda path, given: parse_llff(path, list_images),
+        axes="llff",
+        open_axes=True,
+        files=("poses_bounds.npy",),
+        write=write_llff,
+        losses=losses_llff,
+    ),
+    Format(
+        "opensfm",
+        "reconstruction.json of OpenSfM and OpenDroneMap",
+        "reconstruction.json",
+        lambda path: find_json(path, opening="[", name="reconstruction.json"),
+        lambda path, given: parse_opensfm(path),
+        default_name="reconstruction.json",
+        files=("*.json",),
+        write=write_opensfm,
+        losses=losses_opensfm,
+    ),
+    Format(
+        "metashape",
+        "cameras of Agisoft Metashape as XML (read)",
+        "a file .xml, or cameras.xml",
+        by_suffix(".xml", "cameras.xml"),
+        lambda path, given: parse_metashape(path),
+    ),
+    Format(
+        "reality-capture",
+        "cameras of RealityScan or RealityCapture as CSV (read)",
+        "a file .csv",
+        by_suffix(".csv"),
+        lambda path, given: parse_reality_capture(path, _measure, images=given.images),
+    ),
+    Format(
+        "bundler",
+        "bundle.out of Bundler (read)",
+        "a file .out, or bundle.out",
+        by_suffix(".out", "bundle.out", "bundle/bundle.out"),
+        lambda path, given: parse_bundler(path, _measure, images=given.images),
+        axes="opengl",
+    ),
+    Format(
+        "tum",
+        "a trajectory of the TUM RGB-D benchmark",
+        "a file .txt with 8 numbers a line",
+        lambda path: find_lines(path, columns=8),
+        lambda path, given: parse_tum(path, given.camera),
+        open_axes=True,
+        default_name="trajectory.txt",
+        files=("*.txt",),
+        write=write_tum,
+        losses=losses_tum,
+    ),
+    Format(
+        "kitti",
+        "a trajectory of the KITTI odometry benchmark",
+        "a file .txt with 12 numbers a line",
+        lambda path: find_lines(path, columns=12),
+        lambda path, given: parse_kitti(path, given.camera),
+        open_axes=True,
+        default_name="poses.txt",
+        files=("*.txt",),
+        write=write_kitti,
+        losses=losses_kitti,
+    ),
+    Format(
+        "npz",
+        "everything, as arrays of NumPy",
+        "a file .npz, or capture.npz",
+        by_suffix(".npz", "capture.npz"),
+        lambda path, given: parse_npz(path),
+        open_axes=True,
+        open_centre=True,
+        default_name="capture.npz",
+        files=("*.npz",),
+        write=write_npz,
+        losses=losses_npz,
+    ),
+    Format(
+        "ply",
+        "the points alone (written)",
+        "",
+        lambda path: None,
+        None,
+        default_name="points.ply",
+        files=("*.ply",),
+        write=write_ply,
+        losses=losses_ply,
+    ),
+)

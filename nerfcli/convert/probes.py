@@ -1,0 +1,121 @@
+"""Points at which two descriptions of a capture are compared: pairs of a view and a point that it sees."""
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.frame import Capture
+from nerfcli.convert.axes import poses_of
+
+# Pairs of a view and a point that are tried; where there are more, each view gets a random choice of the points.
+MOST_PAIRS = 500_000
+
+# Synthetic points per view that are tried, at distances from half to twice the capture's own.
+SYNTHETIC_PER_VIEW = 24
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Where points are seen.
+
+    Args:
+        frame_index: (M,) of the view.
+        point_index: (M,) of the capture's point; -1 for a synthetic one.
+        points: (M, 3) in the world.
+        pixels: (M, 2) where the view sees the point.
+        distances: (M,) of the point from the camera's centre.
+    """
+
+    frame_index: np.ndarray
+    point_index: np.ndarray
+    points: np.ndarray
+    pixels: np.ndarray
+    distances: np.ndarray
+
+
+def probes_of(capture: Capture) -> Probes:
+    """The capture's points that lie in front of its cameras and inside their pictures, and synthetic ones besides.
+
+    All pairs of a view and a point are tried, or `MOST_PAIRS` random ones, equally many for each view. The choice is
+    the same at every call.
+    """
+    rng = np.random.default_rng(0)
+    num_frames, num_points = len(capture.frames), len(capture.points)
+    per_frame = min(num_points, max(1, MOST_PAIRS // num_frames))
+    if per_frame == num_points:
+        point_index = np.tile(np.arange(num_points), num_frames)
+    else:
+        point_index = rng.integers(0, num_points, num_frames * per_frame)
+    frame_index = np.repeat(np.arange(num_frames), per_frame)
+    synthetic_frames, synthetic_points = _synthetic(capture, rng)
+    frame_index = np.concatenate([frame_index, synthetic_frames])
+    point_index = np.concatenate([point_index, np.full(len(synthetic_frames), -1)])
+    points = np.concatenate([capture.points[point_index[: num_frames * per_frame]], synthetic_points])
+    return _seen(capture, frame_index, point_index, points)
+
+
+def distinct(items: Sequence[Hashable]) -> tuple[list, np.ndarray]:
+    """The different items in the order of their first appearance, and which of them each item is."""
+    places: dict[Hashable, int] = {}
+    index = np.array([places.setdefault(item, len(places)) for item in items], dtype=np.int64)
+    return list(places), index
+
+
+def rows_of_each(labels: np.ndarray, count: int) -> list[np.ndarray]:
+    """For each label 0 ... count - 1 the rows that have it."""
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.searchsorted(labels[order], np.arange(1, count)))
+
+
+def scene_distance(capture: Capture) -> float:
+    """How far away what the cameras see is, roughly: that of the points, the depth bounds, or the cameras' spread."""
+    centres = poses_of(capture)[:, :3, 3]
+    if len(capture.points):
+        distance = np.linalg.norm(np.median(capture.points, axis=0) - centres, axis=1).mean()
+    elif capture.depth_bounds is not None:
+        distance = np.median(capture.depth_bounds)
+    else:
+        distance = 2 * np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean()
+    return float(distance) if np.isfinite(distance) and distance > 0 else 1.0
+
+
+def _synthetic(capture: Capture, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Frame indices (M,) and points (M, 3) in the world, in directions that reach beyond the picture of each view.
+
+    They are those of an equidistant lens of the camera's focal length, theta = radius / focal: of a perspective picture
+    they are the wider ones, and of a panorama all around. No lens needs to be inverted for that, which is slow where
+    every photo has its own.
+    """
+    cameras = [frame.camera for frame in capture.frames]
+    size = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
+    centre = np.array([camera.principal_point for camera in cameras])
+    focal_px = np.array([camera.focal_px for camera in cameras])
+    share = rng.random((len(cameras), SYNTHETIC_PER_VIEW, 2))
+    across = (share * size[:, None] - centre[:, None]) / focal_px[:, None, None]
+    theta = np.linalg.norm(across, axis=2, keepdims=True)
+    directions = np.concatenate([across * np.sinc(theta / np.pi), np.cos(theta)], axis=2)
+    distances = scene_distance(capture) * 2.0 ** rng.uniform(-1, 1, theta.shape)
+    points = rigid.apply(poses_of(capture), directions * distances)
+    return np.repeat(np.arange(len(cameras)), SYNTHETIC_PER_VIEW), points.reshape(-1, 3)
+
+
+def _seen(capture: Capture, frame_index: np.ndarray, point_index: np.ndarray, points: np.ndarray) -> Probes:
+    """The pairs whose point appears inside the picture of its view."""
+    tried = Probes(frame_index, point_index, points, np.zeros((len(points), 2)), np.zeros(len(points)))
+    pixels, kept, distances = projected(capture, tried)
+    sizes = np.array([(frame.camera.width, frame.camera.height) for frame in capture.frames])
+    kept &= np.all((pixels >= 0) & (pixels <= sizes[frame_index]), axis=1)
+    return Probes(frame_index[kept], point_index[kept], points[kept], pixels[kept], distances[kept])
+
+
+def projected(capture: Capture, probes: Probes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the views of a capture see points: pixels (M, 2), whether they do (M,) bool, distances (M,)."""
+    cam_from_world = rigid.inverse(poses_of(capture))[probes.frame_index]
+    in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], probes.points) + cam_from_world[:, :3, 3]
+    cameras, camera_of_frame = distinct([frame.camera for frame in capture.frames])
+    pixels, valid = np.zeros((len(in_camera), 2)), np.zeros(len(in_camera), dtype=bool)
+    for camera, rows in zip(cameras, rows_of_each(camera_of_frame[probes.frame_index], len(cameras)), strict=True):
+        pixels[rows], valid[rows] = camera.project(in_camera[rows])
+    return pixels, valid, np.linalg.norm(in_camera, axis=1)

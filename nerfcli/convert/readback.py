@@ -1,0 +1,241 @@
+"""What stands in a file that was just written, read by other means than the ones that wrote it or that parse it.
+
+Nothing here comes from `cameras`: COLMAP models are read by pycolmap, JSON field by field, quaternions by SciPy. It
+reads only what nerfcli writes, so it is short and checks nothing: whatever is wrong shows as a residual or as an
+`Unreadable`.
+"""
+
+import json
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from nerfcli.convert.lenses import Lens
+
+
+class UnreadableError(Exception):
+    """A file that was just written does not hold what its format asks for."""
+
+
+@dataclass(frozen=True)
+class ReadBack:
+    """The views in a file.
+
+    Args:
+        labels: what the file says which photo a view is of; None where its order says it.
+        cam_from_world: (views, 3, 3) rotations, OpenCV axes.
+        centres: (views, 3) camera centres in the world.
+        lenses: one per view; None where the format has no intrinsics.
+        points: (N, 3), or None where the format has no points.
+    """
+
+    labels: tuple[str, ...] | None
+    cam_from_world: np.ndarray
+    centres: np.ndarray
+    lenses: tuple[Lens, ...] | None
+    points: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Meant:
+    """What a file leaves open: the axes of its cameras as three letters, where its pixel positions put the first
+    pixel's centre, and the widths and heights of its views' pictures in the file's order."""
+
+    axes: str
+    pixel_centre: float
+    sizes: tuple[tuple[int, int], ...]
+
+
+def read_colmap(path: Path, meant: Meant) -> ReadBack:
+    """A COLMAP model, by pycolmap."""
+    model = pycolmap.Reconstruction(str(path))
+    lenses = {
+        camera_id: Lens(camera.model.name, camera.width, camera.height, tuple(camera.params))
+        for camera_id, camera in model.cameras.items()
+    }
+    images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
+    rotations = poses[:, :, :3]
+    return ReadBack(
+        labels=tuple(image.name for image in images),
+        cam_from_world=rotations,
+        centres=-np.einsum("nji,nj->ni", rotations, poses[:, :, 3]),
+        lenses=tuple(lenses[image.camera_id] for image in images),
+        points=np.array([model.points3D[index].xyz for index in sorted(model.points3D)]).reshape(-1, 3),
+    )
+
+
+def read_transforms(path: Path, meant: Meant) -> ReadBack:
+    """transforms.json, by the json module, and the PLY file of points that it names."""
+    content = json.loads(path.read_text(encoding="utf-8"))
+    cloud = content.get("ply_file_path")
+    points = np.zeros((0, 3)) if cloud is None else read_ply_points(path.parent / cloud)
+    return replace(_from_transforms([content], meant), points=points)
+
+
+def read_blender(path: Path, meant: Meant) -> ReadBack:
+    """transforms_train.json, transforms_val.json and transforms_test.json of a folder: only the angle of view."""
+    files = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
+    contents = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
+    for content in contents:
+        content["frames"] = [{**record, "angle": content["camera_angle_x"]} for record in content["frames"]]
+    return _from_transforms(contents, meant)
+
+
+def read_llff(path: Path, meant: Meant) -> ReadBack:
+    """poses_bounds.npy, by NumPy: 17 numbers a view, of which the fifth column of 3 x 5 is height, width, focal."""
+    rows = np.load(path / "poses_bounds.npy")
+    matrices = rows[:, :15].reshape(-1, 3, 5)
+    rotations, centres = _views_from_world_from_cam(matrices[:, :, :4], meant.axes)
+    lenses = []
+    for height, width, focal in matrices[:, :, 4]:
+        lenses.append(Lens("SIMPLE_PINHOLE", int(width), int(height), (focal, width / 2, height / 2)))
+    return ReadBack(None, rotations, centres, tuple(lenses), None)
+
+
+def read_tum(path: Path, meant: Meant) -> ReadBack:
+    """A TUM trajectory: time, position, quaternion with its real part last, by NumPy and SciPy."""
+    rows = np.loadtxt(path, ndmin=2)
+    matrices = np.concatenate([Rotation.from_quat(rows[:, 4:8]).as_matrix(), rows[:, 1:4, None]], axis=2)
+    rotations, centres = _views_from_world_from_cam(matrices, meant.axes)
+    return ReadBack(None, rotations, centres, None, None)
+
+
+def read_kitti(path: Path, meant: Meant) -> ReadBack:
+    """A KITTI odometry file: 3 x 4 numbers a line, by NumPy."""
+    rotations, centres = _views_from_world_from_cam(np.loadtxt(path, ndmin=2).reshape(-1, 3, 4), meant.axes)
+    return ReadBack(None, rotations, centres, None, None)
+
+
+def read_opensfm(path: Path, meant: Meant) -> ReadBack:
+    """reconstruction.json, by the json module and SciPy: angle-axis and translation of cam_from_world."""
+    (content,) = json.loads(path.read_text(encoding="utf-8"))
+    shots = content["shots"]
+    rotations = Rotation.from_rotvec(np.array([shot["rotation"] for shot in shots.values()])).as_matrix()
+    translations = np.array([shot["translation"] for shot in shots.values()])
+    lenses = {key: _opensfm_lens(record) for key, record in content["cameras"].items()}
+    return ReadBack(
+        labels=tuple(shots),
+        cam_from_world=rotations,
+        centres=-np.einsum("nji,nj->ni", rotations, translations),
+        lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
+        points=np.array([point["coordinates"] for point in content["points"].values()]).reshape(-1, 3),
+    )
+
+
+def read_npz(path: Path, meant: Meant) -> ReadBack:
+    """The arrays of an .npz file, by NumPy."""
+    with np.load(path) as arrays:
+        rotations, centres = _views_from_world_from_cam(arrays["world_from_cam"], meant.axes)
+        lenses = []
+        for model, (width, height), params in zip(
+            arrays["camera_models"].tolist(), arrays["camera_sizes"].tolist(), arrays["camera_params"], strict=True
+        ):
+            camera = pycolmap.Camera(model=model, width=width, height=height, params=params[~np.isnan(params)])
+            shifted = np.array(camera.params)
+            shifted[list(camera.principal_point_idxs())] += 0.5 - meant.pixel_centre
+            lenses.append(Lens(model, width, height, tuple(shifted.tolist())))
+        return ReadBack(
+            labels=tuple(arrays["names"].tolist()),
+            cam_from_world=rotations,
+            centres=centres,
+            lenses=tuple(lenses[index] for index in arrays["camera_index"]),
+            points=arrays["points"],
+        )
+
+
+def read_ply_points(path: Path) -> np.ndarray:
+    """The vertices (N, 3) of a binary PLY file whose first three properties are doubles."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
+    sizes = {"double": 8, "float64": 8, "float": 4, "uchar": 1, "uint8": 1}
+    stride = sum(sizes[line.split()[1]] for line in lines if line.startswith("property"))
+    rows = np.frombuffer(body, dtype=np.uint8, count=count * stride).reshape(count, stride)
+    return np.ascontiguousarray(rows[:, :24]).view("<f8").reshape(count, 3)
+
+
+def _opensfm_lens(record: dict[str, Any]) -> Lens:
+    """A lens from numbers in units of the picture's longer side, measured from its middle."""
+    kind, width, height = record["projection_type"], record["width"], record["height"]
+    if kind in ("spherical", "equirectangular"):
+        return Lens("EQUIRECTANGULAR", width, height, (width, height))
+    unit = max(width, height)
+    fx, fy = record["focal_x"] * unit, record["focal_y"] * unit
+    head = (fx, fy, record["c_x"] * unit + width / 2, record["c_y"] * unit + height / 2)
+    k1, k2, k3, k4, k5, k6, p1, p2, sx, sy = (
+        record.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s2")
+    )
+    if kind == "fisheye_opencv":
+        return Lens("OPENCV_FISHEYE", width, height, (*head, k1, k2, k3, k4))
+    if kind == "fisheye62":
+        terms = (k1, k2, k3, k4, k5, k6, p1, p2, 0.0, 0.0, 0.0, 0.0)
+        return Lens("RAD_TAN_THIN_PRISM_FISHEYE", width, height, (*head, *terms))
+    if kind == "fisheye624":
+        return Lens("THIN_PRISM_FISHEYE", width, height, (*head, k1, k2, p1, p2, k3, k4, sx, sy))
+    return Lens("FULL_OPENCV", width, height, (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+
+
+def _from_transforms(contents: list[dict[str, Any]], meant: Meant) -> ReadBack:
+    records = [{**content, **record} for content in contents for record in content["frames"]]
+    rotations, centres = _views_from_world_from_cam([record["transform_matrix"] for record in records], meant.axes)
+    return ReadBack(
+        labels=tuple(record["file_path"] for record in records),
+        cam_from_world=rotations,
+        centres=centres,
+        lenses=tuple(
+            _transforms_lens(record, 0.5 - meant.pixel_centre, size)
+            for record, size in zip(records, meant.sizes, strict=True)
+        ),
+        points=None,
+    )
+
+
+def _transforms_lens(record: dict[str, Any], shift: float, size: tuple[int, int]) -> Lens:
+    if "angle" in record:
+        width, height = size
+        return Lens("SIMPLE_PINHOLE", width, height, (width / 2 / math.tan(record["angle"] / 2), width / 2, height / 2))
+    width, height = record["w"], record["h"]
+    if record["camera_model"] == "EQUIRECTANGULAR":
+        return Lens("EQUIRECTANGULAR", width, height, (width, height))
+    head = (record["fl_x"], record["fl_y"], record["cx"] + shift, record["cy"] + shift)
+    if "FISHEYE" in record["camera_model"]:
+        terms = (record.get(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
+        return Lens("OPENCV_FISHEYE", width, height, (*head, *terms))
+    terms = (record.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
+    return Lens("FULL_OPENCV", width, height, (*head, *terms))
+
+
+def _views_from_world_from_cam(matrices: Any, axes: str) -> tuple[np.ndarray, np.ndarray]:
+    """cam_from_world rotations and centres, from matrices whose columns are the camera's axes in the world.
+
+    The columns are put in OpenCV's order one by one: right, down, forward.
+    """
+    poses = np.array(matrices, dtype=np.float64)
+    rows = [_pointing(poses, axes, *pair) for pair in ("rl", "du", "fb")]
+    return np.stack(rows, axis=1), poses[:, :3, 3]
+
+
+def _pointing(poses: np.ndarray, axes: str, along: str, against: str) -> np.ndarray:
+    """Where in the world (views, 3) a direction of the camera points, of which the axes have it or its opposite."""
+    if along in axes:
+        return poses[:, :3, axes.index(along)]
+    return -poses[:, :3, axes.index(against)]
+
+
+READERS = {
+    "colmap": read_colmap,
+    "colmap-text": read_colmap,
+    "transforms": read_transforms,
+    "blender": read_blender,
+    "llff": read_llff,
+    "opensfm": read_opensfm,
+    "tum": read_tum,
+    "kitti": read_kitti,
+    "npz": read_npz,
+}

@@ -1,0 +1,88 @@
+"""What is left of a capture in a format that cannot hold all of it: the cameras, without the terms that are lost, and
+names, as far as other programs read them.
+
+A written file is compared with this when losses were accepted. It says in its own words what a writer keeps, so that a
+writer that loses something else is found out.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Collection
+from dataclasses import replace
+
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.frame import Capture
+
+# Models that transforms.json holds whole.
+_HELD = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"),
+)
+
+
+def reduced(capture: Capture, format_name: str) -> Capture:
+    """The capture with the cameras and names that a format can hold."""
+    if format_name == "colmap-text":
+        return replace(capture, frames=tuple(replace(f, name=f.name.split(" ")[0]) for f in capture.frames))
+    if format_name == "blender":
+        return _with_one_angle(_with_cameras(capture, _pinhole))
+    change = {"transforms": _to_transforms, "llff": _pinhole, "opensfm": _to_opensfm}.get(format_name)
+    return capture if change is None else _with_cameras(capture, change)
+
+
+def _with_cameras(capture: Capture, change: Callable[[Camera], Camera]) -> Capture:
+    changed = {camera: change(camera) for camera in {frame.camera for frame in capture.frames}}
+    return replace(capture, frames=tuple(replace(frame, camera=changed[frame.camera]) for frame in capture.frames))
+
+
+def _with_one_angle(capture: Capture) -> Capture:
+    """Every split's views with the angle that most of them have: its file holds one."""
+    angles: dict[str, Counter[float]] = {}
+    for frame in capture.frames:
+        angle = 2 * math.atan(frame.camera.width / 2 / frame.camera.params[0])
+        angles.setdefault(frame.split or "train", Counter())[angle] += 1
+    shared = {split: counts.most_common(1)[0][0] for split, counts in angles.items()}
+    frames = []
+    for frame in capture.frames:
+        width, height = frame.camera.width, frame.camera.height
+        focal_px = width / 2 / math.tan(shared[frame.split or "train"] / 2)
+        frames.append(replace(frame, camera=Camera.pinhole(width, height, focal_px)))
+    return replace(capture, frames=tuple(frames))
+
+
+def _pinhole(camera: Camera) -> Camera:
+    """The horizontal focal length alone; the principal point is the picture's middle."""
+    if camera.is_spherical:
+        return camera
+    return Camera.pinhole(camera.width, camera.height, camera.params[0])
+
+
+def _to_transforms(camera: Camera) -> Camera:
+    """OpenCV's k1, k2, p1, p2, k3, or its fisheye's k1 to k4; a camera that has no other terms is left as it is."""
+    value = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    if camera.is_spherical or camera.model in _HELD:
+        return camera
+    head = (value["fx"] if "fx" in value else value["f"], value["fy"] if "fy" in value else value["f"])
+    head = (*head, value["cx"], value["cy"])
+    if "FISHEYE" in camera.model:
+        keys = ("k0", "k1", "k2", "k3") if camera.model.startswith("RAD_TAN") else ("k1", "k2", "k3", "k4")
+        return Camera("OPENCV_FISHEYE", camera.width, camera.height, (*head, *(value.get(key, 0.0) for key in keys)))
+    if camera.model == "FULL_OPENCV":
+        return _without(camera, ("k4", "k5", "k6"))
+    return Camera("PINHOLE", camera.width, camera.height, head)
+
+
+def _to_opensfm(camera: Camera) -> Camera:
+    """Brown's terms without the denominator's, or six radial ones of the fisheye."""
+    if camera.model == "FULL_OPENCV":
+        return _without(camera, ("k4", "k5", "k6"))
+    if camera.model == "RAD_TAN_THIN_PRISM_FISHEYE":
+        return _without(camera, ("p0", "p1", "s0", "s1", "s2", "s3"))
+    return camera
+
+
+def _without(camera: Camera, lost: Collection[str]) -> Camera:
+    """The camera with some terms 0."""
+    values = zip(parameter_names(camera.model), camera.params, strict=True)
+    params = tuple(0.0 if name in lost else value for name, value in values)
+    return Camera(camera.model, camera.width, camera.height, params)

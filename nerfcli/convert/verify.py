@@ -1,0 +1,191 @@
+"""The proof of a conversion: the file that was written and the capture that it was written from see the same.
+
+The capture projects its points with nerfcli's cameras; the file is read back (`readback`) and projects the same points
+with OpenCV's (`lenses`). The two sides share no code that knows a convention.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from nerfcli.cameras.frame import Capture
+from nerfcli.convert import lenses
+from nerfcli.convert.axes import poses_of
+from nerfcli.convert.probes import Probes, distinct, probes_of, rows_of_each
+from nerfcli.convert.readback import ReadBack, UnreadableError
+
+TOLERANCE_PX = 1e-6
+
+# Coordinates are rounded to 2^-53 of their size, some times over, on both sides.
+_ROUNDINGS = 16 * 2.0**-53
+
+
+@dataclass(frozen=True)
+class Verification:
+    """How far a written file is from what it was written from.
+
+    Args:
+        max_px: the largest distance between the two projections of a point.
+        max_deg: the largest angle between the two rotations of a view.
+        max_centre_shift: the largest distance between the two centres of a view, over the size of the scene.
+        max_point_shift: the largest distance between the two positions of a point, over the size of the scene.
+        worst: the name of the view that has max_px, or of the one in error.
+        num_views, num_points, num_projections: compared. The poses of all views are, those without a point too.
+        tolerance_px: what max_px may be.
+        tolerance_rad: the same as an angle at the longest focal length; what rotations may differ by, and positions in
+            sizes of the scene.
+        fault: what is wrong with the file beside numbers, such as a view that is not there; "" if nothing.
+    """
+
+    max_px: float
+    max_deg: float
+    max_centre_shift: float
+    max_point_shift: float
+    worst: str
+    num_views: int
+    num_points: int
+    num_projections: int
+    tolerance_px: float
+    tolerance_rad: float
+    fault: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the file says the same as the capture."""
+        moved = max(np.radians(self.max_deg), self.max_centre_shift, self.max_point_shift)
+        return not self.fault and self.max_px <= self.tolerance_px and moved <= self.tolerance_rad
+
+
+def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px: float = TOLERANCE_PX) -> Verification:
+    """Compare a capture with what was read back from the file that it was written to.
+
+    Every 3D point that a view sees is projected by both, or a random choice of them where pairs of views and points are
+    too many, and synthetic points besides. Where coordinates are so large that rounding alone moves projections by more
+    than the tolerance (a scene of metres in coordinates of the globe), the tolerance is that.
+
+    Args:
+        capture: what the file should hold: after accepted losses, what was left.
+        back: what it does hold.
+        listed: (frames,) the indices of the capture's frames in the order in which the format lists them.
+        tolerance_px: the largest residual that passes.
+    """
+    probes = probes_of(capture)
+    tolerance_px = max(tolerance_px, _rounding_px(capture, probes))
+    empty = replace(
+        unreadable(capture, "", tolerance_px=tolerance_px),
+        num_views=len(np.unique(probes.frame_index)),
+        num_points=len(np.unique(probes.point_index[probes.point_index >= 0])),
+        num_projections=len(probes.points),
+    )
+    points = capture.points
+    try:
+        order = _order(capture, back, listed)
+        if back.points is not None and back.points.shape != points.shape:
+            raise UnreadableError(f"it holds {len(back.points)} points instead of {len(points)}")
+    except UnreadableError as error:
+        return replace(empty, fault=str(error))
+    residual = np.linalg.norm(_projected(capture, probes, back, order) - probes.pixels, axis=1)
+    residual = np.where(np.isfinite(residual), residual, np.inf)
+    worst = int(residual.argmax()) if len(residual) else -1
+    poses, size = poses_of(capture), _size(capture)
+    cam_from_world = np.swapaxes(poses[:, :3, :3], 1, 2)
+    chord = np.linalg.norm(back.cam_from_world[order] - cam_from_world, axis=(1, 2)) / np.sqrt(8)  # sin(angle / 2)
+    shifts = np.linalg.norm(back.centres[order] - poses[:, :3, 3], axis=1)
+    point_shifts = np.linalg.norm(back.points - points, axis=1) if back.points is not None else np.zeros(0)
+    return replace(
+        empty,
+        max_px=float(residual.max(initial=0.0)),
+        max_deg=float(np.degrees(2 * np.arcsin(np.minimum(chord, 1.0)).max())),
+        max_centre_shift=float(shifts.max() / size),
+        max_point_shift=float(point_shifts.max(initial=0.0) / size),
+        worst=capture.frames[probes.frame_index[worst]].name if worst >= 0 else "",
+    )
+
+
+def unreadable(capture: Capture, fault: str, *, tolerance_px: float = TOLERANCE_PX) -> Verification:
+    """What is to be said of a file that could not be compared."""
+    tolerance_rad = tolerance_px / max(frame.camera.focal_px for frame in capture.frames)
+    return Verification(np.inf, np.inf, np.inf, np.inf, "", 0, 0, 0, tolerance_px, tolerance_rad, fault)
+
+
+def verify_points(capture: Capture, points: np.ndarray, *, tolerance_px: float = TOLERANCE_PX) -> Verification:
+    """Compare the points alone, for a format that holds nothing else: they must be the same to the last bit."""
+    same = points.shape == capture.points.shape
+    shift = float(np.abs(points - capture.points).max(initial=0.0) / _size(capture)) if same else np.inf
+    fault = "" if shift == 0 else f"its points are off by {shift:.3g} of the scene"
+    told = unreadable(capture, fault, tolerance_px=tolerance_px)
+    return replace(
+        told, max_px=0.0, max_deg=0.0, max_centre_shift=0.0, max_point_shift=shift, num_points=len(capture.points)
+    )
+
+
+def listed_order(capture: Capture, format_name: str) -> np.ndarray:
+    """The indices of the frames in the order in which a file of the format lists them, where names do not tell."""
+    places = range(len(capture.frames))
+    if format_name == "llff":
+        return np.array(sorted(places, key=lambda index: PurePosixPath(capture.frames[index].name).name))
+    if format_name == "blender":
+        splits = ("train", "val", "test")
+        return np.array(sorted(places, key=lambda index: splits.index(capture.frames[index].split or "train")))
+    return np.array(places)
+
+
+def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
+    """For each frame of the capture, the view that was read back; (frames,).
+
+    Raises:
+        UnreadableError: a view is missing, or belongs to another photo.
+    """
+    if len(back.centres) != len(capture.frames):
+        raise UnreadableError(f"it holds {len(back.centres)} views instead of {len(capture.frames)}")
+    names = [frame.name for frame in capture.frames]
+    places = {label: index for index, label in enumerate(back.labels or ())}
+    if len(places) == len(names) and set(places) == set(names):
+        return np.array([places[name] for name in names])
+    if back.labels is not None:  # paths as seen from the file, or without a suffix
+        for frame_index, label in zip(listed, back.labels, strict=True):
+            name = PurePosixPath(names[frame_index])
+            if PurePosixPath(label).name not in (name.name, name.stem):
+                raise UnreadableError(f"where {name} should be, it lists {label}")
+    return np.argsort(listed)
+
+
+def _projected(capture: Capture, probes: Probes, back: ReadBack, order: np.ndarray) -> np.ndarray:
+    """Where the read-back views see the points, (M, 2); by the capture's lenses where the file has none."""
+    points = probes.points
+    if back.points is not None and len(back.points):
+        listed = probes.point_index >= 0
+        points = points.copy()
+        points[listed] = back.points[probes.point_index[listed]]
+    view = order[probes.frame_index]
+    in_camera = np.einsum("mij,mj->mi", back.cam_from_world[view], points - back.centres[view])
+    if back.lenses is None:
+        own = [frame.camera for frame in capture.frames]
+        per_frame = [lenses.Lens(camera.model, camera.width, camera.height, camera.params) for camera in own]
+    else:
+        per_frame = [back.lenses[index] for index in order]
+    each, lens_of_frame = distinct(per_frame)
+    pixels = np.zeros((len(points), 2))
+    for lens, rows in zip(each, rows_of_each(lens_of_frame[probes.frame_index], len(each)), strict=True):
+        pixels[rows] = lenses.project(lens, in_camera[rows])
+        if lens.model == "EQUIRECTANGULAR":  # the left edge and the right edge are one
+            turns = np.round((pixels[rows, 0] - probes.pixels[rows, 0]) / lens.width)
+            pixels[rows, 0] -= turns * lens.width
+    return pixels
+
+
+def _size(capture: Capture) -> float:
+    """The extent of cameras and points, in scene units."""
+    places = np.concatenate([poses_of(capture)[:, :3, 3], capture.points])
+    return float(np.linalg.norm(np.ptp(places, axis=0))) or 1.0
+
+
+def _rounding_px(capture: Capture, probes: Probes) -> float:
+    """How far rounding alone may move a projection: by that of coordinates, seen from where the point is nearest."""
+    if not len(probes.points):
+        return 0.0
+    focal_px = np.array([frame.camera.focal_px for frame in capture.frames])[probes.frame_index]
+    centres = poses_of(capture)[:, :3, 3]
+    largest = np.maximum(np.abs(probes.points).max(axis=1), np.abs(centres).max(axis=1)[probes.frame_index])
+    return float(_ROUNDINGS * np.max(focal_px * largest / probes.distances))

@@ -1,0 +1,78 @@
+"""Another world frame on the way: what is up, where the origin is, how long a unit is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from nerfcli.cameras.frame import Capture
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.world import moved_to_origin, transformed, turned_up
+from nerfcli.errors import UserError
+from nerfcli.scale.distances import known_distance, scale_from_distances
+from nerfcli.scale.estimate import ScaleEstimate
+from nerfcli.scale.gps import gps_positions, scale_from_gps
+
+GPS = "gps"
+
+
+@dataclass(frozen=True)
+class WorldFrame:
+    """The world frame that a capture shall be in; None where it shall stay.
+
+    Args:
+        up: the axis that points up: x, y, z, -x, -y or -z.
+        origin: centre-of-cameras, focus, or a place "x,y,z" of the old frame.
+        scale: a number that lengths are multiplied by, or "gps" for metres by the positions in the photos' EXIF.
+        distances: known ones, "A B METRES" with names of images or points x,y,z: lengths become metres.
+    """
+
+    up: str | None = None
+    origin: str | None = None
+    scale: str | None = None
+    distances: Sequence[str] = ()
+
+
+def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Similarity, ScaleEstimate | None]:
+    """The capture in another world frame: first its origin, then up, then the scale about the new origin.
+
+    Returns:
+        The capture, the similarity new_from_old, and the estimate of the scale where lengths became metres.
+
+    Raises:
+        UserError: a value that says nothing, or photos that do not tell the scale.
+    """
+    estimate = _estimate(capture, wanted)
+    change = Similarity.identity()
+    if wanted.origin is not None:
+        change = moved_to_origin(capture.frames, wanted.origin)
+    if wanted.up is not None:
+        change = turned_up(capture.frames, wanted.up).compose(change)
+    factor = _factor(wanted.scale) if estimate is None else estimate.metres_per_unit
+    if factor != 1:
+        change = Similarity(factor, np.eye(3), np.zeros(3)).compose(change)
+    moved = transformed(capture, change)
+    return (moved if estimate is None else replace(moved, unit="metre")), change, estimate
+
+
+def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
+    if wanted.distances:
+        if wanted.scale is not None:
+            raise UserError(f"both --scale {wanted.scale} and --distance are given", "give one of them", exit_code=2)
+        return scale_from_distances([known_distance(text, capture.frames) for text in wanted.distances])
+    if wanted.scale == GPS:
+        frames = [frame for frame in capture.frames if frame.image is not None and frame.image.is_file()]
+        return scale_from_gps(frames, gps_positions(frames)).estimate
+    return None
+
+
+def _factor(text: str | None) -> float:
+    if text is None:
+        return 1.0
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if not 0 < factor < np.inf:
+        raise UserError(f"--scale is {text!r}", "expected a number above 0, or gps", exit_code=2)
+    return factor

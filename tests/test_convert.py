@@ -1,0 +1,527 @@
+"""Conversions: round trips through every writable format, losses, faults that the verification must see, exit codes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from test_cli import check_that_it_parses, error_of, listing, nerfcli
+from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQUARE, capture_of
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import OPENCV_FROM_LLFF, OPENCV_FROM_OPENGL
+from nerfcli.cameras.formats import blender, colmap_binary, llff, opensfm, trajectories, transforms, transforms_cameras
+from nerfcli.cameras.formats.archive import write_npz
+from nerfcli.cameras.formats.ply import write_ply
+from nerfcli.cameras.frame import Capture
+from nerfcli.cli.convert import FORMATS_WRITTEN
+from nerfcli.convert import lenses
+from nerfcli.convert.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
+from nerfcli.convert.conversion import Doubt, Wanted, convert, load
+from nerfcli.convert.formats import FORMATS, Given, format_named, recognise
+from nerfcli.convert.verify import _ROUNDINGS
+from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
+
+USAGE = 2
+LIMIT_PX = 1e-6
+
+
+def write_photos(folder: Path, capture: Capture) -> None:
+    folder.mkdir(parents=True)
+    for frame in capture.frames:
+        Image.new("L", (frame.camera.width, frame.camera.height)).save(folder / frame.name)
+
+
+def with_images(capture: Capture, folder: Path) -> Capture:
+    return replace(capture, frames=tuple(replace(f, image=folder / f.name) for f in capture.frames))
+
+
+def npz_of(tmp_path: Path, capture: Capture) -> Path:
+    path = tmp_path / "in.npz"
+    write_npz(capture, path)
+    return path
+
+
+def farthest_px(a: Capture, b: Capture) -> float:
+    """The largest distance between projections of a's points by two captures, by nerfcli's own cameras."""
+    worst = 0.0
+    for one, other in zip(a.frames, b.frames, strict=True):
+        first, seen = one.camera.project(rigid.apply(rigid.inverse(one.world_from_cam), a.points))
+        second, also = other.camera.project(rigid.apply(rigid.inverse(other.world_from_cam), a.points))
+        assert (seen == also).all()
+        worst = max(worst, float(np.linalg.norm(first - second, axis=1)[seen].max()))
+    return worst
+
+
+# Axes
+
+
+def test_named_axes_are_those_of_the_other_programs():
+    np.testing.assert_array_equal(opencv_from_axes("opencv"), np.eye(4))
+    np.testing.assert_array_equal(opencv_from_axes("opengl"), OPENCV_FROM_OPENGL)
+    np.testing.assert_array_equal(opencv_from_axes("llff"), OPENCV_FROM_LLFF)
+    # PyTorch3D: x left, y up, z forward. ROS: x forward is OpenCV's z, y left is -x, z up is -y.
+    np.testing.assert_array_equal(opencv_from_axes("pytorch3d"), np.diag([-1.0, -1.0, 1.0, 1.0]))
+    np.testing.assert_array_equal(opencv_from_axes("ros")[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+
+
+def test_there_are_24_right_handed_axes():
+    turns = np.array([opencv_from_axes(axes)[:3, :3] for axes in all_axes()])
+    assert len(np.unique(turns.reshape(-1, 9), axis=0)) == len(turns) == 24
+    np.testing.assert_array_equal(np.linalg.det(turns), 1)
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"), [("ruf", "left-handed"), ("rud", "unknown"), ("rrd", "unknown"), ("blend", "unknown")]
+)
+def test_axes_that_there_are_not(axes, message):
+    with pytest.raises(UserError, match=message):
+        opencv_from_axes(axes)
+
+
+@pytest.mark.parametrize("axes", ["opencv", "llff", "ros"])
+@pytest.mark.parametrize("centre", [0.5, 0.0])
+def test_reading_in_a_convention_undoes_writing_in_it(axes, centre):
+    capture = capture_of([PINHOLE, BROWN])
+    convention = Convention(axes, pixel_centre=centre)
+    again = reinterpreted(expressed(capture, convention, written_axes="opengl"), convention, parsed_axes="opengl")
+    assert farthest_px(capture, again) < 1e-9
+    assert again.observations is not None
+    assert capture.observations is not None
+    np.testing.assert_allclose(again.observations.pixels, capture.observations.pixels, rtol=0, atol=1e-12)
+
+
+# Independent lenses
+
+
+def test_the_other_side_projects_fisheyes_as_opencv_does():
+    lens = lenses.Lens(FISHEYE.model, FISHEYE.width, FISHEYE.height, FISHEYE.params)
+    points = np.random.default_rng(0).normal((0, 0, 3), (1, 1, 0.5), (200, 3))
+    fx, fy, cx, cy, *terms = FISHEYE.params
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(terms))
+    np.testing.assert_allclose(lenses.project(lens, points), expected[:, 0], rtol=0, atol=1e-9)
+
+
+# Round trips
+
+EVERYTHING = [PINHOLE, BROWN, RATIONAL, FISHEYE, PRISM, PANORAMA]
+CAMERAS = {
+    "transforms": [PINHOLE, BROWN, FISHEYE],
+    "opensfm": [PINHOLE, BROWN, FISHEYE, RADIAL],
+    "blender": [SQUARE],
+    "llff": [SQUARE],
+}
+
+
+@pytest.mark.parametrize("form", [name for name in FORMATS_WRITTEN if name != "ply"])
+def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
+    capture = capture_of(CAMERAS.get(form, EVERYTHING))
+    write_photos(tmp_path / "images", capture)
+    capture = with_images(capture, tmp_path / "images")
+    first = nerfcli("convert", npz_of(tmp_path, capture), tmp_path / "sparse" / "0", "--to", "colmap")
+    assert first.exit_code == 0, first.stderr
+    there = nerfcli("convert", tmp_path / "sparse" / "0", tmp_path / "there", "--to", form, "--allow-loss", "--json")
+    assert there.exit_code == 0, there.stderr
+    report = json.loads(there.stdout)
+    assert report["verification"]["max_px"] < LIMIT_PX
+    assert report["verification"]["projections"] > 100
+    more = []
+    if form in ("tum", "kitti"):
+        one = {"model": "PINHOLE", "width": 640, "height": 480, "params": PINHOLE.params}
+        (tmp_path / "camera.json").write_text(json.dumps(one))
+        more = ["--intrinsics", tmp_path / "camera.json"]
+        capture = replace(capture, frames=tuple(replace(frame, camera=PINHOLE) for frame in capture.frames))
+    if form in ("llff", "blender"):
+        more = ["--images", tmp_path / "images"]
+    back = nerfcli("convert", report["path"], tmp_path / "back", "--to", "colmap", "--allow-loss", *more)
+    assert back.exit_code == 0, back.stderr
+    _, _, again = load(tmp_path / "back", Given(), Doubt())
+    assert farthest_px(capture, again) < LIMIT_PX
+
+
+@pytest.mark.parametrize("form", ["colmap", "colmap-text", "npz"])
+def test_points_and_observations_survive(form, tmp_path):
+    capture = replace(capture_of(EVERYTHING), colours=None)
+    names = [frame.name.replace(" ", "_") for frame in capture.frames]
+    capture = replace(
+        capture, frames=tuple(replace(f, name=name) for f, name in zip(capture.frames, names, strict=True))
+    )
+    done = convert(capture, tmp_path / "out", source_format="made", wanted=Wanted(format_named(form)))
+    assert done.losses == ()
+    _, _, again = load(done.path, Given(), Doubt())
+    np.testing.assert_array_equal(again.points, capture.points)
+    assert again.observations is not None
+    assert capture.observations is not None
+    np.testing.assert_array_equal(again.observations.pixels, capture.observations.pixels)
+
+
+@pytest.mark.parametrize("form", ["transforms", "npz"])
+def test_axes_and_pixel_centre_of_the_written_file(form, tmp_path):
+    """By hand: with OpenCV axes the matrix is world_from_cam itself, and with centres at 0 cx is half a pixel less."""
+    capture = capture_of([PINHOLE])
+    out = tmp_path / ("out.json" if form == "transforms" else "out.npz")
+    options = ("--axes", "opencv", "--pixel-center", "0", "--allow-loss")
+    result = nerfcli("convert", npz_of(tmp_path, capture), out, "--to", form, *options)
+    assert result.exit_code == 0, result.stderr
+    if form == "transforms":
+        content = json.loads(out.read_text())
+        matrix, cx = content["frames"][0]["transform_matrix"], content["cx"]
+    else:
+        with np.load(out) as arrays:
+            matrix, cx = arrays["world_from_cam"][0], arrays["camera_params"][0, 2]
+    np.testing.assert_allclose(matrix, capture.frames[0].world_from_cam, rtol=0, atol=1e-15)
+    assert cx == PINHOLE.params[2] - 0.5
+    options = ("--from-axes", "opencv", "--from-pixel-center", "0")
+    assert nerfcli("convert", out, tmp_path / "back", "--to", "colmap", *options).exit_code == 0
+    assert farthest_px(capture, load(tmp_path / "back", Given(), Doubt())[2]) < LIMIT_PX
+
+
+@pytest.mark.parametrize(
+    ("form", "options", "message"),
+    [
+        ("colmap", ("--axes", "opengl"), "colmap fixes the camera axes"),
+        ("opensfm", ("--pixel-center", "0"), "opensfm fixes where pixel positions count from"),
+    ],
+)
+def test_a_convention_that_the_format_fixes_is_refused(form, options, message, tmp_path):
+    source = npz_of(tmp_path, replace(capture_of([PINHOLE]), observations=None))
+    result = nerfcli("convert", source, tmp_path / "out", "--to", form, *options)
+    assert result.exit_code == BAD_INPUT
+    assert message in error_of(result)[0]
+    assert set(listing(tmp_path)) == {"in.npz"}
+
+
+def test_a_file_that_holds_the_inverse_is_read_so(tmp_path):
+    capture = capture_of([PINHOLE])
+    content = {"w": 640, "h": 480, "fl_x": 500.0, "fl_y": 505.0, "cx": 321.25, "cy": 238.5, "frames": []}
+    for frame in capture.frames:
+        matrix = np.linalg.inv(frame.world_from_cam).tolist()
+        content["frames"].append({"file_path": frame.name, "transform_matrix": matrix})
+    (tmp_path / "wrong.json").write_text(json.dumps(content))
+    options = ("--from-axes", "opencv", "--from-inverted")
+    result = nerfcli("convert", tmp_path / "wrong.json", tmp_path / "out", "--to", "colmap", *options)
+    assert result.exit_code == 0, result.stderr
+    assert farthest_px(capture, load(tmp_path / "out", Given(), Doubt())[2]) < LIMIT_PX
+
+
+def test_intrinsics_for_another_size(tmp_path):
+    """A camera of twice the resolution, with its principal point off the middle, in a file that says the size here."""
+    double = Camera("PINHOLE", 640, 480, (1000.0, 1010.0, 642.5, 477.0))
+    source = npz_of(tmp_path, capture_of([double]))
+    assert nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--from-size", "2").exit_code == 0
+    assert load(tmp_path / "out", Given(), Doubt())[2].frames[0].camera == PINHOLE
+
+
+def test_the_world_frame_and_its_scale(tmp_path):
+    capture = capture_of([PINHOLE])
+    first, second = capture.frames[:2]
+    metres = 2.5 * float(np.linalg.norm(first.centre - second.centre))
+    out = tmp_path / "out.npz"
+    known = f"{','.join(map(str, first.centre))} {','.join(map(str, second.centre))} {metres}"
+    options = ("--origin", "centre-of-cameras", "--world-up", "-y", "--distance", known, "--json")
+    result = nerfcli("convert", npz_of(tmp_path, capture), out, "--to", "npz", *options)
+    assert result.exit_code == 0, result.stderr
+    again = load(out, Given(), Doubt())[2]
+    centres = np.array([frame.centre for frame in again.frames])
+    np.testing.assert_allclose(centres.mean(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(centres[0] - centres[1]), metres, rtol=1e-12)
+    assert again.unit == "metre"
+    change = rigid.Similarity.from_json(json.loads(result.stdout)["new_from_old"])
+    np.testing.assert_allclose(change.apply(capture.points), again.points, rtol=0, atol=1e-12)
+    assert change.scale == pytest.approx(2.5, rel=1e-12)
+
+
+# Losses
+
+
+@pytest.mark.parametrize(
+    ("form", "camera", "lost"),
+    [
+        ("transforms", RATIONAL, "k4 of 1 camera"),
+        ("transforms", PRISM, "sx1 of 1 camera"),
+        ("opensfm", RATIONAL, "k4 of 1 camera"),
+        ("llff", BROWN, "k1 of 1 camera"),
+        ("blender", BROWN, "k1 of 1 camera"),
+        ("tum", BROWN, "intrinsics of 1 camera"),
+    ],
+)
+def test_losses_are_refused_and_named_then_accepted_and_verified(form, camera, lost, tmp_path):
+    capture = capture_of([camera])
+    source = npz_of(tmp_path, capture)
+    before = listing(tmp_path)
+    result = nerfcli("convert", source, tmp_path / "out", "--to", form)
+    assert result.exit_code == BAD_INPUT
+    assert lost in error_of(result)[0]
+    assert "--allow-loss" in error_of(result)[1]
+    assert result.stdout == ""
+    assert listing(tmp_path) == before
+    accepted = nerfcli("convert", source, tmp_path / "out", "--to", form, "--allow-loss", "--json")
+    assert accepted.exit_code == 0, accepted.stderr
+    assert f"{form} cannot hold {lost}" in accepted.stderr
+    assert "what is left of the capture" in accepted.stderr
+    report = json.loads(accepted.stdout)
+    assert any(lost in clause for clause in report["losses"])
+    assert report["verification"]["max_px"] < LIMIT_PX
+
+
+def test_what_a_lost_term_does_is_told_in_pixels(tmp_path):
+    """The distortion f k r^3 of the last corner of the picture is the most that its loss can do."""
+    source = npz_of(tmp_path, capture_of([RADIAL]))
+    result = nerfcli("convert", source, tmp_path / "out", "--to", "llff", "--allow-loss", "--json")
+    assert result.exit_code == 0, result.stderr
+    (corner,), _ = RADIAL.bearings(np.zeros((1, 2)))
+    most = 500 * 0.05 * np.hypot(corner[0] / corner[2], corner[1] / corner[2]) ** 3
+    assert 0.3 * most < json.loads(result.stdout)["loss_px"] < most
+
+
+# Faults: each is put into the code that writes, and must be found by the code that reads back
+
+
+def half_a_pixel(record_of_camera: Any) -> Any:
+    def record(camera: Camera) -> dict[str, Any]:
+        content = record_of_camera(camera)
+        return {**content, "cx": content["cx"] + 0.5, "cy": content["cy"] + 0.5}
+
+    return record
+
+
+def turned(pose: np.ndarray) -> np.ndarray:
+    return pose @ np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def transposed(pose: np.ndarray) -> np.ndarray:
+    wrong = opencv_gl(pose).copy()
+    wrong[..., :3, :3] = np.swapaxes(wrong[..., :3, :3], -1, -2)
+    return wrong
+
+
+def opencv_gl(pose: np.ndarray) -> np.ndarray:
+    return pose @ OPENCV_FROM_OPENGL
+
+
+def scalar_last(rotation: np.ndarray) -> np.ndarray:
+    return np.roll(rigid.quaternion_from_rotation(rotation), -1, axis=-1)
+
+
+def rigid_with(**faults: Any) -> Any:
+    """The module `rigid` with some functions of another kind, for one module alone."""
+    return SimpleNamespace(**{**vars(rigid), **faults})
+
+
+FAULTS = {
+    "transforms, flipped axes": ("transforms", transforms, "opengl_from_opencv_pose", turned),
+    "transforms, transposed rotation": ("transforms", transforms, "opengl_from_opencv_pose", transposed),
+    "transforms, half a pixel": (
+        "transforms",
+        transforms,
+        "record_of_camera",
+        half_a_pixel(transforms_cameras.record_of_camera),
+    ),
+    "blender, flipped axes": ("blender", blender, "opengl_from_opencv_pose", turned),
+    "llff, OpenGL axes": ("llff", llff, "llff_from_opencv_pose", opencv_gl),
+    "opensfm, inverse transform": ("opensfm", opensfm, "rigid", rigid_with(inverse=lambda pose: pose)),
+    "tum, order of quaternion": ("tum", trajectories, "rigid", rigid_with(quaternion_from_rotation=scalar_last)),
+    "colmap, order of quaternion": ("colmap", colmap_binary, "pose_rows", None),
+    "colmap, transposed rotation": ("colmap", colmap_binary, "pose_rows", None),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_of_a_writer_is_found_and_nothing_is_kept(name, tmp_path, monkeypatch):
+    form, module, function, fault = FAULTS[name]
+    capture = capture_of([SQUARE])
+    source = npz_of(tmp_path, capture)
+    before = listing(tmp_path)
+    right = getattr(module, function)
+    if fault is None:
+
+        def fault(model: Any) -> np.ndarray:
+            rows = right(model)
+            signs = [1, -1, -1, -1, 1, 1, 1]  # the conjugate: of the transposed rotation
+            return rows[:, [1, 2, 3, 0, 4, 5, 6]] if "order" in name else rows * signs
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, function, fault)
+        result = nerfcli("convert", source, tmp_path / "new" / "out", "--to", form, "--allow-loss")
+    assert result.exit_code == GATE_NOT_MET, result.stderr
+    assert "is off by" in error_of(result)[0]
+    assert result.stdout == ""
+    assert listing(tmp_path) == before
+    assert not (tmp_path / "new").exists()
+    assert nerfcli("convert", source, tmp_path / "out", "--to", form, "--allow-loss").exit_code == 0
+
+
+def test_half_a_pixel_is_half_a_pixel(tmp_path, monkeypatch):
+    source = npz_of(tmp_path, capture_of([SQUARE]))
+    monkeypatch.setattr(transforms, "record_of_camera", half_a_pixel(transforms_cameras.record_of_camera))
+    result = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss")
+    assert "is off by 0.707 px" in error_of(result)[0]
+    unverified = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss", "--no-verify")
+    assert unverified.exit_code == 0
+    assert "was not verified" in unverified.stderr
+    loose = nerfcli("convert", source, tmp_path / "2", "--to", "transforms", "--allow-loss", "--tolerance", "1")
+    assert loose.exit_code == 0
+
+
+def test_a_view_under_another_name_is_found(tmp_path, monkeypatch):
+    source = npz_of(tmp_path, capture_of([SQUARE]))
+    monkeypatch.setattr(transforms, "relative_path", lambda frame, folder: "photo 01.png")
+    result = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss")
+    assert result.exit_code == GATE_NOT_MET
+    assert "where photo 00.png should be, it lists photo 01.png" in error_of(result)[0]
+
+
+def test_after_a_fault_the_old_result_stands(tmp_path, monkeypatch):
+    source = npz_of(tmp_path, replace(capture_of([SQUARE])))
+    out = tmp_path / "sparse" / "0"
+    assert nerfcli("convert", source, out, "--to", "colmap").exit_code == 0
+    before = listing(tmp_path)
+    right = colmap_binary.pose_rows
+    monkeypatch.setattr(colmap_binary, "pose_rows", lambda model: right(model) + 1e-3)
+    result = nerfcli("convert", source, out, "--to", "colmap", "--overwrite")
+    assert result.exit_code == GATE_NOT_MET
+    assert listing(tmp_path) == before
+
+
+def test_coordinates_of_the_globe_are_compared_as_finely_as_float64_can(tmp_path):
+    """At 5,000 km from the origin and 4 m from the scene, rounding alone moves pixels by about 1e-6."""
+    capture = capture_of([PINHOLE])
+    moved = tuple(
+        replace(f, world_from_cam=rigid.from_parts(f.world_from_cam[:3, :3], f.centre + 5e6)) for f in capture.frames
+    )
+    capture = replace(capture, frames=moved, points=capture.points + 5e6)
+    done = convert(capture, tmp_path / "out", source_format="made", wanted=Wanted(format_named("colmap")))
+    assert done.verification is not None
+    assert 1e-6 < done.verification.tolerance_px <= _ROUNDINGS * 505 * 5000010 / 0.9
+
+
+def test_points_alone(tmp_path):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    result = nerfcli("convert", source, tmp_path / "points.ply", "--to", "ply", "--allow-loss")
+    assert result.exit_code == 0, result.stderr
+    assert "6 cameras and their poses" in result.stderr
+    assert "its 60 points are those of" in result.stderr
+    capture = capture_of([PINHOLE])
+    shifted = replace(capture, points=capture.points + 1e-9)
+    wrong = replace(format_named("ply"), write=lambda _, path: write_ply(shifted, path))
+    with pytest.raises(UserError, match="its points are off by"):
+        convert(capture, tmp_path / "2.ply", source_format="npz", wanted=Wanted(wrong, allow_loss=True))
+
+
+def test_points_beside_a_transforms_json_are_compared_too(tmp_path, monkeypatch):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    right = transforms.write_ply
+    monkeypatch.setattr(transforms, "write_ply", lambda c, path: right(replace(c, points=c.points[:, ::-1]), path))
+    result = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss")
+    assert result.exit_code == GATE_NOT_MET
+    assert set(listing(tmp_path)) == {"in.npz"}
+
+
+# The command
+
+
+def test_stdout_is_the_path_and_stderr_the_report(tmp_path):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    result = nerfcli("convert", source, tmp_path / "out", "--to", "colmap")
+    assert result.stdout == f"{tmp_path / 'out'}\n"
+    assert "largest residual" in result.stderr
+    quiet = nerfcli("convert", source, tmp_path / "out", "--to", "colmap", "--overwrite", "--quiet")
+    assert (quiet.exit_code, quiet.stderr) == (0, "")
+
+
+def test_an_existing_result_is_kept(tmp_path):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    (tmp_path / "out.json").write_text("mine")
+    result = nerfcli("convert", source, tmp_path / "out.json", "--to", "transforms", "--allow-loss")
+    assert result.exit_code == BAD_INPUT
+    assert "out.json exists" in error_of(result)[0]
+    assert (tmp_path / "out.json").read_text() == "mine"
+
+
+def test_a_folder_of_other_things_is_not_replaced_by_a_model(tmp_path):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_bytes(b"photo")
+    before = listing(tmp_path)
+    result = nerfcli("convert", source, tmp_path / "photos", "--to", "colmap", "--overwrite")
+    assert result.exit_code == BAD_INPUT
+    assert listing(tmp_path) == before
+
+
+def test_many_captures_each_under_its_name(tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        write_npz(capture_of([PINHOLE]), tmp_path / name / "capture.npz")
+    lines = f"{tmp_path / 'one'}\n{tmp_path / 'three'}\n{tmp_path / 'two'}\n"
+    result = nerfcli("convert", "-", tmp_path / "out", "--to", "colmap", stdin=lines)
+    assert result.exit_code == BAD_INPUT
+    assert result.stdout.split() == [str(tmp_path / "out" / "one"), str(tmp_path / "out" / "two")]
+    assert f"{tmp_path / 'three'}" in error_of(result)[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("out", "--to", "colmpa"), "colmpa"),
+        (("out",), "--to"),
+        (("--to", "colmap"), "OUT"),
+        (("out", "--detect"), "--detect"),
+        (("out", "--to", "colmap", "--pixel-center", "1"), "--pixel-center"),
+        (("out", "--to", "npz", "--scale", "0"), "--scale"),
+    ],
+)
+def test_wrong_usage(options, named, tmp_path):
+    result = nerfcli("convert", npz_of(tmp_path, capture_of([PINHOLE])), *options)
+    assert result.exit_code == USAGE
+    assert named in result.stderr
+
+
+@pytest.mark.parametrize("prefix", ["", "images/"])
+def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, tmp_path):
+    capture = replace(capture_of([PINHOLE]), observations=None)
+    write_photos(tmp_path / "images", capture)
+    capture = replace(capture, frames=tuple(replace(f, name=prefix + f.name) for f in capture.frames))
+    convert(capture, tmp_path / "sparse" / "0", source_format="made", wanted=Wanted(format_named("colmap")))
+    result = nerfcli("convert", tmp_path, tmp_path / "elsewhere" / "transforms.json", "--to", "transforms")
+    assert result.exit_code == 0, result.stderr
+    content = json.loads((tmp_path / "elsewhere" / "transforms.json").read_text())
+    assert content["frames"][0]["file_path"] == "../images/photo 00.png"
+
+
+def test_what_was_looked_for_is_told(tmp_path):
+    (tmp_path / "notes.md").write_text("hello")
+    with pytest.raises(UserError, match="holds no capture in a known format") as caught:
+        recognise(tmp_path)
+    for form in FORMATS:
+        assert form.parse is None or f"{form.name}: {form.looked_for}" in caught.value.hint
+
+
+def test_trajectories_need_a_camera(tmp_path):
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    result = nerfcli("convert", tmp_path / "poses.txt", tmp_path / "out", "--to", "colmap")
+    assert result.exit_code == BAD_INPUT
+    assert "no camera" in error_of(result)[0]
+    assert "--intrinsics" in nerfcli("convert", "--help").stdout
+
+
+def test_help_has_examples_that_parse_and_names_all_formats():
+    text = nerfcli("convert", "--help").stdout
+    examples = [line.strip() for line in text.split("Examples:")[1].splitlines() if "nerfcli convert " in line]
+    assert len(examples) > 5
+    for example in examples:
+        check_that_it_parses(example)
+    written, read = (
+        text.split("Formats written:")[1].split("Inside")[0],
+        text.split("Formats read:")[1].split("Formats w")[0],
+    )
+    for form in FORMATS:
+        assert (form.write is None) == (form.name not in FORMATS_WRITTEN)
+        assert form.write is None or form.name in written
+        assert form.parse is None or form.name.removesuffix("-text") in read

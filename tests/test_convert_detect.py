@@ -1,0 +1,280 @@
+"""Which convention a capture follows, found out from captures whose convention was broken on purpose."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from test_cli import error_of, nerfcli
+from views import BROWN, PINHOLE, capture_of
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.archive import write_npz
+from nerfcli.cameras.formats.transforms import write_transforms
+from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.convert.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
+from nerfcli.convert.detect import Detection, detect
+from nerfcli.convert.evidence import Intrinsics, MatchEvidence
+from nerfcli.convert.matches import PairMatches, match_neighbours
+from nerfcli.errors import BAD_INPUT, UserError
+
+
+def silent(share: float, detail: str) -> None:
+    """Progress that nobody watches."""
+
+
+def with_poses(capture: Capture, poses: np.ndarray) -> Capture:
+    frames = zip(capture.frames, poses, strict=True)
+    return replace(capture, frames=tuple(replace(frame, world_from_cam=pose) for frame, pose in frames))
+
+
+def misread(capture: Capture, meant: Convention, parsed_axes: str) -> Capture:
+    """What is parsed from a file that was written in the convention `meant`, by one who takes it for the format's.
+
+    By hand, not by `expressed`: the file's matrices, then the format's axes taken off them.
+    """
+    in_file = poses_of(capture) @ opencv_from_axes(meant.axes)
+    if meant.inverted:
+        in_file = np.linalg.inv(in_file)
+    wrong = with_poses(capture, in_file @ np.linalg.inv(opencv_from_axes(parsed_axes)))
+    frames = []
+    for frame in wrong.frames:
+        camera, k, shift = frame.camera, meant.intrinsics_scale, meant.pixel_centre - 0.5
+        params = [value * k for value in camera.params[:4]] + list(camera.params[4:])
+        params[2:4] = [value + shift for value in params[2:4]]
+        frames.append(replace(frame, camera=Camera(camera.model, camera.width, camera.height, tuple(params))))
+    return replace(wrong, frames=tuple(frames))
+
+
+def verdicts(found: Detection) -> dict[str, str]:
+    return {question.name: question.verdict for question in found.questions}
+
+
+CONVENTIONS = [
+    Convention("opengl"),
+    Convention("opencv"),
+    Convention("opencv", inverted=True),
+    Convention("opengl", inverted=True),
+    Convention("llff"),
+    Convention("ros"),
+    Convention("drb", inverted=True),
+    Convention("opengl", pixel_centre=0.0),
+    Convention("opencv", inverted=True, intrinsics_scale=2.0),
+    Convention("opencv", inverted=True, intrinsics_scale=0.5, pixel_centre=0.0),
+]
+
+
+@pytest.mark.parametrize("meant", CONVENTIONS, ids=str)
+@pytest.mark.parametrize("parsed_axes", ["opengl", "opencv"])
+def test_exact_observations_tell_every_convention(meant, parsed_axes):
+    if meant.axes == "drb":
+        meant = replace(meant, axes="llff")
+    capture = misread(capture_of([PINHOLE, BROWN]), meant, parsed_axes)
+    found = detect(capture, axes=parsed_axes, progress=silent)
+    assert found.convention == meant
+    assert set(verdicts(found).values()) == {"holds"}
+    assert all(question.ratio > 10 for question in found.questions)  # the first two are asked with a half pixel's error
+    assert found.questions[-1].ratio > 100
+    assert found.as_format_says == (meant == Convention(parsed_axes))
+    # What convert then makes of it is the capture that was spoiled.
+    mended = reinterpreted(capture, found.convention, parsed_axes=parsed_axes)
+    np.testing.assert_allclose(poses_of(mended), poses_of(capture_of([PINHOLE, BROWN])), rtol=0, atol=1e-12)
+    assert mended.frames[1].camera.params == pytest.approx(BROWN.params, rel=1e-14)
+
+
+def test_a_half_pixel_below_the_noise_is_not_decided():
+    """20 px of noise in 360 observations: their median error is known to 1 px or so, not to 0.5 px."""
+    capture = capture_of([PINHOLE])
+    assert capture.observations is not None
+    rng = np.random.default_rng(1)
+    noisy = capture.observations.pixels + rng.normal(0, 20, capture.observations.pixels.shape)
+    capture = replace(capture, observations=replace(capture.observations, pixels=noisy))
+    capture = replace(capture, frames=tuple(capture.frames))
+    found = detect(misread(capture, Convention("opengl"), "opencv"), axes="opencv", progress=silent)
+    question = found.questions[-1]
+    assert question.name == "pixel centre"
+    assert question.verdict != "holds"
+    assert found.convention.pixel_centre == 0.5
+
+
+def test_poses_that_fit_in_no_convention_are_told():
+    capture = capture_of([PINHOLE], count=8)
+    rng = np.random.default_rng(2)
+    shuffled = poses_of(capture)[rng.permutation(8)]
+    found = detect(with_poses(capture, shuffled), axes="opencv", progress=silent)
+    assert verdicts(found)["axes and direction"] == "none holds"
+    assert not found.as_format_says
+    assert found.convention == Convention("opencv")
+
+
+def matched_pairs(capture: Capture) -> list[PairMatches]:
+    """What a perfect matcher finds: the points that neighbours both see."""
+    seen = capture.observations
+    assert isinstance(seen, Observations)
+    where = [
+        dict(
+            zip(
+                *(column[seen.frame_index == i] for column in (seen.point_index, np.arange(len(seen.pixels)))),
+                strict=True,
+            )
+        )
+        for i in range(len(capture.frames))
+    ]
+    pairs = []
+    for first in range(len(capture.frames) - 1):
+        both = sorted(set(where[first]) & set(where[first + 1]))
+        rows = [[where[first + step][point] for point in both] for step in (0, 1)]
+        pairs.append(PairMatches(first, first + 1, seen.pixels[rows[0]], seen.pixels[rows[1]]))
+    return pairs
+
+
+@pytest.mark.parametrize("meant", CONVENTIONS[:7], ids=str)
+def test_epipolar_errors_vanish_in_the_right_convention_alone(meant):
+    capture = capture_of([PINHOLE, BROWN], count=8)
+    spoiled = misread(capture, meant, "opengl")
+    evidence = MatchEvidence(matched_pairs(capture), dict(enumerate(f.camera for f in spoiled.frames)), 8)
+    directions = evidence.directions(Intrinsics())
+    right = evidence.errors_px(directions, poses_of(reinterpreted(spoiled, meant, parsed_axes="opengl")))
+    assert right.max() < 1e-8
+    for other in CONVENTIONS[:7]:
+        if (
+            not np.array_equal(opencv_from_axes(other.axes), opencv_from_axes(meant.axes))
+            or other.inverted != meant.inverted
+        ):
+            wrong = evidence.errors_px(directions, poses_of(reinterpreted(spoiled, other, parsed_axes="opengl")))
+            assert np.median(wrong) > 5
+
+
+def test_the_epipolar_error_is_the_distance_in_pixels():
+    """A camera moved sideways sees every point in the same row: off by 3 rows in one photo, the Sampson distance to the
+    epipolar geometry is 3 / sqrt(2) px near the optical axis."""
+    camera = Camera.pinhole(2000, 2000, 10_000.0)
+    second = np.eye(4)
+    second[0, 3] = 1.0
+    points = np.random.default_rng(0).uniform((-0.4, -0.4, 30), (0.4, 0.4, 50), (50, 3))
+    first_pixels, _ = camera.project(points)
+    second_pixels, _ = camera.project(points - second[:3, 3])
+    second_pixels[:, 1] += 3.0
+    pair = PairMatches(0, 1, first_pixels, second_pixels)
+    evidence = MatchEvidence([pair], {0: camera, 1: camera}, 2)
+    errors = evidence.errors_px(evidence.directions(Intrinsics()), np.stack([np.eye(4), second]))
+    np.testing.assert_allclose(errors, 3 / np.sqrt(2), rtol=2e-3)
+
+
+def test_points_alone_tell_axes(tmp_path):
+    capture = replace(misread(capture_of([PINHOLE]), Convention("opencv"), "opengl"), observations=None)
+    found = detect(capture, axes="opengl", progress=silent)
+    assert "whether they lie inside" in found.evidence
+    assert [question.name for question in found.questions] == ["axes and direction"]
+    best = found.questions[0].answers[0]
+    assert best.inlier_share == 1
+
+
+# Photos
+
+
+CARDS = ((-1.2, -0.9, 2.4, 1.8, 1.0), (-0.5, -0.4, 1.0, 0.8, 0.3))
+
+
+def photograph(folder: Path, *, count: int, camera: Camera) -> Capture:
+    """Photos of a textured card in front of a larger one (x, y, width, height, z of each), warped by homographies."""
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    textures = []
+    for _ in CARDS:
+        layers = [
+            cv2.resize(rng.uniform(0, 255, (n, n)), (512, 512), interpolation=cv2.INTER_CUBIC) for n in (12, 40, 120)
+        ]
+        textures.append(np.clip(np.mean(layers, axis=0), 0, 255).astype(np.float32))
+    fx, fy, cx, cy = camera.params
+    matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])  # OpenCV's pixel centres are whole numbers
+    frames = []
+    for index in range(count):
+        centre = np.array([np.sin(1.5 * index), 0.6 * np.cos(2.0 * index), -2.6 + 0.2 * np.cos(index)]) * (0.8, 0.8, 1)
+        pose = rigid.look_at(centre, rng.normal(0, 0.15, 3), np.array([0.2 * np.sin(index), -1.0, 0.0]))
+        cam_from_world = rigid.inverse(pose)
+        picture = np.zeros((camera.height, camera.width), np.float32)
+        for texture, (x, y, width, height, z) in zip(textures, CARDS, strict=True):
+            # world = (x + u width, y + v height, z) for texture pixels (512 u, 512 v) - 1/2
+            card = np.array(
+                [[width / 512, 0, x + width / 1024], [0, height / 512, y + height / 1024], [0, 0, z], [0, 0, 1]]
+            )
+            homography = matrix @ cam_from_world[:3] @ card
+            size = (camera.width, camera.height)
+            seen = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_LINEAR, borderValue=-1.0)
+            picture = np.where(seen >= 0, seen, picture)
+        name = f"{index:02d}.png"
+        Image.fromarray(np.clip(picture, 0, 255).astype(np.uint8)).save(folder / name)
+        frames.append(Frame(name, camera, pose, image=folder / name))
+    return Capture(tuple(frames), np.zeros((0, 3)), (), None, "transforms")
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return photograph(tmp_path_factory.mktemp("cards") / "images", count=6, camera=Camera.pinhole(480, 360, 420.0))
+
+
+def test_matches_lie_where_both_photos_show_the_same_place(photographed):
+    """The true distance of matches from each other, through the cards that they lie on, is a fraction of a pixel."""
+    pairs, cameras = match_neighbours(photographed.frames, progress=silent)
+    assert len(pairs) >= 3
+    evidence = MatchEvidence(pairs, cameras, 6)
+    errors = evidence.errors_px(evidence.directions(Intrinsics()), poses_of(photographed))
+    assert np.median(errors) < 0.2
+
+
+@pytest.mark.parametrize("meant", [Convention("opengl"), Convention("opencv", inverted=True)], ids=str)
+def test_photos_tell_the_convention_and_how_to_read_it(meant, photographed, tmp_path):
+    spoiled = misread(photographed, meant, "opengl")
+    write_transforms(spoiled, tmp_path / "transforms.json")
+    result = nerfcli("convert", tmp_path, "--detect")
+    assert result.exit_code == 0, result.stderr
+    assert "SIFT matches" in result.stdout
+    assert "holds" in result.stdout
+    report = json.loads(nerfcli("convert", tmp_path, "--detect", "--json").stdout)
+    axes, size, centre = report["questions"]
+    assert (axes["verdict"], size["verdict"]) == ("holds", "holds")
+    assert axes["ratio"] > 10
+    # These photos are sharp and without noise: their matches tell even the half pixel, and must not tell it wrongly.
+    assert centre["hypotheses"][0]["pixel_centre"] == 0.5
+    assert report["as_format_says"] == (meant == Convention("opengl"))
+    if meant.inverted:
+        assert report["options"] == "--from-axes opencv --from-inverted"
+        assert report["options"] in result.stdout
+        mended = nerfcli("convert", tmp_path, tmp_path / "out", "--to", "colmap", *report["options"].split())
+        assert mended.exit_code == 0, mended.stderr
+    assert not (tmp_path / "cache").exists()
+
+
+def test_nothing_to_judge_by(tmp_path):
+    capture = replace(capture_of([PINHOLE]), points=np.zeros((0, 3)), colours=None, observations=None)
+    write_npz(capture, tmp_path / "in.npz")
+    result = nerfcli("convert", tmp_path / "in.npz", "--detect")
+    assert result.exit_code == BAD_INPUT
+    assert "nothing to judge the convention by" in error_of(result)[0]
+    assert "--images" in error_of(result)[1]
+
+
+def test_a_photo_of_another_shape_is_told(photographed):
+    other = replace(photographed.frames[0], camera=Camera.pinhole(500, 300, 420.0))
+    with pytest.raises(UserError, match="480x360 pixels does not fit a camera of 500x300"):
+        match_neighbours((other, *photographed.frames[1:]), progress=silent)
+
+
+def test_a_principal_point_in_the_middle_was_not_given():
+    assert for_picture(Camera.pinhole(640, 480, 500.0), 2.0) == Camera.pinhole(640, 480, 250.0)
+
+
+def test_what_is_written_in_a_convention_is_detected_as_that(tmp_path):
+    """The writer's way into a convention and the detector's way out are the same one."""
+    capture = capture_of([PINHOLE])
+    wanted = Convention("llff", pixel_centre=0.0)
+    written = expressed(capture, wanted, written_axes="opencv")
+    assert written.observations is not None
+    assert capture.observations is not None
+    spoiled = replace(written, observations=capture.observations)
+    assert detect(spoiled, axes="opencv", progress=silent).convention == wanted
