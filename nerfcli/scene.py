@@ -17,8 +17,9 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.formats.blender import read_blender
 from nerfcli.cameras.formats.colmap import is_model, read_colmap, read_model
+from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.llff import IMAGE_FOLDERS, read_llff
-from nerfcli.cameras.formats.transforms import read_json_object, read_transforms
+from nerfcli.cameras.formats.transforms import read_transforms
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
 from nerfcli.media.images import image_size, list_images, read_exif

@@ -509,7 +509,7 @@ def test_renders_are_kept_refused_and_overwritten(finished, tmp_path):
     assert listing(tmp_path / "views") != before
 
 
-@pytest.mark.parametrize("cameras", ["train", "orbit", "spiral", "interpolate"])
+@pytest.mark.parametrize("cameras", ["train", "orbit", "ellipse", "spiral", "interpolate"])
 def test_cameras_to_render_from(cameras, finished):
     arguments = ("--cameras", cameras, "--frames", "3", "--outputs", "rgb", "--max-size", "10", "--video")
     result = nerfcli("render", finished, *arguments)
@@ -525,6 +525,48 @@ def test_cameras_of_another_file_and_none_at_all(capture, finished, tmp_path):
     result = nerfcli(*arguments, "--cameras", "somewhere")
     assert result.exit_code == BAD_INPUT
     assert "no cameras called somewhere" in error_of(result)[0]
+
+
+def views_of(folder: Path) -> list[dict[str, Any]]:
+    """Pose and camera of each frame that was rendered into a folder."""
+    return json.loads((folder / "render.json").read_text())["frames"]
+
+
+def test_views_are_written_and_rendered_from_again(finished, tmp_path):
+    path = ("--cameras", "interpolate", "--through", "r_001,r_003.png", "--frames", "3", "--max-size", "10")
+    result = nerfcli("render", finished, *path, "--cameras-only", "-o", tmp_path / "path")
+    assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'path'}\n")
+    assert set(listing(tmp_path / "path")) == {"camera_path.json", "cameras.json"}
+    assert nerfcli("render", finished, *path, "--outputs", "rgb", "-o", tmp_path / "views").exit_code == 0
+    for name in ("cameras.json", "camera_path.json"):
+        again = ("--cameras", tmp_path / "path" / name, "--outputs", "rgb", "-o", tmp_path / name)
+        assert nerfcli("render", finished, *again).exit_code == 0
+        for one, other in zip(views_of(tmp_path / "views"), views_of(tmp_path / name), strict=True):
+            assert one["camera"]["params"] == pytest.approx(other["camera"]["params"], rel=1e-12)
+            np.testing.assert_allclose(one["world_from_cam"], other["world_from_cam"], rtol=0, atol=1e-12)
+
+
+def test_a_path_in_the_world_of_a_nerfstudio_run_comes_home(finished, tmp_path):
+    arguments = ("render", finished, "--cameras", "orbit", "--frames", "2", "--max-size", "10")
+    assert nerfcli(*arguments, "--cameras-only", "-o", tmp_path).exit_code == 0
+    # nerfstudio_from_world: x -> 2 (x + (1, 0, 0)).
+    (tmp_path / "dataparser_transforms.json").write_text(
+        json.dumps({"transform": [[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 2.0})
+    )
+    frame = ("--nerfstudio-frame", tmp_path / "dataparser_transforms.json")
+    given = ("render", finished, "--cameras", tmp_path / "camera_path.json", "--outputs", "rgb")
+    assert nerfcli(*given, "-o", tmp_path / "a").exit_code == 0
+    assert nerfcli(*given, *frame, "-o", tmp_path / "b").exit_code == 0
+    for one, other in zip(views_of(tmp_path / "a"), views_of(tmp_path / "b"), strict=True):
+        shifted = 2 * (np.array(other["world_from_cam"])[:3, 3] + [1, 0, 0])
+        np.testing.assert_allclose(np.array(one["world_from_cam"])[:3, 3], shifted, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "options", [("--through", "r_001.png"), ("--cameras", "orbit", "--nerfstudio-frame", "dataparser_transforms.json")]
+)
+def test_options_of_views_that_do_not_fit_are_wrong_usage(options, finished):
+    assert nerfcli("render", finished, *options).exit_code == 2
 
 
 def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch, capture, tmp_path):

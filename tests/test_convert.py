@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from test_cli import check_that_it_parses, error_of, listing, nerfcli
+from test_scale import photos_of, sheet_of_markers
 from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQUARE, capture_of
 
 from nerfcli.cameras import rigid
@@ -236,6 +237,26 @@ def test_the_world_frame_and_its_scale(tmp_path):
     change = rigid.Similarity.from_json(json.loads(result.stdout)["new_from_old"])
     np.testing.assert_allclose(change.apply(capture.points), again.points, rtol=0, atol=1e-12)
     assert change.scale == pytest.approx(2.5, rel=1e-12)
+
+
+def test_markers_in_the_photos_give_metres(tmp_path):
+    # Markers with a side of 120 pixels at 120 / 0.7 pixels per unit, which is said to be 0.05 m.
+    frames = photos_of(tmp_path, sheet_of_markers([3, 17], 120), per_unit=120 / 0.7)
+    source = npz_of(tmp_path, Capture(tuple(frames), np.zeros((0, 3)), (), None, "npz"))
+    result = nerfcli("convert", source, tmp_path / "out.npz", "--to", "npz", "--markers", "DICT_4X4_50:0.05", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert "from ArUco markers (DICT_4X4_50, 0.05 m), 8 sides" in result.stderr
+    assert json.loads(result.stdout)["new_from_old"]["scale"] == pytest.approx(0.05 / 0.7, rel=1e-4)
+    assert load(tmp_path / "out.npz", Given(), Doubt())[2].unit == "metre"
+
+
+@pytest.mark.parametrize(
+    "options", [("--markers", "DICT_4X4_50"), ("--markers", "DICT_4X4_50:0.05", "--scale", "2"), ("--scale", "-1")]
+)
+def test_a_scale_that_says_nothing_or_two_of_them(options, tmp_path):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    assert nerfcli("convert", source, tmp_path / "out.npz", "--to", "npz", *options).exit_code == USAGE
+    assert not (tmp_path / "out.npz").exists()
 
 
 # Losses

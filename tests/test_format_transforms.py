@@ -16,7 +16,6 @@ from nerfcli.cameras.formats.transforms import (
     ignored_transforms,
     losses_transforms,
     parse_transforms,
-    read_camera_path,
     read_transforms,
     write_transforms,
 )
@@ -186,8 +185,6 @@ def test_a_written_file_serves_for_training_and_as_a_camera_path(tmp_path):
     for frame, again in zip(capture.frames[1:], scene.frames, strict=True):
         assert (again.name, again.camera) == (frame.name, frame.camera)
         np.testing.assert_allclose(again.world_from_cam, frame.world_from_cam, rtol=0, atol=1e-15)
-    path = read_camera_path(tmp_path / "transforms.json")
-    assert [frame.camera for frame in path] == [frame.camera for frame in capture.frames]
 
 
 def test_blender_files_are_read_back(tmp_path):

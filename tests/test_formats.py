@@ -18,7 +18,7 @@ from nerfcli.cameras.conventions import (
 from nerfcli.cameras.formats.blender import read_blender
 from nerfcli.cameras.formats.colmap import is_model, read_colmap, read_model
 from nerfcli.cameras.formats.llff import read_llff
-from nerfcli.cameras.formats.transforms import read_camera_path, read_transforms
+from nerfcli.cameras.formats.transforms import parse_transforms, read_transforms
 from nerfcli.errors import BAD_INPUT, UserError
 
 # A camera at (1, 2, 3) that looks along -x with +z up. OpenGL axes: right +y, up +z, backward +x, as columns.
@@ -196,7 +196,14 @@ def test_blender_splits_are_kept_and_val_is_left_out(tmp_path):
 def test_a_camera_path_needs_the_size_of_its_pictures(tmp_path):
     path = write_capture(tmp_path, {"fl_x": 50, "frames": [entry("a")]})
     with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing"):
-        read_camera_path(path)
+        parse_transforms(path)
+
+
+def test_views_of_a_camera_path_need_no_photo(tmp_path):
+    view = entry("")
+    del view["file_path"]
+    path = write_capture(tmp_path, {"fl_x": 50, "w": 40, "h": 30, "frames": [view, view]})
+    assert [frame.name for frame in parse_transforms(path).frames] == ["frame_0000", "frame_0001"]
 
 
 def llff_rows(count: int) -> np.ndarray:

@@ -62,6 +62,13 @@ def convert(
             help='A known distance, to metres: "A B 1.25", A and B images or points x,y,z; many may be given.'
         ),
     ] = None,
+    markers: Annotated[
+        str | None,
+        typer.Option(
+            help="To metres by ArUco markers in the photos, DICT_4X4_50:0.05 (their side), or a ChArUco board, "
+            "DICT_5X5_100:7x5:0.04:0.03 (squares, sides of square and marker)."
+        ),
+    ] = None,
     allow_loss: Annotated[
         bool, typer.Option("--allow-loss", help="Leave out what the format cannot hold (it is listed).")
     ] = False,
@@ -79,7 +86,8 @@ def convert(
 
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
-                      reality-capture, bundler, tum, kitti, npz; recognised by their files
+                      reality-capture, bundler, tum, kitti, npz, camera-path (of nerfstudio's viewer); recognised by
+                      their files
     Formats written:  colmap, colmap-text, transforms, blender, llff, opensfm, tum, kitti, npz (all of it), ply (points)
 
     \b
@@ -118,7 +126,8 @@ def convert(
             raise typer.BadParameter(f"{to!r}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         if target is None:
             raise typer.BadParameter("say where the result goes", param_hint="OUT")
-        world = {"up": world_up, "origin": origin, "scale": scale, "distances": tuple(distance or ())}
+        lengths = {"scale": scale, "markers": markers, "distances": tuple(distance or ())}
+        world = {"up": world_up, "origin": origin, **lengths}
         wanted = {
             "axes": axes,
             "pixel_centre": _pixel_centre(pixel_center, "--pixel-center"),

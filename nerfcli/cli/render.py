@@ -8,22 +8,29 @@ import typer
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
+from nerfcli.cli.views import Views, chosen_frames, write_frames
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.cameras.camera import Camera
-    from nerfcli.cameras.frame import Frame
     from nerfcli.export import ExportSettings
-
-PATHS = ("orbit", "spiral", "interpolate")
 
 
 @command
 def render(
     run: Annotated[str, typer.Argument(help="The folder that train wrote, or - for runs on standard input.")],
     cameras: Annotated[
-        str, typer.Option(help="test, train, orbit, spiral, interpolate, or a scene or transforms.json to see from.")
+        str,
+        typer.Option(
+            help="test, train, orbit, ellipse, spiral, interpolate, or any file or folder that convert reads."
+        ),
     ] = "test",
+    through: Annotated[
+        str | None, typer.Option(help="Photos a.jpg,b.jpg,... that the path is made from, in this order.")
+    ] = None,
+    nerfstudio_frame: Annotated[
+        Path | None,
+        typer.Option(help="The dataparser_transforms.json of the nerfstudio run in whose world --cameras FILE is."),
+    ] = None,
     outputs: Annotated[str, typer.Option(help="Some of rgb,depth,opacity.")] = "rgb,depth,opacity",
     depth: Annotated[
         str, typer.Option(help="Which depth: conditional, moment, background, max-weight or median.")
@@ -35,8 +42,12 @@ def render(
     ] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Depth as .npy beside the TIFF.")] = False,
     video: Annotated[bool, typer.Option("--video", help="An MP4 of each output.")] = False,
-    frames: Annotated[int, typer.Option(help="Frames of orbit, spiral and interpolate.", min=2)] = 60,
+    frames: Annotated[int, typer.Option(help="Frames of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
     fps: Annotated[float, typer.Option(help="Frames per second of the video.", min=1, max=240)] = 24,
+    cameras_only: Annotated[
+        bool,
+        typer.Option("--cameras-only", help="Render nothing; write cameras.json and camera_path.json."),
+    ] = False,
     max_size: Annotated[
         int | None, typer.Option(help="Longer side of the pictures at most, pixels.  [default: as trained]", min=8)
     ] = None,
@@ -63,11 +74,15 @@ def render(
     Examples:
       nerfcli render photos-scene-run --cameras test --outputs rgb,depth --depth median --depth-axis ray
       nerfcli render photos-scene-run --cameras orbit --frames 120 --video
-      nerfcli render photos-scene-run --cameras other/transforms.json -o other-views
+      nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
+      nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
+      nerfcli render photos-scene-run --cameras ellipse --frames 240 --cameras-only -o ellipse/
     """
     from nerfcli.export import OUTPUTS, ExportSettings
     from nerfcli.render.depth import CONVENTIONS
+    from nerfcli.render.model import load_model
     from nerfcli.render.pictures import DepthRequest
+    from nerfcli.train.run_folder import FIELD
 
     chosen = tuple(dict.fromkeys(outputs.split(",")))
     if unknown := [name for name in chosen if name not in OUTPUTS]:
@@ -82,16 +97,23 @@ def render(
     )
     settings = ExportSettings(outputs=chosen, depth=request, npy=npy, video=video, fps=fps)
 
+    views = Views(cameras, frames, through, nerfstudio_frame, max_size)
+
     def work(folder: Path, one_of_many: bool) -> None:
-        target = folder / "renders" / folder_name(cameras, settings)
+        name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
+        target = folder / "renders" / name
         if output is not None:
             target = output / folder.name if one_of_many else output
+        if cameras_only:
+            hint = 1.0 / load_model(folder / FIELD, "cpu").training_from_scene.scale
+            chosen_views = chosen_frames(folder, views, depth_hint=hint)
+            write_frames(chosen_views, target, fps=fps, overwrite=overwrite, console=console)
+            console.result(target)
+            return
         written = render_run(
             folder,
             target,
-            cameras=cameras,
-            count=frames,
-            max_size=max_size,
+            views=views,
             settings=settings,
             device=device_name(device),
             threads=thread_count(threads),
@@ -104,19 +126,18 @@ def render(
     for_each_input(run, work)
 
 
-def folder_name(cameras: str, settings: "ExportSettings") -> str:
+def folder_name(views: Views, settings: "ExportSettings") -> str:
     """The folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
-    name = cameras if cameras in ("test", "train", *PATHS) else Path(cameras).absolute().stem
-    return f"{name}-{settings.depth.convention}-{settings.depth.axis}" if "depth" in settings.outputs else name
+    if "depth" not in settings.outputs:
+        return views.name
+    return f"{views.name}-{settings.depth.convention}-{settings.depth.axis}"
 
 
 def render_run(
     run: Path,
     target: Path,
     *,
-    cameras: str,
-    count: int,
-    max_size: int | None,
+    views: Views,
     settings: "ExportSettings",
     device: str,
     threads: int,
@@ -148,9 +169,9 @@ def render_run(
         settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
     # The unit of the training frame is about the distance between the cameras and what they look at.
     depth_hint = 1.0 / model.training_from_scene.scale
-    views = chosen_frames(run, cameras, count=count, max_size=max_size, depth_hint=depth_hint)
+    frames = chosen_frames(run, views, depth_hint=depth_hint)
     provenance: dict[str, Any] = {
-        "cameras": cameras,
+        "cameras": views.cameras,
         "run": run.name,
         "field_sha256": hashlib.sha256((run / FIELD).read_bytes()).hexdigest(),
     }
@@ -158,72 +179,19 @@ def render_run(
         raise UserError(f"{target} holds something else than renders", "choose another place with -o")
     if (target / DESCRIPTION).exists() and not overwrite:
         made = json_module.loads((target / DESCRIPTION).read_text(encoding="utf-8"))
-        wanted = {"settings": settings.to_json(), "frames": describe_frames(views), **provenance}
+        wanted = {"settings": settings.to_json(), "frames": describe_frames(frames), **provenance}
         if any(made.get(key) != value for key, value in wanted.items()):
             raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another place with -o")
         console.note(f"{target} is kept: it was rendered with these settings; --overwrite renders again")
         return [target / (f"{name}.mp4" if settings.video else name) for name in settings.outputs]
 
-    total = sum(frame.camera.width * frame.camera.height for frame in views)
+    total = sum(frame.camera.width * frame.camera.height for frame in frames)
     done = 0
-    with console.progress(f"render {cameras}") as update:
+    with console.progress(f"render {views.name}") as update:
 
         def on_rays(rays: int) -> None:
             nonlocal done
             done += rays
-            update(done / total, f"{len(views)} frames")
+            update(done / total, f"{len(frames)} frames")
 
-        return export_frames(model, views, target, settings, provenance=provenance, on_rays=on_rays)
-
-
-def chosen_frames(run: Path, cameras: str, *, count: int, max_size: int | None, depth_hint: float) -> "list[Frame]":
-    """The frames that --cameras names, at the size of the training or within `max_size`.
-
-    `depth_hint` is how far away the scene's middle is, for paths around it where the optical axes do not say.
-    """
-    from dataclasses import replace
-
-    from nerfcli.cameras import paths
-    from nerfcli.train.photos import downscaled_camera
-    from nerfcli.train.run_folder import read_cameras, read_config
-
-    sets = read_cameras(run)
-    factor = read_config(run)["settings"]["downscale"]
-    if cameras in ("test", "train"):
-        chosen = list(sets[cameras])
-        if not chosen:
-            raise UserError(f"{run} has no {cameras} cameras", "choose --cameras train, orbit, spiral or interpolate")
-    elif cameras == "interpolate":
-        chosen = list(paths.interpolate(sets["train"], count=count))
-    elif cameras in PATHS:
-        path = {"orbit": paths.orbit, "spiral": paths.spiral}[cameras]
-        chosen = list(path(sets["train"], count=count, depth_hint=depth_hint))
-    else:
-        chosen = list(frames_of_file(Path(cameras)))
-        factor = 1
-    chosen = [replace(frame, camera=downscaled_camera(frame.camera, factor)) for frame in chosen]
-    if max_size is None:
-        return chosen
-    return [replace(frame, camera=_within(frame.camera, max_size)) for frame in chosen]
-
-
-def frames_of_file(path: Path) -> "tuple[Frame, ...]":
-    """The cameras of a transforms.json, or of any scene folder."""
-    from nerfcli import scene as scenes
-    from nerfcli.cameras.formats.transforms import read_camera_path
-
-    if path.is_dir():
-        return scenes.load(path).frames
-    if not path.exists():
-        raise UserError(
-            f"no cameras called {path}",
-            f"choose test, train, {', '.join(PATHS)}, a scene folder, or a transforms.json",
-        )
-    return read_camera_path(path)
-
-
-def _within(camera: "Camera", max_size: int) -> "Camera":
-    """The camera of the picture made smaller, if need be, until its longer side fits."""
-    from nerfcli.train.photos import downscaled_camera
-
-    return downscaled_camera(camera, max(1.0, max(camera.width, camera.height) / max_size))
+        return export_frames(model, frames, target, settings, provenance=provenance, on_rays=on_rays)

@@ -54,6 +54,7 @@ def run(
     from nerfcli.cli.poses import estimate_scene
     from nerfcli.cli.render import folder_name, render_run
     from nerfcli.cli.train import train_scene, was_interrupted
+    from nerfcli.cli.views import Views
     from nerfcli.export import OUTPUTS, ExportSettings
     from nerfcli.poses.structure_from_motion import PoseSettings
     from nerfcli.render.pictures import DepthRequest
@@ -85,12 +86,11 @@ def run(
         console.result(metrics, numbers)
         for cameras, video in (("test", False), ("orbit", True)):
             settings = ExportSettings(outputs=OUTPUTS[: 2 if video else 3], depth=depth, npy=False, video=video, fps=24)
+            views = Views(cameras, frames, max_size=max_size if video else None)
             written = render_run(
                 field,
-                field / "renders" / folder_name(cameras, settings),
-                cameras=cameras,
-                count=frames,
-                max_size=max_size if video else None,
+                field / "renders" / folder_name(views, settings),
+                views=views,
                 settings=settings,
                 device=torch_device,
                 threads=cores,

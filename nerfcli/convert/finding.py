@@ -6,7 +6,9 @@ A folder is known by the names of files in it, a file by its suffix and its begi
 from collections.abc import Callable
 from pathlib import Path
 
+from nerfcli.cameras.formats.camera_path import is_camera_path
 from nerfcli.cameras.formats.colmap import is_model
+from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.scene import SCENE_FILE
 
 MODEL_FILES = tuple(
@@ -64,6 +66,14 @@ def find_json(path: Path, *, opening: str, name: str) -> Path | None:
         return None
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         return path if stream.read(1000).lstrip().startswith(opening) else None
+
+
+def find_camera_path(path: Path) -> Path | None:
+    """A JSON file that has the key camera_path and no frames, or the file camera_path.json of a folder."""
+    found = find_json(path, opening="{", name="camera_path.json")
+    if found is None or path.is_dir():
+        return found
+    return found if is_camera_path(read_json_object(found)) else None
 
 
 def find_lines(path: Path, *, columns: int) -> Path | None:

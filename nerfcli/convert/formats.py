@@ -9,6 +9,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.archive import losses_npz, parse_npz, write_npz
 from nerfcli.cameras.formats.blender import losses_blender, parse_blender, write_blender
 from nerfcli.cameras.formats.bundler import parse_bundler
+from nerfcli.cameras.formats.camera_path import parse_camera_path
 from nerfcli.cameras.formats.colmap import parse_colmap
 from nerfcli.cameras.formats.colmap_write import (
     losses_colmap,
@@ -16,6 +17,7 @@ from nerfcli.cameras.formats.colmap_write import (
     write_colmap_binary,
     write_colmap_text,
 )
+from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.llff import IMAGE_FOLDERS, losses_llff, parse_llff, write_llff
 from nerfcli.cameras.formats.metashape import parse_metashape
 from nerfcli.cameras.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
@@ -32,7 +34,6 @@ from nerfcli.cameras.formats.trajectories import (
 from nerfcli.cameras.formats.transforms import (
     losses_transforms,
     parse_transforms,
-    read_json_object,
     write_transforms,
 )
 from nerfcli.cameras.frame import Capture
@@ -40,6 +41,7 @@ from nerfcli.convert.finding import (
     MODEL_FILES,
     by_suffix,
     find_blender,
+    find_camera_path,
     find_json,
     find_lines,
     find_llff,
@@ -189,6 +191,15 @@ FORMATS = (
         files=MODEL_FILES,
         write=write_colmap_text,
         losses=losses_colmap_text,
+    ),
+    Format(
+        "camera-path",
+        "a camera path of nerfstudio's viewer (read)",
+        "a file .json with a camera_path, or camera_path.json",
+        find_camera_path,
+        lambda path, given: parse_camera_path(path),
+        axes="opengl",
+        open_axes=True,
     ),
     Format(
         "transforms",

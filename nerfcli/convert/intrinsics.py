@@ -4,7 +4,7 @@ from pathlib import Path
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap_text import cameras_from_text
-from nerfcli.cameras.formats.transforms import read_json_object
+from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.convert.formats import Given, recognise
 from nerfcli.errors import UserError
 

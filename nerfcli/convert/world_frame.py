@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nerfcli.cameras.frame import Capture
+from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.cameras.world import moved_to_origin, transformed, turned_up
 from nerfcli.errors import UserError
+from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
 from nerfcli.scale.distances import known_distance, scale_from_distances
 from nerfcli.scale.estimate import ScaleEstimate
 from nerfcli.scale.gps import gps_positions, scale_from_gps
@@ -24,12 +25,15 @@ class WorldFrame:
         up: the axis that points up: x, y, z, -x, -y or -z.
         origin: centre-of-cameras, focus, or a place "x,y,z" of the old frame.
         scale: a number that lengths are multiplied by, or "gps" for metres by the positions in the photos' EXIF.
+        markers: ArUco markers in the photos, "DICTIONARY:SIDE", or a ChArUco board,
+            "DICTIONARY:COLUMNSxROWS:SQUARE:MARKER", with sides in metres: lengths become metres.
         distances: known ones, "A B METRES" with names of images or points x,y,z: lengths become metres.
     """
 
     up: str | None = None
     origin: str | None = None
     scale: str | None = None
+    markers: str | None = None
     distances: Sequence[str] = ()
 
 
@@ -56,14 +60,33 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Simil
 
 
 def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
+    given = {"--scale": wanted.scale, "--markers": wanted.markers, "--distance": wanted.distances or None}
+    if len(named := [name for name, value in given.items() if value is not None]) > 1:
+        raise UserError(f"{' and '.join(named)} are given", "give one of them: a scene has one scale", exit_code=2)
     if wanted.distances:
-        if wanted.scale is not None:
-            raise UserError(f"both --scale {wanted.scale} and --distance are given", "give one of them", exit_code=2)
         return scale_from_distances([known_distance(text, capture.frames) for text in wanted.distances])
+    frames = [frame for frame in capture.frames if frame.image is not None and frame.image.is_file()]
+    if wanted.markers is not None:
+        return _scale_from_markers(frames, wanted.markers)
     if wanted.scale == GPS:
-        frames = [frame for frame in capture.frames if frame.image is not None and frame.image.is_file()]
         return scale_from_gps(frames, gps_positions(frames)).estimate
     return None
+
+
+def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:
+    dictionary, *numbers = text.split(":")
+    try:
+        if len(numbers) == 1:
+            return scale_from_markers(frames, float(numbers[0]), dictionary=dictionary)
+        size, square, marker = numbers
+        columns, rows = (int(part) for part in size.split("x"))
+        return scale_from_charuco(frames, CharucoBoard(columns, rows, float(square), float(marker), dictionary))
+    except ValueError as error:
+        raise UserError(
+            f"--markers is {text!r}",
+            "expected markers DICT_4X4_50:0.05, or a ChArUco board DICT_5X5_100:7x5:0.04:0.03, sides in metres",
+            exit_code=2,
+        ) from error
 
 
 def _factor(text: str | None) -> float:

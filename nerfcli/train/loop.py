@@ -92,6 +92,8 @@ def train(
         f"{photos[0].frame.camera.width}x{photos[0].frame.camera.height} (1/{factor}), "
         f"{'unbounded' if unbounded else 'bounded'} scene, {settings.device}, {settings.threads} threads"
     )
+    if pool.without_ray:
+        notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
 
     fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings)
     totals = _Totals()

@@ -72,7 +72,8 @@ def downscaled_camera(camera: Camera, factor: float) -> Camera:
 class PixelPool:
     """All usable pixels of some photos, and the ray of each, in the training frame.
 
-    Bearings are kept once per camera, not per photo: photos that share intrinsics share them.
+    Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
+    pixels that the lens model has no direction for, which are left out.
     """
 
     def __init__(self, photos: Sequence[Photo], training_from_scene: Similarity, device: torch.device):
@@ -97,6 +98,7 @@ class PixelPool:
         self.first_bearing = torch.tensor([first_bearing[p.frame.camera] for p in photos], device=device)
 
         good_rays = dict(zip(first_bearing, valid, strict=True))
+        self.without_ray = sum(int((~good_rays[photo.frame.camera]).sum()) for photo in photos)
         usable = [
             good_rays[photo.frame.camera] if photo.used is None else good_rays[photo.frame.camera] & photo.used.ravel()
             for photo in photos

@@ -16,13 +16,13 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import parameter_names
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
+from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts, lost_to_pinhole
 from nerfcli.cameras.formats.transforms import (
     SPLITS,
     capture_on_disk,
     frames_on_disk,
     listed_frames,
-    read_json_object,
     refuse_twins,
     relative_path,
 )

@@ -58,6 +58,15 @@ def read_json(path: Path, expected: str) -> Any:
         raise malformed(str(path), f"not valid JSON: {error}", expected) from error
 
 
+def read_json_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises:
+        UserError: the file cannot be read, is no JSON, or holds something else than an object.
+    """
+    return record_of(read_json(path, "expected a JSON file"), str(path))
+
+
 def filled_lines(text: str) -> list[tuple[int, str]]:
     """Line numbers, from 1, and lines without the empty ones and the comments (#)."""
     lines = enumerate(text.splitlines(), start=1)

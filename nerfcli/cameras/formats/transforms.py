@@ -4,7 +4,6 @@ Poses in these files are world_from_cam with OpenGL axes. Their pixel positions 
 Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips.md and scripts/colmap2nerf.py.
 """
 
-import json
 import os
 from collections import Counter
 from contextlib import ExitStack
@@ -17,15 +16,15 @@ import numpy as np
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
+from nerfcli.cameras.formats.fields import malformed, read_json_object
 from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts
 from nerfcli.cameras.formats.ply import read_ply_points, write_ply
-from nerfcli.cameras.formats.poses import rigid_pose, rigid_poses
+from nerfcli.cameras.formats.poses import rigid_poses
 from nerfcli.cameras.formats.transforms_cameras import (
     CAMERA_KEYS,
     camera_of_record,
     given_size,
     lost_to_transforms,
-    malformed,
     record_of_camera,
 )
 from nerfcli.cameras.frame import Capture, Frame
@@ -146,49 +145,6 @@ def write_transforms(capture: Capture, path: Path) -> None:
         undo.pop_all()
 
 
-def read_camera_path(path: Path) -> tuple[Frame, ...]:
-    """The cameras of a transforms.json without its images, for rendering along them: `w` and `h` must be given.
-
-    Raises:
-        UserError: the file is malformed; file and field are named.
-    """
-    content = read_json_object(path)
-    frames = []
-    for index, record in enumerate(records_of(path, content)):
-        where = f"{path}: frames[{index}]"
-        size = given_size({**content, **record}, where)
-        if size is None:
-            raise malformed(where, "w and h are missing", "a camera path gives the size of its pictures in pixels")
-        camera = camera_of_record({**content, **record}, size, where)
-        name = str(record.get("file_path", f"frame_{index:04d}"))
-        pose = opencv_from_opengl_pose(rigid_pose(_matrix(record, where), f"{where}.transform_matrix"))
-        frames.append(Frame(name, camera, pose))
-    return tuple(frames)
-
-
-def read_json_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file.
-
-    Raises:
-        UserError: the file cannot be read, is no JSON, or holds something else than an object.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise malformed(str(path), error.strerror or str(error), "the file must be there and readable") from error
-    except UnicodeDecodeError as error:
-        raise malformed(str(path), f"not UTF-8 text (byte {error.start})", "expected a JSON file") from error
-    except json.JSONDecodeError as error:
-        what = f"not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
-        raise malformed(str(path), what, "the file is cut off or was edited by hand; write it again") from error
-    except (ValueError, RecursionError) as error:  # a number of thousands of digits, lists in lists in lists
-        what = f"not sensible JSON: {str(error)[:80]}"
-        raise malformed(str(path), what, "the file was changed; write it again") from error
-    if not isinstance(content, dict):
-        raise malformed(str(path), f"holds a {type(content).__name__}", "expected a JSON object {...}")
-    return content
-
-
 def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
     """The entries of the list `frames`.
 
@@ -250,8 +206,9 @@ def listed_frames(path: Path, content: dict[str, Any], measure: Measure | None, 
     merged = [{**content, **record} for record in records]
     wheres = [f"{path}: frames[{index}]" for index in range(len(records))]
     images, names = [], []
-    for record, where in zip(records, wheres, strict=True):
-        listed = _listed_path(record, where)
+    for index, (record, where) in enumerate(zip(records, wheres, strict=True)):
+        # The views of a camera path have no photo.
+        listed = _listed_path({"file_path": f"frame_{index:04d}", **record}, where)
         plain = listed.replace("\\", "/")
         ending = ""
         if not PurePosixPath(plain).suffix:

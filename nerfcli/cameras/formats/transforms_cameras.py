@@ -7,9 +7,9 @@ import math
 from typing import Any
 
 from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.limits import stated_camera
 from nerfcli.cameras.formats.losses import distortion, projection
-from nerfcli.errors import UserError
 
 # All the keys that are read here, of a frame or of the whole file.
 CAMERA_KEYS = frozenset(
@@ -133,11 +133,6 @@ def number(record: dict[str, Any], key: str, where: str) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:  # True at NaN
         raise malformed(where, f"{key} is {value!r:.80}", "expected a finite number")
     return float(value)
-
-
-def malformed(where: str, what: str, hint: str) -> UserError:
-    """The error that says where in a file what is wrong."""
-    return UserError(f"{where}: {what}", hint)
 
 
 def _focal(record: dict[str, Any], axis: str, size_px: int, where: str) -> float | None:
