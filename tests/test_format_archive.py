@@ -90,6 +90,7 @@ def test_arrays_of_other_writers_are_read(tmp_path, compress):
         ("camera_models", np.array(["PENTAGON"]), "camera 0: unknown camera model 'PENTAGON'"),
         ("camera_sizes", np.array([[2**60, 1]]), "camera 0: a picture of 1.15e"),
         ("camera_params", np.array([[500, np.nan, 320, 240]]), "camera 0: a parameter is NaN"),
+        ("camera_params", np.array([[500, 1e300, 320, 240]]), r"camera 0: camera parameters 500, 1e\+300, 320, 240"),
         ("world_from_cam", np.full((6, 4, 4), np.nan), r"world_from_cam\[0\]: holds a number that is not finite"),
         ("points", np.zeros((40, 2)), r"points: \(40, 2\) values"),
         ("points", np.full((40, 3), np.inf), "points: a position"),

@@ -187,6 +187,16 @@ def test_names_that_a_model_cannot_hold_are_refused(tmp_path, suffix, name):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("count", [2**20, 2**32, 2**62])
+def test_an_announced_count_is_not_believed(tmp_path, name, count):
+    write_colmap_binary(ring(CAMERAS["PINHOLE"]), tmp_path / "model")
+    path = tmp_path / "model" / name
+    path.write_bytes(count.to_bytes(8, "little") + path.read_bytes()[8:])
+    with pytest.raises(UserError, match=f"{name} is damaged: it announces {count} records"):
+        parse_colmap(tmp_path / "model")
+
+
 @pytest.mark.parametrize("suffix", WRITERS)
 def test_two_hundred_corruptions(tmp_path, suffix):
     capture = ring(CAMERAS["PINHOLE"], CAMERAS["OPENCV"], CAMERAS["RADIAL_FISHEYE"], num_points=12)
