@@ -8,6 +8,7 @@ order. g(rho) = rho A / B is the radius that the radial part alone gives to the 
 coordinates come first.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -139,8 +140,11 @@ class Distortion:
 
         The table ends where g first exceeds all goals, or at the reach. Where g does not come so far, it is its end.
         """
-        halves = 0.5 ** np.arange(1, 51)
-        ends = np.append(self.reach * (1 - halves), self.reach) if np.isfinite(self.reach) else 1 / halves
+        ends = 2.0 ** np.arange(-100, 101)
+        if self.reach < ends[-1]:
+            ends = np.concatenate(
+                [ends[ends < self.reach / 2], self.reach * (1 - 0.5 ** np.arange(1, 51)), [self.reach]]
+            )
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             high_enough = np.append(ends[:-1] * self._factor(ends[:-1] ** 2) >= goals.max(initial=0.0), True)
             end = ends[np.argmax(high_enough)]
@@ -155,7 +159,7 @@ class Distortion:
         Newton's method, which falls back on halving wherever it would leave the interval that holds the root: g grows
         in it, so that the root is the only one.
         """
-        radii, active = radii.copy(), np.arange(len(radii))
+        active, polished = np.arange(len(radii)), np.empty_like(radii)
         here, goal, low, high = radii, goals, np.zeros_like(radii), np.full_like(radii, end)
         for _ in range(MOST_STEPS):
             square = here * here
@@ -166,18 +170,18 @@ class Distortion:
                 moved = here - error / (factor + 2 * square * self._factor_slope(square))
             inside = (moved >= low) & (moved <= high)
             moved = np.where(inside, moved, (low + high) / 2)
-            radii[active] = moved
+            polished[active] = moved
             left = ~inside | (np.abs(moved - here) > LAST_STEP * moved)
             if not left.any():
                 break
             active, here, goal, low, high = active[left], moved[left], goal[left], low[left], high[left]
-        return radii
+        return polished
 
     def _invert_all(self, targets: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same as `invert` for all terms together, from the solution of the radial ones.
 
-        Three steps of Newton's method bring the weak tangential and prism terms of real lenses to rounding. What is left
-        then, near the reach or with strong terms, goes on by guarded steps from the start.
+        Three steps of Newton's method bring the weak tangential and prism terms of real lenses to rounding. What is
+        left then, near the reach or with strong terms, goes on by guarded steps from the start.
         """
         plane = start
         for _ in range(3):
@@ -249,7 +253,7 @@ def _first_root(coefficients: np.ndarray) -> float:
 
 
 def _size(vector: tuple[float, ...]) -> float:
-    return float(np.hypot(*vector)) if vector else 0.0
+    return math.hypot(*vector)
 
 
 def _radius(plane: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """How directions meet the plane, before any distortion: one class for each way that COLMAP's models know.
 
-A projection maps directions d = (x, y, z) in camera axes to a plane q with unit focal length; rho = |(x, y)| and theta is
-the angle between d and the optical axis. Coordinates come first: directions are (3, N), points of the plane (2, N).
+A projection maps directions d = (x, y, z) in camera axes to a plane q with unit focal length; rho = |(x, y)| and theta
+is the angle between d and the optical axis. Coordinates come first: directions are (3, N), points of the plane (2, N).
 Each class says which directions it `sees`; only of these are `plane` and the two Jacobians meant.
 """
 
@@ -76,9 +76,7 @@ class Equidistant:
 
     def directions(self, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         angle = np.sqrt(plane[0] ** 2 + plane[1] ** 2)
-        sine_over_angle = np.sin(angle) / np.where(angle > 0, angle, 1.0)
-        sine_over_angle = np.where(angle > 0, sine_over_angle, 1.0)
-        return np.stack([*(sine_over_angle * plane), np.cos(angle)]), angle < np.pi
+        return np.stack([*(_sine_over(angle) * plane), np.cos(angle)]), angle < np.pi
 
     def jacobian(self, directions: np.ndarray) -> np.ndarray:
         square = (directions**2).sum(axis=0)
@@ -112,8 +110,7 @@ class FieldOfView:
 
     def directions(self, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         angle = np.sqrt(plane[0] ** 2 + plane[1] ** 2) * abs(self.omega)
-        sine_over_angle = np.where(angle > 0, np.sin(angle) / np.where(angle > 0, angle, 1.0), 1.0)
-        directions, _ = _unit(sine_over_angle / self._growth() * plane, np.cos(angle))
+        directions, _ = _unit(_sine_over(angle) / self._growth() * plane, np.cos(angle))
         return directions, angle < np.pi / 2
 
     def jacobian(self, directions: np.ndarray) -> np.ndarray:
@@ -260,7 +257,7 @@ class Equirectangular:
         azimuth, elevation = 2 * np.pi * plane[0], np.pi * plane[1]
         level = np.cos(elevation)
         directions = np.stack([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)])
-        return directions, (np.abs(plane) <= 0.5).all(axis=0)
+        return directions, np.asarray((np.abs(plane) <= 0.5).all(axis=0))
 
     def jacobian(self, directions: np.ndarray) -> np.ndarray:
         x, y, z = directions
@@ -276,7 +273,7 @@ class Equirectangular:
 def _unit(plane: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The unit directions along (plane, z), and whether their length is a number."""
     length = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + z * z)
-    return np.stack([*(plane / length), z / length]), np.isfinite(length)
+    return np.stack([*(plane / length), z / length]), np.asarray(np.isfinite(length))
 
 
 def _jacobian(factor: np.ndarray, bend: np.ndarray, xy: np.ndarray, *, by_z: np.ndarray) -> np.ndarray:
@@ -288,13 +285,20 @@ def _jacobian(factor: np.ndarray, bend: np.ndarray, xy: np.ndarray, *, by_z: np.
     )
 
 
+def _sine_over(angle: np.ndarray) -> np.ndarray:
+    """sin(angle) / angle, 1 at 0."""
+    safe = np.where(angle > 0, angle, 1.0)
+    return np.where(angle > 0, np.sin(safe) / safe, 1.0)
+
+
 def _angle_over_rho(directions: np.ndarray) -> np.ndarray:
     """theta / rho of directions of any length; 1 / z on the optical axis."""
     rho = np.sqrt(directions[0] ** 2 + directions[1] ** 2)
     on_axis = rho == 0
     if not on_axis.any():
         return np.arctan2(rho, directions[2]) / rho
-    return np.where(on_axis, 1 / directions[2], np.arctan2(rho, directions[2]) / np.where(on_axis, 1.0, rho))
+    angle = np.where(on_axis, 1.0, np.arctan2(rho, directions[2]))
+    return angle / np.where(on_axis, directions[2], rho)
 
 
 def _angle_bend(directions: np.ndarray) -> np.ndarray:

@@ -12,6 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from nerfcli.errors import UserError
 
+# Below this angle in radians, differences of nearly equal terms give way to their series; five terms are exact there.
+SERIES_BELOW = 0.25
+
 
 def inverse(b_from_a: np.ndarray) -> np.ndarray:
     """The inverse `a_from_b` of rigid transforms (..., 4, 4), by transposing the rotation: no linear solve."""
@@ -74,6 +77,65 @@ def quaternion_from_rotation(rotation: np.ndarray) -> np.ndarray:
     rotation = np.asarray(rotation, dtype=np.float64)
     xyzw = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(canonical=True)
     return xyzw[:, [3, 0, 1, 2]].reshape(*rotation.shape[:-2], 4)
+
+
+def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
+    """exp: rotations (..., 3, 3) about the axes of vectors (..., 3), by their lengths in radians.
+
+    Orthonormal to rounding at any length; near 0 each entry keeps its relative accuracy.
+    """
+    vector = np.asarray(vector, dtype=np.float64)
+    half = np.linalg.norm(vector, axis=-1, keepdims=True) / 2
+    return rotation_from_quaternion(np.concatenate([np.cos(half), np.sinc(half / np.pi) * vector / 2], axis=-1))
+
+
+def vector_from_rotation(rotation: np.ndarray) -> np.ndarray:
+    """log: the vector (..., 3) along the axis, as long as the angle in [0, pi], of rotations (..., 3, 3).
+
+    It goes through the quaternion, whose parts w and |(x, y, z)| are cosine and sine of half the angle: one of them
+    always fixes the angle to rounding, at pi too. There the axis and its opposite are the same rotation, and rounding
+    chooses between them.
+    """
+    wxyz = quaternion_from_rotation(rotation)
+    sine = np.linalg.norm(wxyz[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, wxyz[..., :1])
+    return wxyz[..., 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 2.0)
+
+
+def transform_from_twist(twist: np.ndarray) -> np.ndarray:
+    """exp of SE(3): the rigid motions (..., 4, 4) of twists (..., 6), translational part u first, then rotational w.
+
+    The rotation is exp(w) and the translation V u with V = 1 + b W + c W^2, W = w x, b = (1 - cos a) / a^2,
+    c = (a - sin a) / a^3, a = |w|: a screw at constant speed, followed for a unit of time.
+
+    Source: Murray, Li and Sastry 1994, A mathematical introduction to robotic manipulation, eq. 2.36.
+    """
+    twist = np.asarray(twist, dtype=np.float64)
+    u, w = twist[..., :3], twist[..., 3:]
+    angle = np.linalg.norm(w, axis=-1, keepdims=True)
+    b = np.sinc(angle / (2 * np.pi)) ** 2 / 2
+    small = angle < SERIES_BELOW
+    safe = np.where(small, 1.0, angle)
+    c = np.where(small, _series(angle, (6, -120, 5040, -362880, 39916800)), (safe - np.sin(safe)) / safe**3)
+    turned = np.cross(w, u)
+    return from_parts(rotation_from_vector(w), u + b * turned + c * np.cross(w, turned))
+
+
+def twist_from_transform(b_from_a: np.ndarray) -> np.ndarray:
+    """log of SE(3): the twists (..., 6) of rigid motions (..., 4, 4), the inverse of `transform_from_twist`.
+
+    u = V^-1 t with V^-1 = 1 - W / 2 + d W^2, d = (1 - (a / 2) cot(a / 2)) / a^2; the angle a is in [0, pi].
+    """
+    b_from_a = np.asarray(b_from_a, dtype=np.float64)
+    w, translation = vector_from_rotation(b_from_a[..., :3, :3]), b_from_a[..., :3, 3]
+    angle = np.linalg.norm(w, axis=-1, keepdims=True)
+    small = angle < SERIES_BELOW
+    safe = np.where(small, 1.0, angle)
+    d = np.where(
+        small, _series(angle, (12, 720, 30240, 1209600, 47900160)), (1 - safe / (2 * np.tan(safe / 2))) / safe**2
+    )
+    turned = np.cross(w, translation)
+    return np.concatenate([translation - turned / 2 + d * np.cross(w, turned), w], axis=-1)
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
@@ -168,6 +230,11 @@ class Similarity:
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
             raise _bad_similarity("the rotation is not orthonormal with determinant 1")
         return Similarity(scale, rotation, translation)
+
+
+def _series(angle: np.ndarray, divisors: tuple[int, ...]) -> np.ndarray:
+    """1 / divisors[0] + angle^2 / divisors[1] + angle^4 / divisors[2] + ..."""
+    return np.polynomial.polynomial.polyval(angle**2, 1 / np.array(divisors, dtype=np.float64))
 
 
 def _bad_similarity(what: str) -> UserError:

@@ -1,0 +1,219 @@
+"""Round trips over the whole domain of every model, its end against brute force, and one direction for a pixel."""
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.distortion import Distortion
+from nerfcli.cameras.lens import DISTORTIONS
+from tests.lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions, random_pixels
+
+seeds = st.integers(0, 2**32 - 1)
+strengths = st.sampled_from([0.0, 1.0, 5.0, 20.0])
+models = st.sampled_from(MODELS)
+many = settings(max_examples=300, deadline=None)
+few = settings(max_examples=40, deadline=None)
+
+POLYNOMIAL = [model for model in MODELS if DISTORTIONS[model]]
+
+
+def distortion_of(camera: Camera) -> tuple[Distortion, ...]:
+    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    return tuple(
+        Distortion(**{term: tuple(values[name] for name in names) for term, names in group.items()})
+        for group in DISTORTIONS[camera.model]
+    )
+
+
+def test_every_model_of_colmap_has_its_lens():
+    assert set(MODELS) == set(pycolmap.CameraModelId.__members__) - {"INVALID"}
+    for model in MODELS:
+        used = {name for group in DISTORTIONS[model] for names in group.values() for name in names}
+        other = {"f", "fx", "fy", "cx", "cy", "w", "h", "omega", "alpha", "beta"} | ({"k"} if not used else set())
+        assert used <= set(parameter_names(model)) <= used | other
+
+
+@given(model=models, seed=seeds, strength=strengths)
+@many
+def test_projecting_a_bearing_gives_the_pixel_in_and_around_the_picture(model, seed, strength):
+    rng = np.random.default_rng(seed)
+    camera, pixels = random_camera(model, rng, strength=strength), random_pixels(rng)
+    directions, valid = camera.bearings(pixels)
+    again, seen = camera.project(directions[valid])
+    assert seen.all()
+    # Only where a lens spreads 1e-6 rad over a pixel, far out of the picture, is a direction in float64 too coarse.
+    px_per_rad = np.linalg.svd(camera.project_jacobian(directions[valid])[0], compute_uv=False)[:, 0]
+    assert (np.abs(again - pixels[valid]).max(axis=1) <= np.maximum(1e-9, 1e-15 * px_per_rad)).all()
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=0, atol=4e-16)
+    np.testing.assert_array_equal(directions[~valid], np.broadcast_to([0, 0, 1], ((~valid).sum(), 3)))
+
+
+@given(model=models, seed=seeds, strength=strengths)
+@many
+def test_the_direction_that_made_a_pixel_is_the_one_found(model, seed, strength):
+    """Over the whole domain: a pixel has one direction, and it is never another root."""
+    rng = np.random.default_rng(seed)
+    camera, directions = random_camera(model, rng, strength=strength), random_directions(rng)
+    pixels, seen = camera.project(directions)
+    # Beyond, rounding of the pixel alone moves the direction; closer to the turn than this, too.
+    weakest = np.linalg.svd(camera.project_jacobian(directions)[0], compute_uv=False)[:, 1]
+    sharp = seen & (np.abs(pixels) < 1e5).all(axis=1) & (weakest > 1e-3 * camera.focal_px)
+    found, valid = camera.bearings(pixels[sharp])
+    assert valid.all()
+    np.testing.assert_allclose(found, directions[sharp], rtol=0, atol=1e-9)
+
+
+@given(model=st.sampled_from(POLYNOMIAL), seed=seeds, strength=strengths)
+@many
+def test_the_jacobian_keeps_its_sign_up_to_the_reach(model, seed, strength):
+    """Brute force: on 400 circles up to the reach the symmetric part of dF/dq is positive definite."""
+    camera = random_camera(model, np.random.default_rng(seed), strength=strength)
+    for distortion in distortion_of(camera):
+        radii = np.linspace(0, min(distortion.reach, 50.0), 400)[:, None] * (1 - 1e-9)
+        azimuths = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+        plane = np.stack([(radii * np.cos(azimuths)).ravel(), (radii * np.sin(azimuths)).ravel()])
+        jacobian = np.moveaxis(distortion.jacobian(plane), -1, 0)
+        smallest = np.linalg.eigvalsh((jacobian + np.swapaxes(jacobian, 1, 2)) / 2)[:, 0]
+        assert smallest.min() > -1e-6
+
+
+@given(model=st.sampled_from(POLYNOMIAL), seed=seeds, strength=strengths)
+@many
+def test_a_radial_distortion_reaches_exactly_to_where_its_radius_stops_growing(model, seed, strength):
+    """The first fall of g on a fine grid, or its pole, where the sign of g changes."""
+    camera = random_camera(model, np.random.default_rng(seed), strength=strength)
+    radial = Distortion(radial=distortion_of(camera)[0].radial, divisor=distortion_of(camera)[0].divisor)
+    step = 1e-4
+    radii = np.arange(0, 10, step)
+    heights = radial.apply(np.stack([radii, np.zeros_like(radii)]))[0]
+    falls = np.flatnonzero(np.diff(heights) <= 0)
+    if len(falls) and falls[0] > 0:
+        assert abs(radial.reach - radii[falls[0]]) <= 2 * step
+    else:
+        assert radial.reach > 10 - 2 * step
+
+
+@given(seed=seeds, strength=st.sampled_from([1.0, 5.0]))
+@few
+def test_tangential_terms_cost_little_of_the_domain(seed, strength):
+    """The proof of uniqueness is no excuse: of what has a positive determinant inside, 2 % of the radius at most."""
+    distortion = distortion_of(random_camera("OPENCV", np.random.default_rng(seed), strength=strength))[0]
+    radii = np.linspace(0, 3, 3000)[:, None]
+    azimuths = np.linspace(0, 2 * np.pi, 180, endpoint=False)
+    plane = np.stack([(radii * np.cos(azimuths)).ravel(), (radii * np.sin(azimuths)).ravel()])
+    (a, b), (c, d) = distortion.jacobian(plane).reshape(2, 2, *np.broadcast_shapes(radii.shape, azimuths.shape))
+    folded = np.flatnonzero((a * d - b * c <= 0).any(axis=1))
+    first = radii[folded[0], 0] if len(folded) else 3.0
+    assert distortion.reach > 0.98 * first - 1e-3
+
+
+def test_a_pixel_beyond_the_reach_is_invalid_with_tangential_terms_too():
+    """Against a brute search: no direction within reach comes near the pixels called invalid, and vice versa."""
+    camera = Camera("OPENCV", 1000, 800, (500.0, 500.0, 500.0, 400.0, -0.3, 0.02, 0.004, -0.003))
+    reach = distortion_of(camera)[0].reach
+    radii, azimuths = np.meshgrid(np.linspace(0, reach, 600), np.linspace(0, 2 * np.pi, 720, endpoint=False))
+    plane = np.stack([radii * np.cos(azimuths), radii * np.sin(azimuths)]).reshape(2, -1)
+    covered = distortion_of(camera)[0].apply(plane).T * 500 + (500, 400)
+    pixels = random_pixels(np.random.default_rng(3), 300, margin=0.0)
+    nearest = np.array([np.linalg.norm(covered - pixel, axis=1).min() for pixel in pixels])
+    _, valid = camera.bearings(pixels)
+    assert 50 < valid.sum() < 290
+    assert nearest[valid].max() < 4  # the grid's spacing in pixels
+    assert (nearest[~valid] > 1e-3).all()
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_FISHEYE", "FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"])
+def test_a_fisheye_of_200_degrees_sees_behind_its_image_plane(model):
+    """radius = f (theta + k1 theta^3 + ...), also at 100 degrees, where x / z has changed its sign."""
+    values = {"f": 300.0, "fx": 300.0, "fy": 300.0, "cx": 600.0, "cy": 450.0, "k1": 0.01, "k2": -0.001}
+    camera = Camera(model, WIDTH, HEIGHT, tuple(values.get(name, 0.0) for name in parameter_names(model)))
+    angle = np.radians([89.0, 90.0, 91.0, 100.0])
+    bend = (0.01, -0.001) if "k1" in parameter_names(model) else (0.0, 0.0)
+    radius = 300 * angle * (1 + bend[0] * angle**2 + bend[1] * angle**4)
+    points = np.stack([-np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)], axis=-1) * 7
+    pixels, valid = camera.project(points)
+    assert valid.all()
+    np.testing.assert_allclose(pixels, np.stack([600 - 0.6 * radius, 450 + 0.8 * radius], axis=1), rtol=0, atol=1e-10)
+    bearings, valid = camera.bearings(pixels)
+    assert valid.all()
+    np.testing.assert_allclose(bearings, points / 7, rtol=0, atol=1e-13)
+
+
+def test_a_plain_fisheye_ends_straight_behind():
+    camera = Camera("SIMPLE_FISHEYE", 1000, 1000, (100.0, 500.0, 500.0))
+    inside, outside = 500 + 100 * (np.pi - 1e-9), 500 + 100 * (np.pi + 1e-9)
+    directions, valid = camera.bearings(np.array([[inside, 500.0], [outside, 500.0]]))
+    np.testing.assert_array_equal(valid, [True, False])
+    np.testing.assert_allclose(directions[0], [1e-9, 0, -1], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("alpha", "beta"), [(0.0, 1.0), (0.3, 1.3), (0.5, 1.0), (0.7, 0.8), (1.0, 1.0)])
+def test_eucm_ends_where_its_source_says(alpha, beta):
+    """z > -w d: from the meridian's angle in closed form, tan^2 = (1 - w^2) / (w^2 beta)."""
+    camera = Camera("EUCM", WIDTH, HEIGHT, (200.0, 200.0, 600.0, 450.0, alpha, beta))
+    w = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+    end = np.pi - np.arctan2(np.sqrt(1 - w * w), w * np.sqrt(beta))
+    angle = np.array([end - 1e-6, end + 1e-6])[: 1 if end > np.pi - 1e-6 else 2]
+    _, valid = camera.project(np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1))
+    np.testing.assert_array_equal(valid, [True, False][: len(angle)])
+    if alpha > 0.5:  # the picture of the whole domain is a disc of this radius
+        rim = 200 / np.sqrt((2 * alpha - 1) * beta)
+        _, valid = camera.bearings(np.array([[600 + rim * (1 - 1e-9), 450], [600 + rim * (1 + 1e-9), 450]]))
+        np.testing.assert_array_equal(valid, [True, False])
+
+
+@pytest.mark.parametrize(("k", "rim"), [(-0.2, np.inf), (0.25, 2.0)])
+def test_the_division_model_ends_where_its_radius_turns(k, rim):
+    camera = Camera("SIMPLE_DIVISION", WIDTH, HEIGHT, (200.0, 600.0, 450.0, k))
+    radius = np.array([0.5, 1.9, 2.1, 5.0, 1e3])
+    directions, valid = camera.bearings(np.stack([600 + 200 * radius, np.full(5, 450)], axis=1))
+    np.testing.assert_array_equal(valid, radius < rim)
+    expected = np.stack([radius, 0 * radius, 1 + k * radius**2], axis=1)[valid]
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(directions[valid], expected, rtol=0, atol=1e-14)
+    assert (directions[valid, 2] < 0).any() == (k < 0)
+
+
+def test_the_fov_model_ends_at_90_degrees():
+    camera = Camera("FOV", WIDTH, HEIGHT, (300.0, 300.0, 600.0, 450.0, 0.9))
+    rim = 300 * np.pi / 2 / 0.9
+    directions, valid = camera.bearings(np.array([[600 + rim - 1e-6, 450.0], [600 + rim + 1e-6, 450.0]]))
+    np.testing.assert_array_equal(valid, [True, False])
+    assert 0 < directions[0, 2] < 1e-6
+
+
+def test_a_panorama_holds_every_direction_once():
+    camera = Camera("EQUIRECTANGULAR", 360, 180, (360.0, 180.0))
+    points = np.array([[0, 0, 1.0], [1, 0, 0], [-1, 0, 0], [0, 1, 1], [1e-9, 0, -1], [-1e-9, 0, -1]])
+    pixels, valid = camera.project(points)
+    assert valid.all()
+    expected = [[180, 90], [270, 90], [90, 90], [180, 135], [360, 90], [0, 90]]
+    np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-6)
+    _, valid = camera.bearings(np.array([[-0.1, 90], [360.1, 90], [10, -0.1], [10, 180.1], [0, 0], [360, 180]]))
+    np.testing.assert_array_equal(valid, [False, False, False, False, True, True])
+
+
+@given(
+    model=models,
+    seed=seeds,
+    wild=st.lists(st.floats(-1e29, 1e29, allow_subnormal=True), min_size=16, max_size=16),
+    mix=st.integers(0, 2**16 - 1),
+)
+@many
+def test_whatever_the_parameters_answers_are_finite_and_true(model, seed, wild, mix):
+    """Parameters up to 1e29, drawn one by one in place of sensible ones: nothing is raised, nothing is NaN."""
+    rng = np.random.default_rng(seed)
+    camera = random_camera(model, rng)
+    names = parameter_names(model)
+    params = [wild[i] if mix >> i & 1 and names[i][0] in "kps" else camera.params[i] for i in range(len(names))]
+    camera = Camera(model, WIDTH, HEIGHT, tuple(params))
+    pixels = random_pixels(rng, 50)
+    directions, valid = camera.bearings(pixels)
+    again, seen = camera.project(directions)
+    assert np.isfinite(directions).all()
+    assert np.isfinite(again).all()
+    np.testing.assert_allclose(again[valid & seen], pixels[valid & seen], rtol=0, atol=1e-9)
+    assert np.isfinite(camera.project(random_directions(rng))[0]).all()

@@ -1,0 +1,181 @@
+"""Derivatives of pixels and bearings against differences of sixth order and against what geometry demands."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nerfcli.cameras.camera import Camera
+from tests.lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions, random_pixels
+
+seeds = st.integers(0, 2**32 - 1)
+models = st.sampled_from(MODELS)
+many = settings(max_examples=150, deadline=None)
+
+# Central differences of sixth order: f'(0) = sum of weight * f(offset * step) / step.
+STENCIL = {-3: -1 / 60, -2: 3 / 20, -1: -3 / 4, 1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+
+
+def difference(evaluate: Callable[[float], tuple[np.ndarray, np.ndarray]], step: float) -> np.ndarray:
+    """The derivative at 0 of a function that also says where it is valid; NaN where some step is not."""
+    values = {offset: evaluate(offset * step) for offset in STENCIL}
+    derivative = sum(weight * values[offset][0] for offset, weight in STENCIL.items()) / step
+    return np.where(np.all([valid for _, valid in values.values()], axis=0)[:, None], derivative, np.nan)
+
+
+def assert_is_derivative(
+    answer: np.ndarray, evaluate: Callable[[float], tuple[np.ndarray, np.ndarray]], *, step: float, noise: float
+) -> None:
+    """The answer (N, columns) to 1e-8 of its largest entry, wherever halving the step says that the difference is true.
+
+    `noise` is the rounding of what is evaluated.
+    """
+    coarse, fine = difference(evaluate, step), difference(evaluate, step / 2)
+    tolerance = 1e-8 * max(np.nanmax(np.abs(fine), initial=0), 1e-3) + 4 * noise / step
+    trusted = np.abs(fine - coarse) < tolerance
+    assert trusted.mean() > 0.8
+    assert np.abs(answer - fine)[trusted].max(initial=0) <= tolerance
+
+
+def well_inside(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Points that are not close to where the model turns or goes to infinity."""
+    _, valid = camera.project(points)
+    singular = np.linalg.svd(camera.project_jacobian(points)[0], compute_uv=False)
+    singular *= np.linalg.norm(points, axis=1)[:, None]
+    return points[valid & (singular[:, 1] > 0.3 * camera.focal_px) & (singular[:, 0] < 3 * camera.focal_px)]
+
+
+@given(model=models, seed=seeds, strength=st.sampled_from([0.0, 1.0, 5.0]))
+@many
+def test_pixels_move_with_points_as_differences_say(model, seed, strength):
+    rng = np.random.default_rng(seed)
+    camera = random_camera(model, rng, strength=strength)
+    points = well_inside(camera, random_directions(rng))
+    if model == "EQUIRECTANGULAR":  # away from its seam, where x jumps by the width
+        points = points[np.abs(points[:, 0]) > 0.05]
+    by_point, _, valid = camera.project_jacobian(points)
+    assert valid.all()
+    for index, axis in enumerate(np.eye(3)):
+        assert_is_derivative(
+            by_point[:, :, index], lambda h, axis=axis: camera.project(points + h * axis), step=4e-3, noise=1e-12
+        )
+
+
+@given(model=models, seed=seeds, strength=st.sampled_from([0.0, 1.0, 5.0]))
+@many
+def test_pixels_move_with_parameters_as_differences_say(model, seed, strength):
+    rng = np.random.default_rng(seed)
+    camera = random_camera(model, rng, strength=strength)
+    points = well_inside(camera, random_directions(rng))
+    by_parameters = camera.project_jacobian(points)[1]
+    for index, value in enumerate(camera.params):
+        step = 2e-3 * max(abs(value), 0.02)
+        if model == "EUCM" and index == 4:
+            step = min(step, value / 4, (1 - value) / 4)
+
+        def changed(h: float, index: int = index, value: float = value) -> tuple[np.ndarray, np.ndarray]:
+            params = (*camera.params[:index], value + h, *camera.params[index + 1 :])
+            return Camera(model, WIDTH, HEIGHT, params).project(points)
+
+        assert_is_derivative(by_parameters[:, :, index], changed, step=step, noise=1e-12)
+
+
+@given(model=models, seed=seeds, exponent=st.integers(-120, 120))
+@many
+def test_a_pixel_does_not_move_along_its_ray_and_the_scale_of_the_scene_divides_out(model, seed, exponent):
+    """Euler: J(point) point = 0, and J(s point) = J(point) / s, across magnitudes."""
+    rng = np.random.default_rng(seed)
+    camera, scale = random_camera(model, rng), 10.0**exponent
+    points = well_inside(camera, random_directions(rng))
+    by_point, by_parameters, _ = camera.project_jacobian(points)
+    size = np.abs(by_point).max(axis=(1, 2), keepdims=True)
+    assert (np.abs(by_point @ points[:, :, None]) <= 1e-13 * size).all()
+    scaled, same, valid = camera.project_jacobian(scale * points)
+    assert valid.all()
+    assert (np.abs(scaled * scale - by_point) <= 1e-13 * size).all()
+    assert (np.abs(same - by_parameters) <= 1e-12 * np.abs(by_parameters).max(axis=(0, 1))).all()
+
+
+@given(model=models, seed=seeds)
+@many
+def test_bearings_turn_as_pixels_move(model, seed):
+    """J_project J_bearing = 1 on the plane normal to the direction, and differences of the bearings themselves."""
+    rng = np.random.default_rng(seed)
+    camera = random_camera(model, rng)
+    pixels = random_pixels(rng, 200, margin=0.0)
+    by_pixel, valid = camera.bearing_jacobian(pixels)
+    directions, _ = camera.bearings(pixels)
+    singular = np.linalg.svd(by_pixel, compute_uv=False) * camera.focal_px
+    kept = valid & (singular[:, 0] < 3) & (singular[:, 1] > 0.1)
+    by_pixel, directions, pixels = by_pixel[kept], directions[kept], pixels[kept]
+    product = camera.project_jacobian(directions)[0] @ by_pixel
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(2), product.shape), rtol=0, atol=1e-13)
+    assert np.abs(directions[:, None] @ by_pixel).max() < 1e-15
+    for index, axis in enumerate(np.eye(2)):
+        assert_is_derivative(
+            camera.focal_px * by_pixel[:, :, index],
+            lambda h, axis=axis: camera.bearings(pixels + camera.focal_px * h * axis),
+            step=2e-3,
+            noise=1e-15,
+        )
+
+
+def test_footprint_of_a_pinhole_is_cos_cubed_over_f_squared():
+    camera = Camera.pinhole(200, 100, 80.0)
+    pixels = random_pixels(np.random.default_rng(0), 50, margin=0.0) / (WIDTH, HEIGHT) * (200, 100)
+    cosine = camera.bearings(pixels)[0][:, 2]
+    footprint, valid = camera.pixel_footprint(pixels)
+    assert valid.all()
+    np.testing.assert_allclose(footprint, cosine**3 / 80**2, rtol=1e-13)
+
+
+def test_footprint_of_a_fisheye_is_sinc_over_f_squared_behind_the_camera_too():
+    camera = Camera("SIMPLE_FISHEYE", 1000, 1000, (200.0, 500.0, 500.0))
+    angle = np.radians([0.0, 1e-6, 1.0, 45.0, 90.0, 120.0, 170.0])
+    footprint, valid = camera.pixel_footprint(np.stack([500 + 200 * angle, np.full(7, 500)], axis=1))
+    assert valid.all()
+    np.testing.assert_allclose(footprint, np.sinc(angle / np.pi) / 200**2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "SIMPLE_FISHEYE", "SIMPLE_DIVISION", "EUCM"])
+def test_the_footprints_of_a_picture_add_up_to_its_solid_angle(model):
+    """All around 4 pi; a cap out to the angle a, 2 pi (1 - cos a). The midpoint rule leaves what the rim cuts."""
+    size, centre = 600, 300.0
+    if model == "EQUIRECTANGULAR":
+        camera, expected = Camera(model, size, size // 2, (size, size // 2)), 4 * np.pi
+    else:
+        extra = {"SIMPLE_FISHEYE": (), "SIMPLE_DIVISION": (-0.3,), "EUCM": (0.55, 1.1)}[model]
+        focal = (150.0, 150.0) if model == "EUCM" else (150.0,)
+        camera = Camera(model, size, size, (*focal, centre, centre, *extra))
+        rim, _ = camera.bearings(np.array([[centre + 290.0, centre]]))
+        expected = 2 * np.pi * (1 - rim[0, 2])
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1)
+    inside = (np.hypot(*(pixels - centre).T) < 290) | camera.is_spherical
+    footprint, valid = camera.pixel_footprint(pixels)
+    assert valid[inside].all()
+    np.testing.assert_allclose(footprint[inside].sum(), expected, rtol=3e-4)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_derivatives_are_finite_and_zero_where_nothing_is_seen(model):
+    camera = random_camera(model, np.random.default_rng(1))
+    points = np.array(
+        [[0, 0, 0], [np.nan, 0, 1], [np.inf, 0, 1], [0, 1, 0], [0, 0, -1], [0, 0, 1], [1e-200, 0, 1e-200]]
+    )
+    by_point, by_parameters, valid = camera.project_jacobian(points)
+    assert np.isfinite(by_point).all()
+    assert np.isfinite(by_parameters).all()
+    assert not valid[:3].any()
+    assert valid[5]
+    np.testing.assert_array_equal(by_point[~valid], 0)
+    np.testing.assert_array_equal(by_parameters[~valid], 0)
+    footprint, valid = camera.pixel_footprint(np.array([[np.nan, 0], [1e300, 0], [600, 450]]))
+    assert np.isfinite(footprint).all()
+    np.testing.assert_array_equal(footprint[~valid], 0)
+    assert not valid[0]
+    assert valid[2]
+    assert camera.project_jacobian(np.zeros((0, 3)))[1].shape == (0, 2, len(camera.params))
+    assert camera.bearing_jacobian(np.zeros((0, 2)))[0].shape == (0, 3, 2)
