@@ -29,6 +29,7 @@ def fly(world_from_cam: np.ndarray, count: int) -> np.ndarray:
 
     Velocities come from the parabola through three poses with centripetal times h_i (the root of the step's length):
     m_i = (h_i v_{i-1} + h_{i-1} v_i) / (h_{i-1} + h_i), and are cut to twice the smaller one of |v_{i-1}| and |v_i|.
+    Where moving outweighs turning, the camera so passes a pose along the bisector of the ways there and on.
     So the camera never flies past a pose and back: between poses on a line it moves along it one way, as it does
     between turns about one axis, and it never leaves the two poses of a piece by more than 2/3 of their distance.
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from nerfcli.cameras.rigid import Similarity
 
-# Hypotheses from three points each; with a third of outliers one in three is free of them.
-_TRIPLES = 500
+# Hypotheses from three points each; even where half of the points are outliers, one in eight is free of them.
+_TRIPLES = 200
 
-# Squared length of noise in three dimensions, in sigma^2 (chi^2 of 3): its median and its 99 % quantile.
-_MEDIAN, _QUANTILE_99 = 2.366, 11.345
+# Squared length of noise in three dimensions, in sigma^2 (chi^2 of 3): its median and its 99.9 % quantile.
+_MEDIAN, _QUANTILE_999 = 2.366, 16.266
 
 _PARAMETERS = 7
 
@@ -55,9 +55,9 @@ def align(x: np.ndarray, y: np.ndarray) -> Similarity:
 
 
 def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
-    """`align`, over the points that are within the 99 % quantile of the noise, which is estimated too.
+    """`align`, over the points that are within the 99.9 % quantile of the noise, which is estimated too.
 
-    It starts from the one of 500 alignments of three points each with the least median residual (Rousseeuw 1984), so
+    It starts from the one of 200 alignments of three points each with the least median residual (Rousseeuw 1984), so
     that up to half of the points may be wrong. Below 5 points nothing can be told apart, and all count. Deterministic.
 
     Args:
@@ -84,7 +84,7 @@ def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
     sigma = np.sqrt(least / _MEDIAN) * (1 + 5 / (count - _PARAMETERS / 3))
     follows = everywhere
     for _ in range(30):
-        now = _squared(best, x, y) <= _QUANTILE_99 * sigma**2 + 1e-18 * np.var(y)
+        now = _squared(best, x, y) <= _QUANTILE_999 * sigma**2 + 1e-18 * np.var(y)
         if now.sum() < half + 1 or np.array_equal(now, follows) or np.ptp(x[now], axis=0).max() == 0:
             break
         follows = now

@@ -11,6 +11,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.media.images import read_image
 from nerfcli.scale.corners import Side, scale_from_corners
+from nerfcli.scale.edges import refined_corners
 from nerfcli.scale.estimate import ScaleEstimate
 
 # OpenCV puts the centre of the top-left pixel at (0, 0).
@@ -46,7 +47,7 @@ class CharucoBoard:
 def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str) -> ScaleEstimate:
     """Metres per unit from ArUco markers, each of which is in the scene once (see `scale_from_corners`).
 
-    A marker that one photo shows twice is not used.
+    A marker that one photo shows twice is not used there, nor one whose edges are not seen.
 
     Args:
         frames: with their photos.
@@ -60,22 +61,21 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
     if not 0 < side < np.inf:
         raise UserError(f"markers with a side of {side:g} m", "expected a length in metres above 0")
     parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX  # near enough for `refined_corners`
     detector = cv2.aruco.ArucoDetector(_dictionary(dictionary), parameters)
     sightings: dict[Hashable, list[tuple[int, np.ndarray]]] = {}
     found: set[int] = set()
     for index, grey in _photos(frames):
         corners, numbers, _ = detector.detectMarkers(grey)
-        numbers = [] if numbers is None else np.ravel(numbers).tolist()
+        numbers = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
         times = Counter(numbers)
         found |= set(numbers)
         for number, four in zip(numbers, corners, strict=True):
-            for k, pixel in enumerate(np.reshape(four, (4, 2)) if times[number] == 1 else ()):
+            pixels = refined_corners(grey, np.reshape(four, (4, 2))) if times[number] == 1 else None
+            for k, pixel in enumerate(() if pixels is None else pixels):
                 sightings.setdefault((number, k), []).append((index, pixel + _OPENCV_PIXEL_CENTRE))
     sides = [
-        Side(f"marker {number}", (number, k), (number, (k + 1) % 4), side)
-        for number in sorted(found)
-        for k in range(4)
+        Side(f"marker {number}", (number, k), (number, (k + 1) % 4), side) for number in sorted(found) for k in range(4)
     ]
     return scale_from_corners(frames, sightings, sides, pattern=f"ArUco markers ({dictionary}, {side:g} m)")
 

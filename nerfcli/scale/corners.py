@@ -3,8 +3,10 @@
 Letters: a corner p is seen from camera centres c_i in unit directions d_i; a pixel there is 1 / f_i wide, in radians.
 """
 
+import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,8 +35,8 @@ class Side:
     metres: float
 
 
-# Where each corner was seen: the index of the frame, and the pixel (x, y) with pixel centres at 0.5.
-Sightings = Mapping[Hashable, Sequence[tuple[int, np.ndarray]]]
+# Where each corner was seen, whatever names it: the frame's index, and the pixel (x, y) with pixel centres at 0.5.
+Sightings = Mapping[Any, Sequence[tuple[int, np.ndarray]]]
 
 
 def scale_from_corners(
@@ -42,9 +44,9 @@ def scale_from_corners(
 ) -> ScaleEstimate:
     """Metres per unit: the median over all sides of known by triangulated length.
 
-    Its standard error is that of a median of as many independent errors as half the number of sides, since each corner
-    belongs to two or more, with their spread from the median absolute deviation. Errors that all sides share, as of a
-    wrong focal length, are not in it. The residuals are those of each name's mean side.
+    Its standard error is that of a median of as many independent errors as there are sides, with their spread from the
+    median absolute deviation: an error of a corner along one side of a square is none along the other one. Errors that
+    all sides share, as of a wrong focal length, are not in it. The residuals are those of each name's mean side.
 
     Args:
         frames: with their poses and lenses.
@@ -74,7 +76,7 @@ def scale_from_corners(
         named.setdefault(side.name, []).append(100 * (float(ratio) - 1))
     return ScaleEstimate(
         metres_per_unit=scale,
-        standard_error=_MEDIAN_PER_MEAN * deviation / np.sqrt(max(len(known) / 2, 1)),
+        standard_error=_MEDIAN_PER_MEAN * deviation / math.sqrt(len(known)),
         residuals=tuple((name, float(np.mean(values))) for name, values in named.items()),
         residual_unit="percent",
         source=f"{pattern}, {len(known)} sides",

@@ -1,9 +1,10 @@
 """Scale, and the place on Earth, from the GPS positions that cameras and phones write into their photos.
 
-GPS of phones is off by metres, and its errors last for minutes: it tells the scale of a street, not of a teapot.
+GPS of phones is off by metres, and its errors last for minutes: it tells the scale of a street, not of a teapot. Errors
+that wander as slowly as the photographer does pass for the walk in 1 to 4 of 100 captures, and no residual shows that.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,8 @@ Position = tuple[float, float, float | None]
 _SEMI_MAJOR = 6378137.0
 _FLATTENING = 1 / 298.257223563
 
-# The photos must be spread this many times as wide as the GPS is off; pure noise reaches 2 (see the tests).
+# The photos must be spread this many times as wide as the GPS is off; pure noise, of which a similarity fits a part,
+# reaches 1.7 with 6 photos and 1.2 with 20.
 _SPREAD_PER_NOISE = 3.0
 
 # Per coordinate, in metres: what is taken where the photos are too few to tell it. Smartphones under open sky are
@@ -107,7 +109,7 @@ def east_north_up(positions: Sequence[Position]) -> tuple[np.ndarray, tuple[floa
     return (earth - earth[0]) @ enu_from_ecef.T, reference
 
 
-def scale_from_gps(frames: Sequence[Frame], positions: dict[str, Position]) -> GpsFit:
+def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -> GpsFit:
     """Metres per unit from where the photos were taken.
 
     A similarity from camera centres to ENU metres, by least squares without outliers (`align_robustly`). The standard
@@ -144,8 +146,8 @@ def scale_from_gps(frames: Sequence[Frame], positions: dict[str, Position]) -> G
     if not spread >= _SPREAD_PER_NOISE * noise:
         how = "as the fit of the photos' poses tells" if told else f"as is taken for {int(keep.sum())} photos"
         raise UserError(
-            f"GPS tells no scale here: the photos are spread over {spread:.2g} m, and GPS is off by {noise:.2g} m, {how}",
-            f"the photos should be spread over {_SPREAD_PER_NOISE * noise:.2g} m at least; give a known distance instead",
+            f"GPS tells no scale: the photos are spread over {spread:.2g} m, and GPS is off by {noise:.2g} m, {how}",
+            f"a spread of {_SPREAD_PER_NOISE * noise:.2g} m at least is needed; give a known distance instead",
         )
     scale = fit.b_from_a.scale
     residuals = np.linalg.norm(fit.b_from_a.apply(x) - y, axis=1)
@@ -168,8 +170,9 @@ def _spans_a_plane(metres: np.ndarray, sigma: float) -> bool:
 
 
 def _jackknife(x: np.ndarray, y: np.ndarray) -> float:
-    """Standard error of the scale: sqrt((g - 1) / g sum (s_i - mean)^2), s_i without the i-th of g groups of neighbours.
+    """Standard error of the scale: sqrt((g - 1) / g sum (s_i - mean)^2), s_i without the i-th of g groups.
 
+    Groups are of neighbours, whose errors are alike.
     0 with fewer than 4 points, where leaving one out leaves too little.
 
     Source: Kuensch 1989, The jackknife and the bootstrap for general stationary observations, for the groups.

@@ -1,0 +1,269 @@
+"""nerfstudio's camera-path JSON against its definition, round trips, and what damaged files are told."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.camera_path import (
+    is_camera_path,
+    losses_camera_path,
+    parse_camera_path,
+    read_normalisation,
+    read_path,
+    write_camera_path,
+)
+from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.errors import BAD_INPUT, UserError
+
+# A camera at (1, 2, 3) that looks along -x with +z up; OpenGL axes: right +y, up +z, backward +x.
+OPENGL_POSE = [0.0, 0, 1, 1, 1, 0, 0, 2, 0, 1, 0, 3, 0, 0, 0, 1]
+OPENCV_POSE = [[0.0, 0, -1, 1], [1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]
+
+
+def content(**more: Any) -> dict[str, Any]:
+    view = {"camera_to_world": OPENGL_POSE, "fov": 60.0, "aspect": 1.0}
+    return {"camera_type": "perspective", "render_height": 48, "render_width": 64, "camera_path": [view, view], **more}
+
+
+def written(folder: Path, value: Any) -> Path:
+    path = folder / "path.json"
+    path.write_text(value if isinstance(value, str) else json.dumps(value), encoding="utf-8")
+    return path
+
+
+def nerfstudio_directions(kind: str, fov: float, pixels: np.ndarray, *, width: int, height: int) -> np.ndarray:
+    """Unit directions in OpenGL camera axes, as nerfstudio's Cameras make them: get_path_from_json, then its rays."""
+    focal = height / 2 / np.tan(fov * np.pi / 180 / 2)
+    fx, fy = (width / 2, height) if kind == "equirectangular" else (focal, focal)
+    x, y = (pixels[:, 0] - width / 2) / fx, -(pixels[:, 1] - height / 2) / fy
+    if kind == "perspective":
+        directions = np.stack([x, y, -np.ones_like(x)], axis=-1)
+    elif kind == "fisheye":
+        theta = np.sqrt(x**2 + y**2)
+        directions = np.stack([x * np.sin(theta) / theta, y * np.sin(theta) / theta, -np.cos(theta)], axis=-1)
+    else:
+        theta, phi = -np.pi * x, np.pi * (0.5 - y)
+        directions = np.stack([-np.sin(theta) * np.sin(phi), np.cos(phi), -np.cos(theta) * np.sin(phi)], axis=-1)
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("kind", ["perspective", "fisheye", "equirectangular"])
+def test_pixels_see_where_nerfstudio_says(tmp_path, kind):
+    """An independent implementation of its formulas, in world coordinates, off the axis and off the diagonal."""
+    frame = read_path(written(tmp_path, content(camera_type=kind))).frames[0]
+    np.testing.assert_allclose(frame.world_from_cam, OPENCV_POSE, rtol=0, atol=1e-15)
+    pixels = np.array([[3.5, 7.5], [60.0, 11.0], [32.5, 40.0], [20.0, 24.5]])
+    directions, valid = frame.camera.bearings(pixels)
+    assert valid.all()
+    expected = nerfstudio_directions(kind, 60.0, pixels, width=64, height=48)
+    world_from_opengl = np.array(OPENGL_POSE).reshape(4, 4)[:3, :3]
+    np.testing.assert_allclose(
+        directions @ frame.world_from_cam[:3, :3].T, expected @ world_from_opengl.T, rtol=0, atol=1e-12
+    )
+
+
+def test_the_fov_is_vertical_and_of_a_fisheye_only_a_name_for_its_focal_length(tmp_path):
+    perspective = read_path(written(tmp_path, content())).frames[0].camera
+    np.testing.assert_allclose(perspective.fov_deg[1], 60.0, rtol=0, atol=1e-9)
+    square = content(camera_type="fisheye", render_width=48)
+    square["camera_path"][0]["fov"] = 90.0
+    fisheye = read_path(written(tmp_path, square)).frames[0].camera
+    np.testing.assert_allclose(fisheye.fov_deg[1], math.degrees(2.0), rtol=0, atol=1e-6)  # 114.6
+
+
+@pytest.mark.parametrize(
+    ("more", "fps"),
+    [({"fps": 30, "seconds": 9.0}, 30.0), ({"seconds": 4.0}, 0.5), ({}, 24.0), ({"fps": None, "seconds": 1}, 2.0)],
+)
+def test_frames_per_second(tmp_path, more, fps):
+    assert read_path(written(tmp_path, content(**more))).fps == fps
+
+
+def test_a_path_is_told_from_other_files_and_parsed_as_a_capture(tmp_path):
+    assert is_camera_path(content())
+    assert not is_camera_path({"frames": [], "fl_x": 1.0})
+    nested = content(camera_type="Perspective", keyframes=[{"matrix": "[1, 2]"}])
+    nested["camera_path"][0]["camera_to_world"] = np.array(OPENGL_POSE).reshape(4, 4).tolist()
+    capture = parse_camera_path(written(tmp_path, nested))
+    assert [frame.name for frame in capture.frames] == ["frame_0000", "frame_0001"]
+    assert (capture.kind, capture.missing, capture.points.shape) == ("camera-path", (), (0, 3))
+    np.testing.assert_array_equal(capture.frames[0].world_from_cam, capture.frames[1].world_from_cam)
+
+
+def random_capture(rng: np.random.Generator, kind: str) -> Capture:
+    frames = []
+    for index in range(4):
+        pose = rigid.from_parts(Rotation.from_quat(rng.normal(size=4)).as_matrix(), 100 * rng.normal(size=3))
+        pinhole = Camera.pinhole(64, 48, 10.0 ** rng.uniform(0.5, 3))
+        camera = {
+            "perspective": pinhole,
+            "fisheye": Camera("OPENCV_FISHEYE", 64, 48, (*pinhole.params, 0, 0, 0, 0)),
+            "equirectangular": Camera("EQUIRECTANGULAR", 64, 48, (64, 48)),
+        }[kind]
+        frames.append(Frame(f"orbit_{index:04d}", camera, pose))
+    return Capture(tuple(frames), np.zeros((0, 3)), (), None, "path")
+
+
+@given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(["perspective", "fisheye", "equirectangular"]))
+@settings(max_examples=30, deadline=None)
+def test_round_trip(tmp_path_factory, seed, kind):
+    before = random_capture(np.random.default_rng(seed), kind)
+    assert losses_camera_path(before) == ()
+    path = tmp_path_factory.mktemp("trip") / "path.json"
+    write_camera_path(before, path, fps=12.5)
+    after = read_path(path)
+    assert after.fps == 12.5
+    for one, other in zip(after.frames, before.frames, strict=True):
+        np.testing.assert_allclose(one.world_from_cam, other.world_from_cam, rtol=0, atol=1e-13)
+        assert (one.camera.model, one.camera.width, one.camera.height) == (other.camera.model, 64, 48)
+        np.testing.assert_allclose(one.camera.params, other.camera.params, rtol=1e-13)
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert content["seconds"] == 4 / 12.5
+    assert [k["matrix"] for k in content["keyframes"]] == [v["camera_to_world"] for v in content["camera_path"]]
+
+
+def test_what_the_format_cannot_hold_is_told(tmp_path):
+    opencv = Camera("OPENCV", 64, 48, (50, 52, 33, 24, 0.1, 0, 0, 0))
+    frames = (
+        Frame("a.jpg", opencv, np.eye(4), image=Path("a.jpg"), mask=Path("m.png"), split="test"),
+        Frame("b", Camera.pinhole(64, 48, 50.0), np.eye(4)),
+        Frame("c", Camera.pinhole(128, 96, 100.0), np.eye(4)),
+        Frame("d", Camera("SIMPLE_RADIAL_FISHEYE", 64, 48, (50, 32, 24, 0.0)), np.eye(4)),
+    )
+    seen = Observations(np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64), np.zeros((1, 2)))
+    capture = Capture(
+        frames, np.ones((2, 3)), (), np.ones((4, 2)), "colmap", np.zeros((2, 3), dtype=np.uint8), seen, "metre"
+    )
+    assert losses_camera_path(capture) == (
+        "type of lens of 1 of 4 views",
+        "lens distortion of 1 of 4 views",
+        "principal point of 1 of 4 views",
+        "focal lengths that differ in x and y of 1 of 4 views",
+        "picture size of 1 of 4 views",
+        "photo of 1 of 4 views",
+        "mask of 1 of 4 views",
+        "split of 1 of 4 views",
+        "2 points",
+        "colours of 2 points",
+        "observations",
+        "depth bounds",
+        "the unit (metre)",
+    )
+    write_camera_path(capture, tmp_path / "path.json")
+    cameras = [frame.camera for frame in read_path(tmp_path / "path.json").frames]
+    assert {(camera.model, camera.width, camera.height) for camera in cameras} == {("PINHOLE", 64, 48)}
+    # The picture of twice the size has the same field of view.
+    np.testing.assert_allclose([camera.focal_px for camera in cameras], [51, 50, 50, 50], rtol=1e-13)
+    with pytest.raises(UserError, match="there is no view to write"):
+        write_camera_path(Capture((), np.zeros((0, 3)), (), None, "x"), tmp_path / "none.json")
+    assert not (tmp_path / "none.json").exists()
+
+
+def test_nerfstudios_normalisation_is_a_similarity(tmp_path):
+    """scale * (transform @ point), and for cameras the same with a rigid result."""
+    rotation = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
+    transform = np.concatenate([rotation, [[1.0], [2.0], [3.0]]], axis=1)
+    path = written(tmp_path, {"transform": transform.tolist(), "scale": 0.25})
+    point = np.array([5.0, -6.0, 7.0])
+    expected = 0.25 * (rotation @ point + [1, 2, 3])
+    np.testing.assert_allclose(read_normalisation(path).apply(point), expected, rtol=0, atol=1e-14)
+    for broken, what in (
+        ({"transform": transform.tolist()}, "scale is None"),
+        ({"transform": transform.tolist(), "scale": 0}, "scale is 0"),
+        ({"transform": transform[:2].tolist(), "scale": 1}, "transform is"),
+        ({"transform": transform[:, :3].tolist(), "scale": 1}, "transform has 9 numbers"),
+        ({"transform": (2 * transform).tolist(), "scale": 1}, "is no rotation"),
+    ):
+        with pytest.raises(UserError, match=what) as caught:
+            read_normalisation(written(tmp_path, broken))
+        assert "path.json" in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("more", "what"),
+    [
+        ({"camera_type": "vr180"}, "camera_type is 'vr180'"),
+        ({"camera_type": 3}, "camera_type is 3"),
+        ({"render_height": None}, "render_height is None"),
+        ({"render_height": 47.5}, "render_height is 47.5"),
+        ({"render_width": 0}, "render_width is 0"),
+        ({"render_width": 10**12}, r"render_width is 1e\+12"),
+        ({"render_width": True}, "render_width is True"),
+        ({"fps": 0}, "fps is 0"),
+        ({"fps": "30"}, "fps is '30'"),
+        ({"seconds": -1}, "seconds is -1"),
+        ({"camera_path": []}, "has no list camera_path"),
+        ({"camera_path": {"a": 1}}, "has no list camera_path"),
+        ({"camera_path": [3]}, r"camera_path\[0\] is 3"),
+    ],
+)
+def test_damaged_files_are_told_with_file_and_field(tmp_path, more, what):
+    with pytest.raises(UserError, match=what) as caught:
+        read_path(written(tmp_path, content(**more)))
+    assert "path.json" in caught.value.message
+    assert caught.value.exit_code == BAD_INPUT
+
+
+TRANSPOSED = np.array(OPENGL_POSE).reshape(4, 4).T.ravel().tolist()
+
+
+@pytest.mark.parametrize(
+    ("more", "what"),
+    [
+        ({"fov": None}, "fov is None"),
+        ({"fov": 0}, "fov is 0"),
+        ({"fov": 180}, "fov is 180"),
+        ({"fov": float("nan")}, "fov is nan"),
+        ({"camera_to_world": None}, "camera_to_world is None"),
+        ({"camera_to_world": OPENGL_POSE[:12]}, "camera_to_world has 12 numbers"),
+        ({"camera_to_world": [*OPENGL_POSE[:15], float("inf")]}, r"camera_to_world: \[15\] is inf"),
+        ({"camera_to_world": [*OPENGL_POSE[:15], 10**400]}, r"camera_to_world: \[15\] is 1000"),
+        ({"camera_to_world": ["0", *OPENGL_POSE[1:]]}, r"camera_to_world: \[0\] is '0'"),
+        ({"camera_to_world": [[1.0], [2.0, 3.0], [4.0]]}, "camera_to_world has 4 numbers"),
+        ({"camera_to_world": TRANSPOSED}, "its last row is 1, 2, 3, 1"),
+        ({"camera_to_world": [2.0, *OPENGL_POSE[1:]]}, "is no rotation"),
+        ({"camera_to_world": [0.0, 0, -1, *OPENGL_POSE[3:]]}, "mirrors the scene"),
+    ],
+)
+def test_damaged_views_are_told_with_their_number(tmp_path, more, what):
+    good = {"camera_to_world": OPENGL_POSE, "fov": 60.0}
+    with pytest.raises(UserError, match=what) as caught:
+        read_path(written(tmp_path, content(camera_path=[good, {**good, **more}])))
+    assert "path.json: camera_path[1]" in caught.value.message
+
+
+def test_two_hundred_corruptions_never_end_in_a_traceback(tmp_path):
+    """A cut, a changed byte, or a value of another kind: a path or a UserError that names the file."""
+    rng = np.random.default_rng(0)
+    whole = json.dumps(content(fps=24, seconds=1.0))
+    values = ["NaN", "-1e400", "1e308", "null", "[]", "{}", '"x"', "true", "9" * 400]
+    tokens = [i for i, c in enumerate(whole) if c in "0123456789" and whole[i - 1] in " ["]
+    refused = passed = 0
+    for trial in range(200):
+        at = int(rng.integers(len(whole)))
+        if trial % 3 == 0:
+            text = whole[:at]
+        elif trial % 3 == 1:
+            text = whole[:at] + chr(int(rng.integers(32, 127))) + whole[at + 1 :]
+        else:
+            start = tokens[int(rng.integers(len(tokens)))]
+            end = next(i for i in range(start, len(whole)) if whole[i] in ",]}")
+            text = whole[:start] + values[int(rng.integers(len(values)))] + whole[end:]
+        path = written(tmp_path, text)
+        try:
+            read_path(path)
+        except UserError as error:
+            refused += str(path) in error.message
+        else:
+            passed += 1
+    assert refused + passed == 200
+    assert passed < 50
