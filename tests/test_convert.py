@@ -391,6 +391,15 @@ def test_half_a_pixel_is_half_a_pixel(tmp_path, monkeypatch):
     assert loose.exit_code == 0
 
 
+@pytest.mark.parametrize("moved", ["max_deg", "max_centre_shift", "max_point_shift"])
+def test_poses_count_even_where_no_point_is_seen(moved, tmp_path):
+    wanted = Wanted(format_named("npz"))
+    checked = convert(capture_of([SQUARE]), tmp_path / "out.npz", source_format="made", wanted=wanted).verification
+    assert checked is not None
+    assert checked.holds
+    assert not replace(checked, **{moved: 1e-6}).holds
+
+
 def test_a_view_under_another_name_is_found(tmp_path, monkeypatch):
     source = npz_of(tmp_path, capture_of([SQUARE]))
     monkeypatch.setattr(transforms, "relative_path", lambda frame, folder: "photo 01.png")
