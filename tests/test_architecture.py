@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "field": {"kernels"},
     "scene": {"cameras", "media"},
     "poses": {"scene", "cameras", "media"},
+    "scale": {"cameras", "media"},
     "render": {"field", "kernels", "cameras"},
     "train": {"render", "field", "kernels", "scene", "cameras", "media"},
     "evaluate": {"render", "field", "scene", "cameras", "media"},

@@ -1,0 +1,111 @@
+"""The similarity that brings one set of points onto another: least squares, and least squares without outliers.
+
+Letters: x are the points of frame a and y those of frame b, with means mx and my; y = s R x + t + noise, and sigma is
+the noise's standard deviation per coordinate.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+
+import numpy as np
+
+from nerfcli.cameras.rigid import Similarity
+
+# Hypotheses from three points each; even where half of the points are outliers, one in eight is free of them.
+_TRIPLES = 200
+
+# Squared length of noise in three dimensions, in sigma^2 (chi^2 of 3): its median and its 99.9 % quantile.
+_MEDIAN, _QUANTILE_999 = 2.366, 16.266
+
+_PARAMETERS = 7
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A robust alignment: b_from_a, which points follow it (N,) bool, and sigma in units of b (NaN below 4 points)."""
+
+    b_from_a: Similarity
+    follows: np.ndarray
+    sigma: float
+
+
+def align(x: np.ndarray, y: np.ndarray) -> Similarity:
+    """The similarity b_from_a that minimises sum |y - (s R x + t)|^2.
+
+    With points on a line R is one of many, and with two points s is the ratio of their distances.
+
+    Args:
+        x, y: (N, 3), N >= 2.
+
+    Raises:
+        ValueError: fewer than two points, or all x at one place.
+
+    Source: Umeyama 1991, Least-squares estimation of transformation parameters between two point patterns.
+    """
+    mx, my = x.mean(axis=0), y.mean(axis=0)
+    variance = np.sum((x - mx) ** 2)
+    if len(x) < 2 or not variance > 0:
+        raise ValueError(f"align needs two points apart, got {len(x)} with a variance of {variance}")
+    u, d, vt = np.linalg.svd((y - my).T @ (x - mx))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * sign) @ vt
+    scale = float(d @ sign / variance)
+    return Similarity(scale, rotation, my - scale * rotation @ mx)
+
+
+def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
+    """`align`, over the points that are within the 99.9 % quantile of the noise, which is estimated too.
+
+    It starts from the one of 200 alignments of three points each with the least median residual (Rousseeuw 1984), so
+    that up to half of the points may be wrong. Below 5 points nothing can be told apart, and all count. Deterministic.
+
+    Args:
+        x, y: (N, 3), N >= 2.
+
+    Raises:
+        ValueError: see `align`.
+    """
+    count = len(x)
+    everywhere = np.ones(count, dtype=bool)
+    best = align(x, y)
+    if count < 5:
+        return Alignment(best, everywhere, _sigma(best, x, y))
+    half = (count + 4) // 2 - 1  # as many must agree: half of those that three points do not fix
+    least = np.partition(_squared(best, x, y), half)[half]
+    for triple in _triples(count):
+        if np.ptp(x[triple], axis=0).max() == 0:
+            continue
+        candidate = align(x[triple], y[triple])
+        median = np.partition(_squared(candidate, x, y), half)[half]
+        if median < least:
+            best, least = candidate, median
+    # Rousseeuw's correction for few points.
+    sigma = np.sqrt(least / _MEDIAN) * (1 + 5 / (count - _PARAMETERS / 3))
+    follows = everywhere
+    for _ in range(30):
+        now = _squared(best, x, y) <= _QUANTILE_999 * sigma**2 + 1e-18 * np.var(y)
+        if now.sum() < half + 1 or np.array_equal(now, follows) or np.ptp(x[now], axis=0).max() == 0:
+            break
+        follows = now
+        best = align(x[follows], y[follows])
+        sigma = max(_sigma(best, x[follows], y[follows]), sigma / 2)
+    best = align(x[follows], y[follows])
+    return Alignment(best, follows, _sigma(best, x[follows], y[follows]))
+
+
+def _squared(b_from_a: Similarity, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.sum((b_from_a.apply(x) - y) ** 2, axis=1)
+
+
+def _sigma(b_from_a: Similarity, x: np.ndarray, y: np.ndarray) -> float:
+    """From the residuals, for as many degrees of freedom as are left; NaN below 4 points."""
+    free = 3 * len(x) - _PARAMETERS
+    return float(np.sqrt(_squared(b_from_a, x, y).sum() / free)) if len(x) >= 4 else float("nan")
+
+
+def _triples(count: int) -> list[list[int]]:
+    if comb(count, 3) <= _TRIPLES:
+        return [list(triple) for triple in combinations(range(count), 3)]
+    rng = np.random.default_rng(0)
+    return [rng.choice(count, 3, replace=False).tolist() for _ in range(_TRIPLES)]

@@ -1,0 +1,141 @@
+"""Corners of printed patterns, from the photos to points of the scene, and the scale from their known distances.
+
+Letters: a corner p is seen from camera centres c_i in unit directions d_i; a pixel there is 1 / f_i wide, in radians.
+"""
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+from nerfcli.scale.estimate import ScaleEstimate
+
+# A corner counts if its directions differ by as much somewhere: with less its depth is hardly known.
+_LEAST_PARALLAX = np.radians(1.0)
+
+# Corners whose directions miss each other by more are wrong: a pattern that was moved, or that is there twice.
+_MOST_MISSED_PX = 5.0
+
+# Standard deviation over median absolute deviation, and of the median over that of the mean, of normal errors.
+_SIGMA_PER_MAD = 1.4826
+_MEDIAN_PER_MEAN = 1.2533
+
+
+@dataclass(frozen=True)
+class Side:
+    """Two corners of a printed pattern and their true distance in metres; `name` is what people know it by."""
+
+    name: str
+    first: Hashable
+    second: Hashable
+    metres: float
+
+
+# Where each corner was seen, whatever names it: the frame's index, and the pixel (x, y) with pixel centres at 0.5.
+Sightings = Mapping[Any, Sequence[tuple[int, np.ndarray]]]
+
+
+def scale_from_corners(
+    frames: Sequence[Frame], sightings: Sightings, sides: Sequence[Side], *, pattern: str
+) -> ScaleEstimate:
+    """Metres per unit: the median over all sides of known by triangulated length.
+
+    Its standard error is that of a median of as many independent errors as there are sides, with their spread from the
+    median absolute deviation: an error of a corner along one side of a square is none along the other one. Errors that
+    all sides share, as of a wrong focal length, are not in it. The residuals are those of each name's mean side.
+
+    Args:
+        frames: with their poses and lenses.
+        sightings: of the corners, through the photos.
+        sides: what is known.
+        pattern: for messages and the source, such as "ArUco markers of 0.05 m".
+
+    Raises:
+        UserError: no corner is seen in two photos, from places far enough apart, where its directions meet.
+    """
+    points, reasons = {}, []
+    for corner, seen in sightings.items():
+        point = _triangulated(frames, seen)
+        if isinstance(point, str):
+            reasons.append(point)
+        else:
+            points[corner] = point
+    known = [side for side in sides if side.first in points and side.second in points]
+    lengths = np.array([np.linalg.norm(points[side.first] - points[side.second]) for side in known])
+    if not len(lengths) or not lengths.min() > 0:
+        raise _no_scale(pattern, sightings, reasons)
+    metres = np.array([side.metres for side in known])
+    scale = float(np.median(metres / lengths))
+    deviation = _SIGMA_PER_MAD * float(np.median(np.abs(metres / lengths - scale)))
+    named: dict[str, list[float]] = {}
+    for side, ratio in zip(known, scale * lengths / metres, strict=True):
+        named.setdefault(side.name, []).append(100 * (float(ratio) - 1))
+    return ScaleEstimate(
+        metres_per_unit=scale,
+        standard_error=_MEDIAN_PER_MEAN * deviation / math.sqrt(len(known)),
+        residuals=tuple((name, float(np.mean(values))) for name, values in named.items()),
+        residual_unit="percent",
+        source=f"{pattern}, {len(known)} sides",
+    )
+
+
+def _triangulated(frames: Sequence[Frame], seen: Sequence[tuple[int, np.ndarray]]) -> np.ndarray | str:
+    """The point (3,) where the directions meet, or why there is none."""
+    rays = [(frames[index], *frames[index].camera.bearings(pixel)) for index, pixel in seen]
+    rays = [(frame, directions[0]) for frame, directions, valid in rays if valid[0]]
+    if len({frame.name for frame, _ in rays}) < 2:
+        return "seen in one photo only"
+    c = np.stack([frame.centre for frame, _ in rays])
+    d = np.stack([frame.world_from_cam[:3, :3] @ direction for frame, direction in rays])
+    f = np.array([frame.camera.focal_px for frame, _ in rays])
+    if (d @ d.T).min() > np.cos(_LEAST_PARALLAX):
+        return "seen from nearly the same direction only"
+    point, missed = nearest_to_rays(c, d, f)
+    if np.median(missed) > _MOST_MISSED_PX:
+        return f"its directions miss each other by {np.median(missed):.1f} px"
+    if np.median(np.sum((point - c) * d, axis=1)) <= 0:
+        return "its directions meet behind the cameras"
+    return point
+
+
+def nearest_to_rays(c: np.ndarray, d: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The point (3,) that appears nearest to where rays point, and by how many pixels each misses it, (n,).
+
+    p = argmin sum_i log(1 + e_i^2),  e_i = f_i |(1 - d_i d_i^T) (p - c_i)| / |p - c_i|
+
+    in pixels, by iteratively reweighted least squares; the logarithm (Cauchy) keeps a wrong ray from moving it much.
+
+    Args:
+        c, d: (n, 3) origins and unit directions, n >= 2, not all parallel.
+        f: (n,) pixels per radian.
+    """
+    across = np.eye(3) - d[:, :, None] * d[:, None, :]
+    weights, missed = np.ones(len(c)), np.zeros(len(c))
+    point = np.zeros(3)
+    for _ in range(30):
+        normal = np.einsum("n,nij->ij", weights, across)
+        point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, across, c))
+        offsets = point - c
+        per_length = f / np.maximum(np.linalg.norm(offsets, axis=1), 1e-150)
+        missed = per_length * np.linalg.norm(np.einsum("nij,nj->ni", across, offsets), axis=1)
+        weights = per_length**2 / (1 + missed**2)
+        weights /= weights.max()
+    return point, missed
+
+
+def _no_scale(pattern: str, sightings: Sightings, reasons: Sequence[str]) -> UserError:
+    if not sightings:
+        return UserError(
+            f"no photo shows the {pattern}", "check the dictionary and the size, and that the pattern is large enough"
+        )
+    photos = len({index for seen in sightings.values() for index, _ in seen})
+    most = max(set(reasons), key=reasons.count) if reasons else "no two corners of one side are known"
+    return UserError(
+        f"the {pattern} in {photos} photo{'s' if photos > 1 else ''} give no scale: of {len(sightings)} corners "
+        f"{len(reasons)} cannot be placed, mostly {most}",
+        "the pattern must lie still and be seen by two photos at least, from different directions",
+    )

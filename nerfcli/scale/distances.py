@@ -1,0 +1,113 @@
+"""Scale from distances that somebody measured: between two cameras, or between two points of the scene."""
+
+import math
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.names import frames_named
+from nerfcli.cameras.world import point_of
+from nerfcli.errors import UserError
+from nerfcli.scale.estimate import ScaleEstimate
+
+EXPECTED = (
+    'expected "A B METRES" with A and B names of images or points x,y,z, such as "a.jpg b.jpg 1.25" or '
+    '"0,0,0 1,0,0 0.3+-0.002"; quote names with spaces'
+)
+_POINT = re.compile(r"[^,]+,[^,]+,[^,]+")
+
+
+@dataclass(frozen=True)
+class KnownDistance:
+    """A distance in scene units and in metres.
+
+    Args:
+        name: what it is between, for people.
+        units: its length in the scene.
+        metres: its true length.
+        tolerance: standard error of `metres` in metres, or None where nobody said.
+    """
+
+    name: str
+    units: float
+    metres: float
+    tolerance: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.units) and self.units > 0):
+            raise UserError(f"{self.name}: the two places are the same in the scene", "measure between two others")
+        if not (math.isfinite(self.metres) and self.metres > 0):
+            raise UserError(f"{self.name}: a distance of {self.metres:g} m", "expected a length in metres above 0")
+        if self.tolerance is not None and not 0 < self.tolerance < self.metres:
+            raise UserError(
+                f"{self.name}: {self.metres:g} m +- {self.tolerance:g} m",
+                "expected a standard error above 0 and below the length",
+            )
+
+
+def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
+    """The distance that "A B METRES" or "A B METRES+-ERROR" tells; A and B are names of images or points x,y,z.
+
+    Raises:
+        UserError: something else, an unknown image, or a length that is none.
+    """
+    try:
+        first, second, length = shlex.split(text)
+        metres, *tolerance = (float(part) for part in length.replace("±", "+-").split("+-"))
+    except ValueError as error:
+        raise UserError(f"{text!r} is no known distance", EXPECTED) from error
+    if len(tolerance) > 1:
+        raise UserError(f"{text!r} is no known distance", EXPECTED)
+    a, b = (_place(place, frames) for place in (first, second))
+    units = float(np.linalg.norm(a - b))
+    return KnownDistance(f"{first} to {second}", units, metres, tolerance[0] if tolerance else None)
+
+
+def scale_from_distances(distances: Sequence[KnownDistance]) -> ScaleEstimate:
+    """Metres per unit by weighted least squares of the logarithm.
+
+    log s = sum_i w_i log(metres_i / units_i) / sum_i w_i,  w_i = (metres_i / tolerance_i)^2
+
+    In the logarithm every distance counts by its relative error, and scale and inverse scale are estimated alike.
+    Where not every distance has a tolerance all weights are 1.
+
+    Returns:
+        The standard error is, with tolerances, s / sqrt(sum w), times sqrt(chi^2 / (n - 1)) where that is above 1: the
+        distances then disagree by more than was said. Without tolerances it is the one of the mean, from the scatter
+        of the distances, and None of a single distance. It does not hold errors that all distances share.
+
+    Raises:
+        ValueError: no distance.
+    """
+    if not distances:
+        raise ValueError("scale_from_distances needs at least one distance")
+    logs = np.log([distance.metres / distance.units for distance in distances])
+    tolerances = [distance.tolerance for distance in distances]
+    told = np.array([t / d.metres for t, d in zip(tolerances, distances, strict=True) if t is not None])
+    weighted = len(told) == len(distances)
+    weights = told**-2.0 if weighted else np.ones(len(distances))
+    log_scale = float(weights @ logs / weights.sum())
+    scale = math.exp(log_scale)
+    free = len(distances) - 1
+    chi_squared = float(weights @ (logs - log_scale) ** 2)
+    scatter = math.sqrt(chi_squared / free / weights.sum()) if free else None
+    error = max(1 / math.sqrt(weights.sum()), scatter or 0.0) if weighted else scatter
+    count = f"{len(distances)} known distance{'s' if free else ''}"
+    return ScaleEstimate(
+        metres_per_unit=scale,
+        standard_error=None if error is None else scale * error,
+        residuals=tuple((d.name, 100 * (scale * d.units / d.metres - 1)) for d in distances),
+        residual_unit="percent",
+        source=count,
+    )
+
+
+def _place(text: str, frames: Sequence[Frame]) -> np.ndarray:
+    """The point x,y,z, or the centre of the camera with this name; a name wins."""
+    if _POINT.fullmatch(text) and all(frame.name != text for frame in frames):
+        return point_of(text, EXPECTED)
+    return frames_named(frames, [text])[0].centre

@@ -1,0 +1,185 @@
+"""Scale, and the place on Earth, from the GPS positions that cameras and phones write into their photos.
+
+GPS of phones is off by metres, and its errors last for minutes: it tells the scale of a street, not of a teapot. Errors
+that wander as slowly as the photographer does pass for the walk in up to 1 of 100 captures, and no residual shows that.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import centres_of
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.errors import UserError
+from nerfcli.media.images import read_exif
+from nerfcli.scale.alignment import align, align_robustly
+from nerfcli.scale.estimate import ScaleEstimate
+
+# Latitude and longitude in degrees, altitude in metres or None.
+Position = tuple[float, float, float | None]
+
+# WGS 84: semi-major axis in metres and flattening. Source: NIMA TR8350.2, table 3.1.
+_SEMI_MAJOR = 6378137.0
+_FLATTENING = 1 / 298.257223563
+
+# The photos must be spread this many times as wide as the GPS is off; pure noise, of which a similarity fits a part,
+# reaches 1.7 with 6 photos and 1.1 with 20.
+_SPREAD_PER_NOISE = 3.0
+
+# Per coordinate, in metres: what is taken where the photos are too few to tell it. Smartphones under open sky are
+# within 4.9 m. Source: gps.gov, "GPS accuracy", after van Diggelen & Enge 2015.
+_TYPICAL_NOISE = 3.0
+_ENOUGH_TO_TELL = 6
+
+# Photos are left out in at most this many groups of neighbours, since their errors are alike.
+_JACKKNIFE_GROUPS = 20
+
+
+@dataclass(frozen=True)
+class GpsFit:
+    """A capture on Earth.
+
+    Args:
+        estimate: of the scale; residuals in metres for every photo with GPS.
+        enu_from_world: to metres east, north and up of `reference`; None where the photos stand too nearly on a line to
+            tell how the world is turned about it.
+        reference: latitude and longitude in degrees and altitude in metres of the origin of ENU.
+        left_out: names of photos whose GPS is far off the others', and was not used.
+        spread: root mean square distance of the photos from their mean, metres.
+        noise: the GPS error, as a length in three dimensions, root mean square, metres.
+    """
+
+    estimate: ScaleEstimate
+    enu_from_world: Similarity | None
+    reference: tuple[float, float, float]
+    left_out: tuple[str, ...]
+    spread: float
+    noise: float
+
+
+def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
+    """What the photos' EXIF says, by the frames' names; photos without a position are left out.
+
+    Latitude 0 and longitude 0 is what some cameras write before they know.
+
+    Raises:
+        UserError: a photo cannot be read.
+    """
+    found = {frame.name: read_exif(frame.image).gps for frame in frames if frame.image is not None}
+    return {name: gps for name, gps in found.items() if gps is not None and gps[:2] != (0.0, 0.0)}
+
+
+def ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Earth-centred coordinates (N, 3) in metres, of positions (N,) on WGS 84 with heights above the ellipsoid.
+
+    x = (n + h) cos(lat) cos(lon), y = (n + h) cos(lat) sin(lon), z = ((1 - e^2) n + h) sin(lat),
+    n = a / sqrt(1 - e^2 sin^2(lat)), e^2 = f (2 - f).  Source: NIMA TR8350.2, eq. 4-14.
+    """
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    squared = _FLATTENING * (2 - _FLATTENING)
+    n = _SEMI_MAJOR / np.sqrt(1 - squared * np.sin(latitude) ** 2)
+    out = (n + height) * np.cos(latitude)
+    return np.stack(
+        [out * np.cos(longitude), out * np.sin(longitude), ((1 - squared) * n + height) * np.sin(latitude)], axis=-1
+    )
+
+
+def east_north_up(positions: Sequence[Position]) -> tuple[np.ndarray, tuple[float, float, float]]:
+    """Positions in metres east, north and up of the first one, (N, 3), and that one.
+
+    EXIF altitudes are above the sea, not above the ellipsoid; both are taken for one, which moves all alike. A photo
+    without altitude is taken to be at the median altitude of the others.
+    """
+    latitude, longitude = (np.array([position[i] for position in positions], dtype=np.float64) for i in (0, 1))
+    known = [position[2] for position in positions if position[2] is not None]
+    middle = float(np.median(known)) if known else 0.0
+    height = np.array([middle if position[2] is None else position[2] for position in positions])
+    earth = ecef(latitude, longitude, height)
+    lat, lon = np.radians(latitude[0]), np.radians(longitude[0])
+    enu_from_ecef = np.array(
+        [
+            [-np.sin(lon), np.cos(lon), 0.0],
+            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+        ]
+    )
+    reference = (float(latitude[0]), float(longitude[0]), float(height[0]))
+    return (earth - earth[0]) @ enu_from_ecef.T, reference
+
+
+def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -> GpsFit:
+    """Metres per unit from where the photos were taken.
+
+    A similarity from camera centres to ENU metres, by least squares without outliers (`align_robustly`). The standard
+    error is the jackknife's over up to 20 groups of neighbouring photos, or sigma / sqrt(sum |x - mean|^2) where that
+    is larger, with sigma the GPS noise per coordinate; it is 3 m at least with fewer than 6 photos.
+
+    Args:
+        frames: the cameras; those without a position are not used.
+        positions: by name, see `gps_positions`.
+
+    Raises:
+        UserError: fewer than two positions, cameras at one place, or photos that are not spread 3 times as wide as
+            their GPS is off; with numbers.
+    """
+    used = sorted((frame for frame in frames if frame.name in positions), key=lambda frame: frame.name)
+    if len(used) < 2:
+        raise UserError(
+            f"only {len(used)} of {len(frames)} photos with a pose have a GPS position in their EXIF",
+            "2 at least are needed for the scale and 3 for directions; give a known distance instead",
+        )
+    x = centres_of(used)
+    y, reference = east_north_up([positions[frame.name] for frame in used])
+    if not (np.ptp(x, axis=0).max() > 0 and np.ptp(y, axis=0).max() > 0):
+        which = "GPS positions" if np.ptp(x, axis=0).max() > 0 else "cameras"
+        raise UserError(
+            f"the {which} of all {len(used)} photos are the same", "no scale comes from that; give a known distance"
+        )
+    fit = align_robustly(x, y)
+    keep = fit.follows
+    told = int(keep.sum()) >= _ENOUGH_TO_TELL
+    sigma = fit.sigma if told else float(np.fmax(fit.sigma, _TYPICAL_NOISE))
+    spread = float(np.sqrt(np.mean(np.sum((y[keep] - y[keep].mean(axis=0)) ** 2, axis=1))))
+    noise = float(np.sqrt(3)) * sigma
+    if not spread >= _SPREAD_PER_NOISE * noise:
+        how = "as the fit of the photos' poses tells" if told else f"as is taken for {int(keep.sum())} photos"
+        raise UserError(
+            f"GPS tells no scale: the photos are spread over {spread:.2g} m, and GPS is off by {noise:.2g} m, {how}",
+            f"a spread of {_SPREAD_PER_NOISE * noise:.2g} m at least is needed; give a known distance instead",
+        )
+    scale = fit.b_from_a.scale
+    residuals = np.linalg.norm(fit.b_from_a.apply(x) - y, axis=1)
+    estimate = ScaleEstimate(
+        metres_per_unit=scale,
+        standard_error=max(_jackknife(x[keep], y[keep]), scale * sigma / (np.sqrt(keep.sum()) * spread)),
+        residuals=tuple((frame.name, float(r)) for frame, r in zip(used, residuals, strict=True)),
+        residual_unit="metre",
+        source=f"GPS of {int(keep.sum())} photos (EXIF)",
+    )
+    left_out = tuple(frame.name for frame, kept in zip(used, keep, strict=True) if not kept)
+    directions = fit.b_from_a if _spans_a_plane(scale * x[keep], sigma) else None
+    return GpsFit(estimate, directions, reference, left_out, spread, noise)
+
+
+def _spans_a_plane(metres: np.ndarray, sigma: float) -> bool:
+    """Whether points (N, 3) are as far off their best line as noise needs to be told from it."""
+    off = np.linalg.svd(metres - metres.mean(axis=0), compute_uv=False)[1] if len(metres) >= 3 else 0.0
+    return bool(off > _SPREAD_PER_NOISE * sigma)
+
+
+def _jackknife(x: np.ndarray, y: np.ndarray) -> float:
+    """Standard error of the scale: sqrt((g - 1) / g sum (s_i - mean)^2), s_i without the i-th of g groups.
+
+    Groups are of neighbours, whose errors are alike.
+    0 with fewer than 4 points, where leaving one out leaves too little.
+
+    Source: Kuensch 1989, The jackknife and the bootstrap for general stationary observations, for the groups.
+    """
+    if len(x) < 4:
+        return 0.0
+    groups = np.array_split(np.arange(len(x)), min(len(x), _JACKKNIFE_GROUPS))
+    left = [(np.delete(x, group, axis=0), np.delete(y, group, axis=0)) for group in groups]
+    scales = np.array([align(*pair).scale for pair in left if np.ptp(pair[0], axis=0).max() > 0])
+    return float(np.sqrt((len(groups) - 1) / len(groups) * np.sum((scales - scales.mean()) ** 2)))
