@@ -542,7 +542,8 @@ def test_views_are_written_and_rendered_from_again(finished, tmp_path):
         again = ("--cameras", tmp_path / "path" / name, "--outputs", "rgb", "-o", tmp_path / name)
         assert nerfcli("render", finished, *again).exit_code == 0
         for one, other in zip(views_of(tmp_path / "views"), views_of(tmp_path / name), strict=True):
-            assert one["camera"]["params"] == pytest.approx(other["camera"]["params"], rel=1e-12)
+            if name == "cameras.json":  # the other has square pixels only, and says so
+                assert one["camera"] == other["camera"]
             np.testing.assert_allclose(one["world_from_cam"], other["world_from_cam"], rtol=0, atol=1e-12)
 
 

@@ -160,7 +160,7 @@ def test_malformed_transforms_are_refused_with_file_and_field(tmp_path, change, 
     [
         (b'{"frames": [', "not valid JSON: Expecting value in line 1"),
         (b"", "not valid JSON"),
-        (b"[1, 2]", "holds a list"),
+        (b"[1, 2]", "is a list of 2"),
         (b"\xff\xfe\x00", "not UTF-8"),
     ],
 )

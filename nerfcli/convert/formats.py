@@ -136,7 +136,8 @@ def with_photos(capture: Capture, folder: Path) -> Capture:
     return replace(capture, frames=tuple(frames))
 
 
-def _measure(path: Path) -> tuple[int, int, int]:
+def measure(path: Path) -> tuple[int, int, int]:
+    """Width and height of a photo as it is shown, and its EXIF orientation."""
     exif = read_exif(path)
     return exif.width, exif.height, exif.orientation
 
@@ -206,7 +207,7 @@ FORMATS = (
         "transforms.json of nerfstudio and instant-ngp",
         "transforms.json",
         lambda path: find_json(path, opening="{", name="transforms.json"),
-        lambda path, given: parse_transforms(path, _measure),
+        lambda path, given: parse_transforms(path, measure),
         axes="opengl",
         open_axes=True,
         open_centre=True,
@@ -220,7 +221,7 @@ FORMATS = (
         "transforms_{train,val,test}.json of NeRF's Blender scenes",
         "transforms_train.json",
         find_blender,
-        lambda path, given: parse_blender(path, _measure),
+        lambda path, given: parse_blender(path, measure),
         axes="opengl",
         open_axes=True,
         files=("transforms_train.json", "transforms_val.json", "transforms_test.json"),
@@ -262,14 +263,14 @@ FORMATS = (
         "cameras of RealityScan or RealityCapture as CSV (read)",
         "a file .csv",
         by_suffix(".csv"),
-        lambda path, given: parse_reality_capture(path, _measure, images=given.images),
+        lambda path, given: parse_reality_capture(path, measure, images=given.images),
     ),
     Format(
         "bundler",
         "bundle.out of Bundler (read)",
         "a file .out, or bundle.out",
         by_suffix(".out", "bundle.out", "bundle/bundle.out"),
-        lambda path, given: parse_bundler(path, _measure, images=given.images),
+        lambda path, given: parse_bundler(path, measure, images=given.images),
         axes="opengl",
     ),
     Format(

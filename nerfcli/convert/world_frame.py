@@ -6,8 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.orientation import fit_to_picture
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.cameras.world import moved_to_origin, transformed, turned_up
+from nerfcli.convert.formats import measure
 from nerfcli.errors import UserError
 from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
 from nerfcli.scale.distances import known_distance, scale_from_distances
@@ -67,10 +69,17 @@ def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
         return scale_from_distances([known_distance(text, capture.frames) for text in wanted.distances])
     frames = [frame for frame in capture.frames if frame.image is not None and frame.image.is_file()]
     if wanted.markers is not None:
-        return _scale_from_markers(frames, wanted.markers)
+        return _scale_from_markers([_upright(frame) for frame in frames], wanted.markers)
     if wanted.scale == GPS:
         return scale_from_gps(frames, gps_positions(frames)).estimate
     return None
+
+
+def _upright(frame: Frame) -> Frame:
+    """The frame of the photo as it is shown, of one whose camera refers to the pixels as they are stored."""
+    assert frame.image is not None
+    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measure=measure)
+    return replace(frame, camera=camera, world_from_cam=pose)
 
 
 def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:
