@@ -35,7 +35,7 @@ from nerfcli.train.normalisation import training_frame
 from nerfcli.train.run_folder import append_log, describe_run, write_cameras
 from nerfcli.train.settings import TrainSettings
 
-COMMANDS = ("poses", "train", "evaluate", "render", "run", "info")
+COMMANDS = ("poses", "train", "evaluate", "render", "run", "info", "convert")
 USAGE = 2
 README = Path(__file__).parent.parent / "README.md"
 # Enough for a command that trains to do everything that it does.
@@ -122,6 +122,11 @@ def check_that_it_parses(line: str) -> None:
         if words[1:] not in (["--help"], ["--version"]) and "--help" not in words:
             group: Any = typer.main.get_command(cli.app)
             group.commands[words[1]].make_context(words[1], words[2:])
+
+
+def needed(command: str, folder: Path) -> tuple[Any, ...]:
+    """What a command asks for besides its input."""
+    return (folder / "out.npz", "--to", "npz") if command == "convert" else ()
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -220,7 +225,7 @@ def test_wrong_usage_is_exit_code_2_and_names_the_value(line, named):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_missing_path_is_told_in_two_lines(command, tmp_path):
-    result = nerfcli(command, tmp_path / "nö such")
+    result = nerfcli(command, tmp_path / "nö such", *needed(command, tmp_path))
     assert result.exit_code == BAD_INPUT
     assert "nö such" in error_of(result)[0]
     assert listing(tmp_path) == {}
@@ -229,7 +234,7 @@ def test_a_missing_path_is_told_in_two_lines(command, tmp_path):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_an_empty_folder_is_told_in_two_lines(command, tmp_path):
     (tmp_path / "empty").mkdir()
-    result = nerfcli(command, tmp_path / "empty")
+    result = nerfcli(command, tmp_path / "empty", *needed(command, tmp_path))
     assert result.exit_code == BAD_INPUT
     assert "empty" in error_of(result)[0]
     assert listing(tmp_path) == {}
@@ -238,7 +243,7 @@ def test_an_empty_folder_is_told_in_two_lines(command, tmp_path):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_file_instead_of_a_folder_is_told_in_two_lines(command, tmp_path):
     (tmp_path / "file.txt").write_text("hello")
-    result = nerfcli(command, tmp_path / "file.txt")
+    result = nerfcli(command, tmp_path / "file.txt", *needed(command, tmp_path))
     assert result.exit_code == BAD_INPUT
     assert "file.txt" in error_of(result)[0]
     assert listing(tmp_path) == {"file.txt": b"hello"}
@@ -415,8 +420,8 @@ def test_many_inputs_share_one_output_folder(capture, tmp_path):
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("stdin", ["", "\n\n"])
-def test_an_empty_batch_is_told(command, stdin):
-    result = nerfcli(command, "-", stdin=stdin)
+def test_an_empty_batch_is_told(command, stdin, tmp_path):
+    result = nerfcli(command, "-", *needed(command, tmp_path), stdin=stdin)
     assert result.exit_code == BAD_INPUT
     assert "no path came on standard input" in error_of(result)[0]
 

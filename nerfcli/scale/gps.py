@@ -1,11 +1,7 @@
 """Scale, and the place on Earth, from the GPS positions that cameras and phones write into their photos.
 
 GPS of phones is off by metres, and its errors last for minutes: it tells the scale of a street, not of a teapot. Errors
-<<<<<<< HEAD
-that wander as slowly as the photographer does pass for the walk in 1 to 4 of 100 captures, and no residual shows that.
-=======
 that wander as slowly as the photographer does pass for the walk in up to 1 of 100 captures, and no residual shows that.
->>>>>>> paths
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,11 +25,7 @@ _SEMI_MAJOR = 6378137.0
 _FLATTENING = 1 / 298.257223563
 
 # The photos must be spread this many times as wide as the GPS is off; pure noise, of which a similarity fits a part,
-<<<<<<< HEAD
-# reaches 1.7 with 6 photos and 1.2 with 20.
-=======
 # reaches 1.7 with 6 photos and 1.1 with 20.
->>>>>>> paths
 _SPREAD_PER_NOISE = 3.0
 
 # Per coordinate, in metres: what is taken where the photos are too few to tell it. Smartphones under open sky are
