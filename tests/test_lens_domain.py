@@ -28,6 +28,15 @@ def distortion_of(camera: Camera) -> tuple[Distortion, ...]:
     )
 
 
+def assert_seen_at(camera: Camera, directions: np.ndarray, pixels: np.ndarray) -> None:
+    """All directions are seen, to 1e-9 px at their pixels."""
+    again, seen = camera.project(directions)
+    assert seen.all()
+    # Only where a lens spreads 4e-6 rad over a pixel, far out of the picture, is a direction in float64 too coarse.
+    px_per_rad = np.linalg.svd(camera.project_jacobian(directions)[0], compute_uv=False)[:, 0]
+    assert (np.abs(again - pixels).max(axis=1) <= np.maximum(1e-9, 4e-15 * px_per_rad)).all()
+
+
 def test_every_model_of_colmap_has_its_lens():
     assert set(MODELS) == set(pycolmap.CameraModelId.__members__) - {"INVALID"}
     for model in MODELS:
@@ -42,11 +51,7 @@ def test_projecting_a_bearing_gives_the_pixel_in_and_around_the_picture(model, s
     rng = np.random.default_rng(seed)
     camera, pixels = random_camera(model, rng, strength=strength), random_pixels(rng)
     directions, valid = camera.bearings(pixels)
-    again, seen = camera.project(directions[valid])
-    assert seen.all()
-    # Only where a lens spreads 1e-6 rad over a pixel, far out of the picture, is a direction in float64 too coarse.
-    px_per_rad = np.linalg.svd(camera.project_jacobian(directions[valid])[0], compute_uv=False)[:, 0]
-    assert (np.abs(again - pixels[valid]).max(axis=1) <= np.maximum(1e-9, 1e-15 * px_per_rad)).all()
+    assert_seen_at(camera, directions[valid], pixels[valid])
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=0, atol=4e-16)
     np.testing.assert_array_equal(directions[~valid], np.broadcast_to([0, 0, 1], ((~valid).sum(), 3)))
 
@@ -64,6 +69,21 @@ def test_the_direction_that_made_a_pixel_is_the_one_found(model, seed, strength)
     found, valid = camera.bearings(pixels[sharp])
     assert valid.all()
     np.testing.assert_allclose(found, directions[sharp], rtol=0, atol=1e-9)
+
+
+def test_a_direction_next_to_the_pole_of_a_rational_model_is_found():
+    """0.3 % from the pole F magnifies the rounding of its own argument beyond that of its value."""
+    radial, divisor = (0.2131718564, 0.0704780748, -0.0059814991), (0.0065467647, 0.0167121516, -0.0015507858)
+    tangential = (-0.0090150200, 0.0149705343)
+    params = (735.6, 707.0, 600.0, 450.0, *radial[:2], *tangential, radial[2], *divisor)
+    camera = Camera("FULL_OPENCV", WIDTH, HEIGHT, params)
+    directions = np.array([[0.17, 0.95, 0.257], [0.1696319, 0.95144373, 0.25686544], [-0.2, 0.94, 0.257]])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    pixels, seen = camera.project(directions)
+    found, valid = camera.bearings(pixels)
+    assert seen.all()
+    assert valid.all()
+    np.testing.assert_allclose(found, directions, rtol=0, atol=1e-14)
 
 
 @given(model=st.sampled_from(POLYNOMIAL), seed=seeds, strength=strengths)
@@ -212,8 +232,6 @@ def test_whatever_the_parameters_answers_are_finite_and_true(model, seed, wild, 
     camera = Camera(model, WIDTH, HEIGHT, tuple(params))
     pixels = random_pixels(rng, 50)
     directions, valid = camera.bearings(pixels)
-    again, seen = camera.project(directions)
     assert np.isfinite(directions).all()
-    assert np.isfinite(again).all()
-    np.testing.assert_allclose(again[valid & seen], pixels[valid & seen], rtol=0, atol=1e-9)
+    assert_seen_at(camera, directions[valid], pixels[valid])
     assert np.isfinite(camera.project(random_directions(rng))[0]).all()

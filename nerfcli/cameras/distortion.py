@@ -195,8 +195,12 @@ class Distortion:
 
     def _meets(self, targets: np.ndarray, plane: np.ndarray) -> np.ndarray:
         """Whether points lie within reach and F moves them to their targets; (N,) bool, False at NaN."""
-        # Rounding of F itself is a few 1e-16 of its largest term.
-        close = _radius(self.apply(plane) - targets) <= 1e-13 * (1 + _radius(targets))
+        off = self.apply(plane) - targets
+        close = _radius(off) <= 1e-13 * (1 + _radius(targets))
+        # Next to a pole F magnifies the rounding of the point itself: there, no step may be left that would count.
+        far = np.flatnonzero(~close)
+        step = _solve(self.jacobian(plane[:, far]), off[:, far])
+        close[far] = _radius(step) <= 1e-14 * _radius(plane[:, far])
         return close & (_radius(plane) < self.reach)
 
     def _by_guarded_steps(self, targets: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -224,11 +228,11 @@ class Distortion:
         """No point within reach is moved farther from the centre than this."""
         if not np.isfinite(self.reach):
             return np.inf
-        square = self.reach**2
-        with np.errstate(divide="ignore"):
-            radial = self.reach * float(self._factor(np.array(square)))
-        others = 3 * _size(self.tangential) + _size(self.prism) + _size(self.prism_fourth) * square
-        return (abs(radial) + others * square) * (1 + 1e-9)
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            square = np.array(self.reach) ** 2
+            radial = self.reach * self._factor(square)
+            others = 3 * _size(self.tangential) + _size(self.prism) + _size(self.prism_fourth) * square
+            return float((np.abs(radial) + others * square) * (1 + 1e-9))
 
     def _pulled_back(self, plane: np.ndarray) -> np.ndarray:
         """Points beyond the reach, moved back along their radius to just within it."""

@@ -18,6 +18,9 @@ from nerfcli.cameras.projections import (
     Projection,
 )
 
+# A direction counts as the pixel's own only if it projects back onto it.
+MAX_MISMATCH_PX = 1e-3
+
 # The parameters of each model's distortions, by the name of the term: one group for F(q), a second for F2(F1(q)).
 # OpenCV's tangential terms are du = 2 p1 u v + p2 (s + 2 u^2), dv = 2 p2 u v + p1 (s + 2 v^2): the vector is (p2, p1).
 DISTORTIONS: dict[str, tuple[dict[str, tuple[str, ...]], ...]] = {
@@ -86,8 +89,10 @@ class Lens:
                 plane, found = distortion.invert(plane)
                 valid &= found
             directions, found = self.projection.directions(plane)
-            # Rounding may put a pixel at the very edge of the domain beyond it.
-            valid &= found & np.isfinite(directions).all(axis=0) & self.projection.sees(directions)
+            valid &= found & np.isfinite(directions).all(axis=0)
+            # The proof of the pudding, for the very edge of the domain and for parameters that no lens has.
+            again, seen = self.project(_where_seen(directions, valid))
+            valid &= seen & (np.abs(again - pixels) < MAX_MISMATCH_PX).all(axis=0)
         directions[:, ~valid] = np.array([[0.0], [0.0], [1.0]])
         return directions, valid
 
