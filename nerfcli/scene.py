@@ -262,16 +262,17 @@ def _measure_upright(path: Path) -> tuple[int, int, int]:
 
 
 def _image_folder(root: Path, model_dir: Path) -> Path:
-    """Where the photos of a COLMAP project are: beside the model, or beside the folders that it stands in."""
-    homes = [root, model_dir, *model_dir.resolve().parents[:3]]
-    for home in dict.fromkeys(homes):
-        for name in IMAGE_FOLDERS:
-            if (home / name).is_dir():
-                return home / name
-    raise UserError(
-        f"{root} holds a COLMAP model, but no photos: there is no folder images/",
-        "put the photos that the model was made from into images/ beside it",
-    )
+    """Where the photos of a COLMAP project are: the folder beside the model, or beside the folders that it stands in,
+    that holds most of the names; these may begin with the name of such a folder themselves."""
+    homes = list(dict.fromkeys([root, model_dir, *model_dir.resolve().parents[:3]]))
+    folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
+    if not folders:
+        raise UserError(
+            f"{root} holds a COLMAP model, but no photos: there is no folder images/",
+            "put the photos that the model was made from into images/ beside it",
+        )
+    names = [image.name for image in read_model(model_dir).images]
+    return max((*folders, *homes), key=lambda folder: sum((folder / name).is_file() for name in names))
 
 
 def _relative(path: Path, start: Path) -> str:

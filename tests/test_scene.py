@@ -13,6 +13,8 @@ from PIL import Image
 from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.formats.transforms import parse_transforms
 from nerfcli.errors import BAD_INPUT, UserError
 
 POSE = np.eye(4).tolist()
@@ -136,6 +138,16 @@ def test_colmap_project_wherever_its_model_stands(tmp_path, model, place):
     assert scene.points.shape == (30, 3)
     assert scene.test_names == {NAMES[1], NAMES[9]}
     assert scenes.load(tmp_path / place).frames[0].image == scene.frames[0].image or place != "."
+
+
+def test_a_converted_model_whose_names_begin_with_the_folder_of_the_photos(tmp_path):
+    for name in NAMES:
+        write_image(tmp_path / "images" / name)
+    write_transforms(tmp_path, [f"images/{name}" for name in NAMES])
+    write_colmap_binary(parse_transforms(tmp_path / "transforms.json"), tmp_path / "sparse/0")
+    scene = scenes.load(tmp_path)
+    assert (scene.kind, scene.missing) == ("colmap", ())
+    assert scene.frames[0].image == tmp_path / "images" / NAMES[0]
 
 
 def test_a_colmap_model_of_photos_stored_lying_is_turned_upright(tmp_path, model):

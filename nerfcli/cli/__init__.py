@@ -33,8 +33,6 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       nerfcli render photos-scene-run/ --cameras orbit --depth conditional --video
     Cameras between formats, proved:
       nerfcli convert photos-scene/ transforms.json --to transforms
-    From one format of cameras to another, proved:
-      nerfcli convert photos-scene/ transforms.json --to transforms
     Many captures:
       ls -d captures/*/ | nerfcli poses - | nerfcli train - --budget 2m | nerfcli render -
 

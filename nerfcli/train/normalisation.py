@@ -49,8 +49,8 @@ def training_frame(scene: Scene, *, unbounded: bool) -> tuple[Similarity, Marchi
 
 
 def _half_fov(frame: Frame) -> float:
-    """Half of the wider field of view, in radians."""
-    return math.radians(max(frame.camera.fov_deg)) / 2
+    """Half of the wider field of view, in radians; at most 70 degrees, as what lenses see to the side is no object."""
+    return math.radians(min(max(frame.camera.fov_deg) / 2, 70.0))
 
 
 def _typical_depths(scene: Scene) -> np.ndarray | None:
