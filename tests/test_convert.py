@@ -20,7 +20,7 @@ from nerfcli.cameras.conventions import OPENCV_FROM_LLFF, OPENCV_FROM_OPENGL
 from nerfcli.cameras.formats import blender, colmap_binary, llff, opensfm, trajectories, transforms, transforms_cameras
 from nerfcli.cameras.formats.archive import write_npz
 from nerfcli.cameras.formats.ply import write_ply
-from nerfcli.cameras.frame import Capture
+from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.cli.convert import FORMATS_WRITTEN
 from nerfcli.convert import lenses
 from nerfcli.convert.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
@@ -290,6 +290,15 @@ def test_losses_are_refused_and_named_then_accepted_and_verified(form, camera, l
     report = json.loads(accepted.stdout)
     assert any(lost in clause for clause in report["losses"])
     assert report["verification"]["max_px"] < LIMIT_PX
+
+
+def test_features_are_left_out_with_a_warning(tmp_path):
+    capture = capture_of([PINHOLE])
+    seen = Observations(np.zeros(3, np.int64), np.arange(3), np.ones((3, 2)))
+    source = npz_of(tmp_path, replace(capture, observations=seen))
+    result = nerfcli("convert", source, tmp_path / "out.json", "--to", "transforms")
+    assert result.exit_code == 0
+    assert "Warning: transforms cannot hold 3 observations" in result.stderr
 
 
 def test_what_a_lost_term_does_is_told_in_pixels(tmp_path):

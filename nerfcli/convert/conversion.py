@@ -4,7 +4,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,7 @@ class Wanted:
     Args:
         form: its format.
         axes, pixel_centre: see `Convention`; None for the format's own.
-        allow_loss: whether what the format cannot hold may be left out.
+        allow_loss: whether what the format cannot hold may be left out; observations always may.
         overwrite: whether a result that is there may be replaced.
         verified: whether the file is read back and compared.
         tolerance_px: the largest residual that passes.
@@ -125,7 +125,9 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wante
         else target / form.default_name
     )
     losses = form.losses(capture)
-    if losses and not wanted.allow_loss:
+    # 2D features are what structure from motion works with; who asks for another format does not expect them there.
+    refused = form.losses(replace(capture, observations=None))
+    if refused and not wanted.allow_loss:
         raise UserError(
             f"{form.name} cannot hold all of this capture; it would lose: {'; '.join(losses)}",
             "add --allow-loss to leave that out, or choose another format, such as npz, which holds everything",
