@@ -82,7 +82,7 @@ def convert(
 
     What was written is read back by other programs' code (pycolmap, OpenCV, SciPy), every 3D point is projected by
     both, and the largest residual is told; above --tolerance the exit code is 7 and nothing is kept. What the format
-    cannot hold is listed, and refused without --allow-loss, but for 2D features. The photos are neither copied nor changed.
+    cannot hold is listed, and refused without --allow-loss, but for 2D features. Photos are not touched.
 
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
