@@ -5,11 +5,11 @@ import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions, random_pixels
 
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.distortion import Distortion
 from nerfcli.cameras.lens import DISTORTIONS
-from tests.lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions, random_pixels
 
 seeds = st.integers(0, 2**32 - 1)
 strengths = st.sampled_from([0.0, 1.0, 5.0, 20.0])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions, random_pixels
 
 from nerfcli.cameras.camera import Camera
-from tests.lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions, random_pixels
 
 seeds = st.integers(0, 2**32 - 1)
 models = st.sampled_from(MODELS)

@@ -6,9 +6,9 @@ import pycolmap
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions
 
 from nerfcli.cameras.camera import Camera, parameter_names
-from tests.lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions
 
 seeds = st.integers(0, 2**32 - 1)
 many = settings(max_examples=200, deadline=None)
