@@ -123,7 +123,7 @@ def render_rays(
         deepest=DEEPEST,
     )
     weights, _ = kernels.interval_weights(density, ends - starts, offsets)
-    seen = weights > NEGLIGIBLE_WEIGHT
+    seen = (weights > NEGLIGIBLE_WEIGHT).nonzero()[:, 0]
     rgb = density.new_zeros(len(density), 3)
     rays = kernels.ray_indices(offsets)[seen]
     rgb[seen] = model.field.radiance_of_encoded(encoded[seen], directions, rays)[1]
