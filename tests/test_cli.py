@@ -552,6 +552,19 @@ def test_views_are_written_and_rendered_from_again(finished, tmp_path):
             np.testing.assert_allclose(one["world_from_cam"], other["world_from_cam"], rtol=0, atol=1e-12)
 
 
+def test_views_are_not_written_over_or_where_nothing_can_be(finished, tmp_path):
+    arguments = ("render", finished, "--cameras", "orbit", "--frames", "2", "--cameras-only", "-o")
+    assert nerfcli(*arguments, tmp_path / "path").exit_code == 0
+    before = listing(tmp_path / "path")
+    result = nerfcli(*arguments, tmp_path / "path")
+    assert (result.exit_code, listing(tmp_path / "path")) == (BAD_INPUT, before)
+    assert "exists" in error_of(result)[0]
+    (tmp_path / "file").write_text("hello")
+    result = nerfcli(*arguments, tmp_path / "file" / "path")
+    assert result.exit_code == BAD_INPUT
+    assert "cannot write" in error_of(result)[0]
+
+
 def test_a_path_in_the_world_of_a_nerfstudio_run_comes_home(finished, tmp_path):
     arguments = ("render", finished, "--cameras", "orbit", "--frames", "2", "--max-size", "10")
     assert nerfcli(*arguments, "--cameras-only", "-o", tmp_path).exit_code == 0

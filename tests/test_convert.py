@@ -484,6 +484,15 @@ def test_an_existing_result_is_kept(tmp_path):
     assert (tmp_path / "out.json").read_text() == "mine"
 
 
+def test_a_place_where_nothing_can_be_is_told_in_two_lines(tmp_path):
+    (tmp_path / "file").write_text("hello")
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    result = nerfcli("convert", source, tmp_path / "file" / "x.npz", "--to", "npz")
+    assert result.exit_code == BAD_INPUT
+    assert "cannot write" in error_of(result)[0]
+    assert (tmp_path / "file").read_text() == "hello"
+
+
 def test_a_folder_of_other_things_is_not_replaced_by_a_model(tmp_path):
     source = npz_of(tmp_path, capture_of([PINHOLE]))
     (tmp_path / "photos").mkdir()

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nerfcli.atomic import cannot_write
 from nerfcli.cli.console import Console
 from nerfcli.errors import UserError
 
@@ -104,7 +105,10 @@ def write_frames(frames: "Sequence[Frame]", target: Path, *, fps: float, overwri
         raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another place with -o")
     for loss in losses_camera_path(capture):
         console.warn(f"{path.name} cannot hold {loss}; {listed.name} does")
-    target.mkdir(parents=True, exist_ok=True)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(target, error) from error
     write_transforms(capture, listed)
     write_camera_path(capture, path, fps=fps)
 

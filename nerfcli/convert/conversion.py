@@ -227,7 +227,8 @@ def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterat
     except BaseException:
         for file in files:
             if file not in aside or aside[file].exists():
-                file.unlink(missing_ok=True)
+                with suppress(OSError):  # where nothing could be written, nothing can be removed
+                    file.unlink(missing_ok=True)
         for file, other in aside.items():
             if other.exists():
                 file.parent.mkdir(parents=True, exist_ok=True)
