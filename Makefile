@@ -11,7 +11,7 @@ PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -
 .PHONY: demo test clean
 
 demo: .venv/installed
-	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --downscale 2 --frames 48 --max-size 400
+	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --downscale 2 --count 48 --max-size 400
 	@printf '%s\n' '' 'Have a look at:' \
 	    '  demo/run/renders/orbit-conditional-z/rgb.mp4     a flight around the desk' \
 	    '  demo/run/renders/orbit-conditional-z/depth.mp4   the same flight in depth' \

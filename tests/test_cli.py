@@ -516,7 +516,7 @@ def test_renders_are_kept_refused_and_overwritten(finished, tmp_path):
 
 @pytest.mark.parametrize("cameras", ["train", "orbit", "ellipse", "spiral", "interpolate"])
 def test_cameras_to_render_from(cameras, finished):
-    arguments = ("--cameras", cameras, "--frames", "3", "--outputs", "rgb", "--max-size", "10", "--video")
+    arguments = ("--cameras", cameras, "--count", "3", "--outputs", "rgb", "--max-size", "10", "--video")
     result = nerfcli("render", finished, *arguments)
     folder = finished / "renders" / cameras
     assert (result.exit_code, result.stdout) == (0, f"{folder / 'rgb.mp4'}\n")
@@ -538,7 +538,7 @@ def views_of(folder: Path) -> list[dict[str, Any]]:
 
 
 def test_views_are_written_and_rendered_from_again(finished, tmp_path):
-    path = ("--cameras", "interpolate", "--through", "r_001,r_003.png", "--frames", "3", "--max-size", "10")
+    path = ("--cameras", "interpolate", "--through", "r_001,r_003.png", "--count", "3", "--max-size", "10")
     result = nerfcli("render", finished, *path, "--cameras-only", "-o", tmp_path / "path")
     assert (result.exit_code, result.stdout) == (0, f"{tmp_path / 'path'}\n")
     assert set(listing(tmp_path / "path")) == {"camera_path.json", "cameras.json"}
@@ -553,7 +553,7 @@ def test_views_are_written_and_rendered_from_again(finished, tmp_path):
 
 
 def test_views_are_not_written_over_or_where_nothing_can_be(finished, tmp_path):
-    arguments = ("render", finished, "--cameras", "orbit", "--frames", "2", "--cameras-only", "-o")
+    arguments = ("render", finished, "--cameras", "orbit", "--count", "2", "--cameras-only", "-o")
     assert nerfcli(*arguments, tmp_path / "path").exit_code == 0
     before = listing(tmp_path / "path")
     result = nerfcli(*arguments, tmp_path / "path")
@@ -566,7 +566,7 @@ def test_views_are_not_written_over_or_where_nothing_can_be(finished, tmp_path):
 
 
 def test_a_path_in_the_world_of_a_nerfstudio_run_comes_home(finished, tmp_path):
-    arguments = ("render", finished, "--cameras", "orbit", "--frames", "2", "--max-size", "10")
+    arguments = ("render", finished, "--cameras", "orbit", "--count", "2", "--max-size", "10")
     assert nerfcli(*arguments, "--cameras-only", "-o", tmp_path).exit_code == 0
     # nerfstudio_from_world: x -> 2 (x + (1, 0, 0)).
     (tmp_path / "dataparser_transforms.json").write_text(
@@ -595,7 +595,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
             shutil.copytree(folder, target)
 
     monkeypatch.setattr(poses_command, "estimate_scene", known_poses)
-    arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--frames", "2", "--max-size", "16"]
+    arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--count", "2", "--max-size", "16"]
 
     def interrupted(*args: Any, on_progress: Callable[[Progress], None], **settings: Any) -> None:
         def stop_at_the_first_step(progress: Progress) -> None:

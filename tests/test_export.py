@@ -13,9 +13,12 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
-from nerfcli.export import ExportSettings, effective_floor, export_frames, file_names
-from nerfcli.media.depth import depth_range, preview, read_tiff
+from nerfcli.export.frames import export_frames
+from nerfcli.export.names import file_names
+from nerfcli.export.settings import ExportSettings, effective_floor
+from nerfcli.media.depth import read_tiff
 from nerfcli.media.images import read_image
+from nerfcli.media.preview import depth_range, preview
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, render_picture
 

@@ -12,7 +12,7 @@ from nerfcli.cli.views import Views, chosen_frames, write_frames
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.export import ExportSettings
+    from nerfcli.export.settings import ExportSettings
 
 
 @command
@@ -42,7 +42,7 @@ def render(
     ] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Depth as .npy beside the TIFF.")] = False,
     video: Annotated[bool, typer.Option("--video", help="An MP4 of each output.")] = False,
-    frames: Annotated[int, typer.Option(help="Frames of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
+    count: Annotated[int, typer.Option(help="Views of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
     fps: Annotated[float, typer.Option(help="Frames per second of the video.", min=1, max=240)] = 24,
     cameras_only: Annotated[
         bool,
@@ -73,12 +73,12 @@ def render(
     \b
     Examples:
       nerfcli render photos-scene-run --cameras test --outputs rgb,depth --depth median --depth-axis ray
-      nerfcli render photos-scene-run --cameras orbit --frames 120 --video
+      nerfcli render photos-scene-run --cameras orbit --count 120 --video
       nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
       nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
-      nerfcli render photos-scene-run --cameras ellipse --frames 240 --cameras-only -o ellipse/
+      nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
     """
-    from nerfcli.export import OUTPUTS, ExportSettings
+    from nerfcli.export.settings import OUTPUTS, ExportSettings
     from nerfcli.render.depth import CONVENTIONS
     from nerfcli.render.model import load_model
     from nerfcli.render.pictures import DepthRequest
@@ -97,7 +97,7 @@ def render(
     )
     settings = ExportSettings(outputs=chosen, depth=request, npy=npy, video=video, fps=fps)
 
-    views = Views(cameras, frames, through, nerfstudio_frame, max_size)
+    views = Views(cameras, count, through, nerfstudio_frame, max_size)
 
     def work(folder: Path, one_of_many: bool) -> None:
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
@@ -158,7 +158,8 @@ def render_run(
 
     import torch
 
-    from nerfcli.export import DESCRIPTION, describe_frames, export_frames
+    from nerfcli.export.frames import DESCRIPTION, export_frames
+    from nerfcli.export.names import describe_frames
     from nerfcli.render.model import load_model
     from nerfcli.train.run_folder import FIELD
 

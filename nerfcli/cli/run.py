@@ -29,7 +29,7 @@ def run(
     output: Output = None,
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
     downscale: Downscale = "auto",
-    frames: Annotated[int, typer.Option(help="Frames of the orbit video.", min=2)] = 60,
+    count: Annotated[int, typer.Option(help="Views of the orbit video.", min=2)] = 60,
     max_size: Annotated[
         int | None, typer.Option(help="Longer side of the video at most, pixels.  [default: as trained]", min=8)
     ] = None,
@@ -55,7 +55,7 @@ def run(
     from nerfcli.cli.render import folder_name, render_run
     from nerfcli.cli.train import train_scene, was_interrupted
     from nerfcli.cli.views import Views
-    from nerfcli.export import OUTPUTS, ExportSettings
+    from nerfcli.export.settings import OUTPUTS, ExportSettings
     from nerfcli.poses.structure_from_motion import PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.train.settings import TrainSettings
@@ -86,7 +86,7 @@ def run(
         console.result(metrics, numbers)
         for cameras, video in (("test", False), ("orbit", True)):
             settings = ExportSettings(outputs=OUTPUTS[: 2 if video else 3], depth=depth, npy=False, video=video, fps=24)
-            views = Views(cameras, frames, max_size=max_size if video else None)
+            views = Views(cameras, count, max_size=max_size if video else None)
             written = render_run(
                 field,
                 field / "renders" / folder_name(views, settings),

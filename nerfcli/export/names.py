@@ -1,0 +1,28 @@
+"""What the files of an export are called."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+from typing import Any
+
+from nerfcli.cameras.frame import Frame
+
+
+def file_names(frames: Sequence[Frame]) -> list[str]:
+    """File names without suffix: the frames' own, subfolders kept; the suffix stays where names would be the same.
+
+    A folder above the capture's ("../images") is called "up": nothing is written outside of the export.
+    """
+    names = ["/".join("up" if part == ".." else part for part in PurePosixPath(frame.name).parts) for frame in frames]
+    stems = [str(PurePosixPath(name).with_suffix("")) for name in names]
+    taken = Counter([*stems, *names])
+    # A name without a suffix is its own stem, and counts twice.
+    return [stem if taken[stem] == 1 + (stem == name) else name for stem, name in zip(stems, names, strict=True)]
+
+
+def describe_frames(frames: Sequence[Frame]) -> list[dict[str, Any]]:
+    """The files, cameras and poses of the pictures, as they stand in render.json."""
+    return [
+        {"file": name, "camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
+        for frame, name in zip(frames, file_names(frames), strict=True)
+    ]
