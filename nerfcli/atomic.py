@@ -9,7 +9,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from errno import EDQUOT, ENOSPC
+from errno import EDQUOT, EFBIG, ENOSPC
 from pathlib import Path
 from typing import Any
 
@@ -86,6 +86,6 @@ def _write_errors_told(path: Path) -> Iterator[None]:
     except OSError as error:
         names = [str(name) for name in (error.filename, error.filename2) if name is not None]
         about_destination = any(Path(name).is_relative_to(path.parent) or path.is_relative_to(name) for name in names)
-        if about_destination or not names or error.errno in (ENOSPC, EDQUOT):
+        if about_destination or not names or error.errno in (ENOSPC, EDQUOT, EFBIG):
             raise cannot_write(path, error) from error
         raise

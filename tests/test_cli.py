@@ -27,7 +27,7 @@ from nerfcli.atomic import write_json
 from nerfcli.cli import poses as poses_command
 from nerfcli.cli.options import seconds_from_text, thread_count
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, OUT_OF_MEMORY, TOO_FEW_PHOTOS
-from nerfcli.media.depth import read_tiff
+from nerfcli.media.float_tiff import read_tiff
 from nerfcli.render.model import save_model
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress

@@ -16,7 +16,7 @@ from nerfcli.errors import UserError
 from nerfcli.export.frames import export_frames
 from nerfcli.export.names import file_names
 from nerfcli.export.settings import ExportSettings, effective_floor
-from nerfcli.media.depth import read_tiff
+from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
 from nerfcli.media.preview import depth_range, preview
 from nerfcli.render.model import Model

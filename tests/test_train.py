@@ -21,7 +21,7 @@ from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
 from nerfcli.errors import BAD_INPUT, NON_FINITE, UserError
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.media.depth import read_tiff
+from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image, write_png
 from nerfcli.render.model import load_model, save_model
 from nerfcli.render.pictures import DepthRequest, render_picture

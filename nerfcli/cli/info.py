@@ -75,6 +75,7 @@ def _describe_run(folder: Path) -> dict[str, Any]:
         "photos": len(cameras["train"]),
         "held_out": len(cameras["test"]),
         "unit": config.get("unit"),
+        "unit_source": config.get("unit_source"),
         "settings": config.get("settings"),
         "versions": config.get("versions"),
     }

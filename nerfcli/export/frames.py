@@ -69,7 +69,7 @@ def export_frames(
         description = {
             "nerfcli": __version__,
             "settings": settings.to_json(),
-            **({"depth_meaning": asdict(meta)} if "depth" in settings.outputs else {}),
+            **({"depth_meaning": meta.to_json()} if "depth" in settings.outputs else {}),
             "frames": describe_frames(frames),
             **provenance,
         }
@@ -85,6 +85,8 @@ def _write_previews(folder: Path, names: Sequence[str], meta: DepthMeta) -> None
             yield read_values(folder, "depth", name)
 
     lo, hi = depth_range(depths())
-    metadata = {key: str(value) for key, value in asdict(meta).items()} | {"range": f"{lo} {hi}"}
+    metadata = {key: str(value) for key, value in asdict(meta).items() if value not in (None, {})} | {
+        "range": f"{lo} {hi}"
+    }
     for name, depth in zip(names, depths(), strict=True):
         write_png(folder / "depth" / f"{name}.png", preview(depth, meta, lo=lo, hi=hi), metadata=metadata)

@@ -6,7 +6,9 @@ import numpy as np
 
 from nerfcli import __version__
 from nerfcli.export.settings import ExportSettings
-from nerfcli.media.depth import DepthMeta, read_tiff, write_npy, write_tiff
+from nerfcli.media.arrays import write_npy
+from nerfcli.media.depth import DepthMeta
+from nerfcli.media.float_tiff import read_tiff, write_tiff
 from nerfcli.media.images import write_png
 from nerfcli.render.pictures import Picture
 

@@ -1,36 +1,66 @@
-"""Depth maps on disk: floats with the convention they were made by.
+"""What the numbers of a depth map mean, in a form that travels with every file and can be read back.
 
-A depth map without its convention is a riddle: along the ray or along the optical axis, in which unit, a mean
-or a median, and what stands where nothing was hit. `DepthMeta` travels with every file.
+A depth map without its convention is a riddle: along the ray or along the optical axis, in which unit, a mean or a
+median, and what stands where nothing was hit. Two files whose answers differ do not belong into one folder, one video
+or one mesh.
 """
 
 import json
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
-import tifffile
 
-from nerfcli.atomic import atomic_path, write_json
+from nerfcli import __version__
 from nerfcli.errors import UserError
 
+FORMAT = "nerfcli depth 2"
+# The word under which a description stands in PNG text chunks, OpenEXR attributes and NPZ archives.
+KEY = "nerfcli"
 AXES = {"ray": "along the ray", "z": "along the optical axis (z)"}
+QUANTITIES = ("depth", "spread", "disagreement")
+# The convention of what is no depth itself.
+CONVENTION_OF = {"spread": "standard-deviation", "disagreement": "median-conditional"}
+
+_IN_WORDS = {
+    "conditional": "the mean distance at which light ends, given that it ends before the background",
+    "moment": "the mean distance times the opacity; no distance where the ray is not opaque",
+    "background": "the mean distance, what passes counted at the background distance",
+    "max-weight": "the mean place inside the interval that stops most light",
+    "median": "the distance at which half of all light has ended",
+    "standard-deviation": "the standard deviation of the distance at which light ends, given that it ends",
+    "median-conditional": "|median - conditional|: large where no single depth is right (edges, glass, fog)",
+}
+_WHAT_MUST_AGREE = (
+    *("quantity", "convention", "axis", "unit", "opacity_floor", "background_distance"),
+    *("invalid", "units_per_level"),
+)
 
 
 @dataclass(frozen=True)
 class DepthMeta:
-    """What the numbers of a depth map mean.
+    """What the numbers of a map mean, and where they come from.
 
     Args:
-        convention: which depth of the ray's distribution, for example "conditional" or "median".
+        convention: which depth of the ray's distribution: "conditional", "median", "quantile:0.05", ...; for other
+            quantities the entry of `CONVENTION_OF`.
         axis: "ray", distance from the camera's centre along the ray; or "z", along the optical axis.
         unit: "metre", or "arbitrary" where the scale of the scene is not known.
-        opacity_floor: pixels whose opacity is below it have no depth.
-        invalid: the value of pixels without depth.
+        opacity_floor: pixels whose opacity is below it have no value.
+        invalid: the value of pixels without one: "nan", or "0" in files of whole numbers.
         background_distance: what a ray that hits nothing counts as, where the convention needs that.
+        quantity: one of `QUANTITIES`.
+        unit_source: how the unit is known ("gps", "distances", ...); None where nobody wrote it down.
+        units_per_level: of files of whole numbers: value = level * units_per_level.
+        error_bounds: what rendering states about its own error, by name; plain numbers and text. They bound the
+            rendering of the field, not the field.
+        view: the camera of the map: name, camera (model, width, height, params), world_from_cam; plain values.
+        provenance: run, field_sha256 and what else says how the map was made; plain values.
 
     Raises:
-        ValueError: another axis.
+        ValueError: another axis or quantity.
     """
 
     convention: str
@@ -39,81 +69,111 @@ class DepthMeta:
     opacity_floor: float
     invalid: str = "nan"
     background_distance: float | None = None
+    quantity: str = "depth"
+    unit_source: str | None = None
+    units_per_level: float | None = None
+    error_bounds: dict[str, Any] = field(default_factory=dict)
+    view: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
         if self.axis not in AXES:
             raise ValueError(f"axis must be one of {', '.join(AXES)}, got {self.axis}")
+        if self.quantity not in QUANTITIES:
+            raise ValueError(f"quantity must be one of {', '.join(QUANTITIES)}, got {self.quantity}")
+
+    def of(self, quantity: str) -> Self:
+        """The meaning of another map of the same picture.
+
+        The spread belongs to the same rays and axis; the disagreement is between two depths that are named in its
+        own convention.
+        """
+        if quantity == self.quantity:
+            return self
+        return replace(self, quantity=quantity, convention=CONVENTION_OF[quantity], background_distance=None)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, with the format and the version that wrote them."""
+        return {"format": FORMAT, "nerfcli": __version__, **asdict(self)}
+
+    def to_text(self) -> str:
+        """`to_json` on one line of ASCII.
+
+        Raises:
+            ValueError: a number is not finite.
+        """
+        return json.dumps(self.to_json(), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, entries: Any) -> Self:
+        """What `to_json` gave; files of earlier versions have fewer entries.
+
+        Raises:
+            ValueError: the entries are not those of a depth map.
+        """
+        if not isinstance(entries, dict) or not {"convention", "axis", "unit", "opacity_floor"} <= entries.keys():
+            raise ValueError("no description of a depth map")
+        return cls(**{f.name: entries[f.name] for f in fields(cls) if f.name in entries})
+
+    def in_words(self) -> str:
+        """One line for people: "conditional depth along the optical axis (z), in metres (gps): the mean ..."."""
+        unit = "metres" if self.unit == "metre" else f"{self.unit} units"
+        source = f" (known from: {self.unit_source})" if self.unit_source else ""
+        convention, _, share = self.convention.partition(":")
+        meaning = _IN_WORDS.get(convention, "")
+        if convention == "quantile":
+            meaning = f"the distance at which {share} of all light has ended"
+        what = f"{self.convention} {self.quantity}" if self.quantity == "depth" else self.quantity
+        return f"{what} {AXES[self.axis]}, in {unit}{source}" + (f": {meaning}" if meaning else "")
 
 
-def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
-    """Write a depth map as float TIFF, losslessly compressed, `meta` as JSON in its ImageDescription; atomic.
+def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:
+    """In what two maps differ that must not be mixed: "convention median and conditional"; None where they agree."""
+    for name in _WHAT_MUST_AGREE:
+        a, b = getattr(one, name), getattr(other, name)
+        if a != b:
+            return f"{name.replace('_', ' ')} {a} and {b}"
+    return None
 
-    Args:
-        path: the folder is made if need be.
-        depth: float32 (height, width); every bit comes back, NaN too.
-        meta: what the numbers mean.
+
+def refuse_mixing(metas: Iterable[tuple[Path, DepthMeta]]) -> None:
+    """Refuse maps that mean different things where they would be taken for one kind: a folder, a video, a mesh.
 
     Raises:
-        UserError: the file cannot be written.
-        ValueError: depth is not float32 (height, width), or meta holds a number that is not finite.
+        UserError: two of them differ; names both files and what differs.
     """
-    _check_depth(depth)
-    description = json.dumps(asdict(meta), allow_nan=False)  # escapes all but ASCII, as the tag demands
-    with atomic_path(path) as partial:
-        tifffile.imwrite(
-            partial,
-            depth,
-            photometric="minisblack",
-            compression="zlib",
-            description=description,
-            metadata=None,  # else tifffile appends a description of its own
-        )
+    first: tuple[Path, DepthMeta] | None = None
+    for path, meta in metas:
+        if first is None:
+            first = (path, meta)
+        elif difference := difference_of(first[1], meta):
+            raise mixed(path, first[0], difference)
 
 
-def read_tiff(path: Path) -> tuple[np.ndarray, DepthMeta]:
-    """Read what `write_tiff` wrote: depth float32 (height, width), and what it means.
+def mixed(path: Path, other: Path, difference: str) -> UserError:
+    """The two-line error for maps that would be taken for one kind and are not."""
+    return UserError(
+        f"{path} and {other} do not mean the same: {difference}",
+        "keep depth of different meaning in different folders: choose another place with -o",
+    )
 
-    Raises:
-        UserError: missing, damaged, not a float32 map, or without a description of its convention.
-    """
+
+def entries_of_text(text: str | None) -> dict[str, Any] | None:
+    """The JSON object in a text; None where there is none."""
     try:
-        with tifffile.TiffFile(path) as tiff:
-            depth = tiff.pages[0].asarray()
-            description = tiff.pages[0].aspage().description
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}", "give a depth TIFF") from error
-    except Exception as error:  # tifffile lets through whatever its decoders raise
-        raise UserError(f"{path} is damaged or no TIFF: {error}", "render the depth map again") from error
-    if depth.dtype != np.float32 or depth.ndim != 2:
-        raise UserError(
-            f"{path} holds {depth.dtype} {depth.shape}, not a float32 depth map",
-            "give a file that nerfcli wrote",
-        )
-    try:
-        entries = json.loads(description)
-        meta = DepthMeta(**{f.name: entries[f.name] for f in fields(DepthMeta)})
-    except (ValueError, TypeError, KeyError) as error:
-        raise UserError(
-            f"{path} does not say what its depth means (ImageDescription: {description[:40]!r})",
-            "give a file that nerfcli wrote",
-        ) from error
-    return depth, meta
+        entries = json.loads(text or "")
+    except ValueError:
+        return None
+    return entries if isinstance(entries, dict) else None
 
 
-def write_npy(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
-    """Write a depth map as .npy, and `meta` beside it under the same name with .json; each file atomically.
+def check_map(values: np.ndarray, *, channels: bool = False) -> None:
+    """Refuse what is no map.
 
     Raises:
-        UserError: a file cannot be written.
-        ValueError: depth is not float32 (height, width), or meta holds a number that is not finite.
+        ValueError: not float32 (H, W), or with `channels` not float32 (H, W, 3 or 4).
     """
-    _check_depth(depth)
-    # The sidecar first: a depth map never stands without its meaning, even if the command is killed between.
-    write_json(path.with_suffix(".json"), asdict(meta))
-    with atomic_path(path) as partial, partial.open("wb") as file:
-        np.save(file, depth)
-
-
-def _check_depth(depth: np.ndarray) -> None:
-    if depth.dtype != np.float32 or depth.ndim != 2:
-        raise ValueError(f"depth must be float32 (H, W), got {depth.dtype} {depth.shape}")
+    fits = values.ndim == 3 and values.shape[2] in (3, 4) if channels else values.ndim == 2
+    if values.dtype != np.float32 or not fits:
+        shape = "(H, W, 3|4)" if channels else "(H, W)"
+        raise ValueError(f"depth must be float32 {shape}, got {values.dtype} {values.shape}")

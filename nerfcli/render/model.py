@@ -41,6 +41,7 @@ class Model:
         background: (3,) sRGB behind everything, for pictures without alpha.
         training_from_scene: the invertible normalisation.
         unit: unit of length of the scene's own frame, "arbitrary" or "metre".
+        unit_source: how a metre is known; None where nobody wrote it down.
     """
 
     field: HashField
@@ -49,6 +50,7 @@ class Model:
     background: tuple[float, float, float]
     training_from_scene: Similarity
     unit: str
+    unit_source: str | None = None
 
     @property
     def device(self) -> torch.device:
@@ -64,6 +66,7 @@ def save_model(path: Path, model: Model) -> None:
         "background": list(model.background),
         "training_from_scene": model.training_from_scene.to_json(),
         "unit": model.unit,
+        "unit_source": model.unit_source,
     }
     save_tensors(path, {**model.field.state_dict(), "occupied": model.occupied}, description)
 
@@ -91,4 +94,5 @@ def load_model(path: Path, device: str) -> Model:
         background=(red, green, blue),
         training_from_scene=Similarity.from_json(description["training_from_scene"]),
         unit=description["unit"],
+        unit_source=description.get("unit_source"),
     )

@@ -1,0 +1,72 @@
+"""Depth maps as NumPy's own files: .npy with its meaning beside it, .npz with the maps of a picture and their meaning.
+
+An archive holds one array per map under the names of `picture_maps.MAPS`, and "meta", the description as JSON text:
+
+    archive = np.load("a.npz"); depth = archive["depth"]; meta = json.loads(str(archive["meta"]))
+"""
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.atomic import atomic_path, write_json
+from nerfcli.errors import UserError
+from nerfcli.media.depth import DepthMeta, check_map
+
+META = "meta"
+
+
+def write_npy(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
+    """Write a map as .npy, and `meta` beside it under the same name with .json; each file atomically.
+
+    Raises:
+        UserError: a file cannot be written.
+        ValueError: depth is not float32 (height, width), or meta holds a number that is not finite.
+    """
+    check_map(depth)
+    # The sidecar first: a depth map never stands without its meaning, even if the command is killed between.
+    write_json(path.with_suffix(".json"), meta.to_json())
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        np.save(file, depth)
+
+
+def write_npz(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> None:
+    """Write the maps of a picture and what they mean into one archive, losslessly compressed; atomic.
+
+    Args:
+        path: the folder is made if need be.
+        maps: by name: depth, spread, disagreement, opacity (H, W) and rgb (H, W, 3 or 4), float32.
+        meta: of the depth; of another map where there is no depth among them.
+
+    Raises:
+        UserError: the file cannot be written.
+        ValueError: a map is not float32, or meta holds a number that is not finite.
+    """
+    for name, values in maps.items():
+        check_map(values, channels=name == "rgb")
+    text = np.array(meta.to_text())
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **maps, **{META: text})  # pyright: ignore[reportArgumentType]
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a .npz file by name, without the description; that of a .npy file as "array".
+
+    Nothing in the file is run as code.
+
+    Raises:
+        UserError: missing, damaged, or with other contents than numbers and text.
+    """
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return {"array": loaded}
+        with loaded:
+            return {name: loaded[name] for name in loaded.files if name != META}
+    except FileNotFoundError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}", "give a .npy or .npz file") from error
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise UserError(f"{path} is damaged, or no arrays of numbers: {error}", "render the depth map again") from error

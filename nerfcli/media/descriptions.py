@@ -1,0 +1,148 @@
+"""What a file says about the depth in it, whatever its format: the description alone, without the pixels."""
+
+import io
+import struct
+import subprocess
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np
+import OpenEXR
+import tifffile
+from PIL import Image
+
+from nerfcli.errors import UserError
+from nerfcli.media.depth import KEY, DepthMeta, entries_of_text
+
+VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")
+
+# What the readers raise on files that are damaged; they promise no common base class.
+_DAMAGED = (
+    *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError, NotImplementedError),
+    *(struct.error, zlib.error, zipfile.BadZipFile, tifffile.TiffFileError, Image.DecompressionBombError),
+)
+
+
+def description_of(path: Path) -> dict[str, Any] | None:
+    """The description that a file of ours carries, as plain values; None where a file has none.
+
+    Args:
+        path: TIFF, OpenEXR, NPZ, NPY (with its .json beside it), PNG or a video.
+
+    Raises:
+        UserError: missing, damaged, or of another kind.
+    """
+    suffix = path.suffix.lower()
+    reader = _READERS.get(suffix)
+    if reader is None:
+        known = ", ".join(sorted(_READERS))
+        raise UserError(f"{path} is of no kind that carries depth or pictures", f"give one of: {known}")
+    try:
+        text = reader(path)
+    except FileNotFoundError as error:
+        raise UserError(f"there is no {path}", "give a file that exists") from error
+    except UserError:
+        raise
+    except _DAMAGED as error:
+        raise damaged(path, error) from error
+    return entries_of_text(text)
+
+
+def depth_meta_of(path: Path) -> DepthMeta | None:
+    """The meaning of the depth in a file of ours; None where it does not say.
+
+    Raises:
+        UserError: see `description_of`.
+    """
+    entries = description_of(path)
+    try:
+        return None if entries is None else DepthMeta.from_json(entries)
+    except (ValueError, TypeError):
+        return None
+
+
+def damaged(path: Path, error: Exception) -> UserError:
+    """The two-line error for a file that cannot be decoded."""
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return UserError(f"{path} is damaged or cut short: {reason}", "copy it once more, or render it again")
+
+
+def _of_tiff(path: Path) -> str | None:
+    with tifffile.TiffFile(path) as tiff:
+        return tiff.pages[0].aspage().description
+
+
+def _of_exr(path: Path) -> str | None:
+    with path.open("rb") as stream:
+        content = io.BytesIO(stream.read())  # a path alone is refused without saying why
+    with OpenEXR.File(content, header_only=True) as file:
+        return file.header().get(KEY)
+
+
+def _of_npz(path: Path) -> str | None:
+    with np.load(path, allow_pickle=False) as archive:
+        return str(archive["meta"]) if "meta" in archive.files else None
+
+
+def _of_npy(path: Path) -> str | None:
+    np.load(path, allow_pickle=False, mmap_mode="r")
+    sidecar = path.with_suffix(".json")
+    return sidecar.read_text(encoding="utf-8") if sidecar.is_file() else None
+
+
+def _of_png(path: Path) -> str | None:
+    with Image.open(path) as image:
+        return image.info.get(KEY)
+
+
+def _of_gif(path: Path) -> str | None:
+    with Image.open(path) as image:
+        comment = image.info.get("comment", b"")
+        return comment.decode("utf-8", errors="replace") if isinstance(comment, bytes) else str(comment)
+
+
+def _of_video(path: Path) -> str | None:
+    """The comment of the container, as ffmpeg tells it."""
+    path.stat()
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", f"file:{path}", "-f", "ffmetadata", "-"]
+    done = subprocess.run(command, capture_output=True, check=False)
+    if done.returncode != 0:
+        reason = done.stderr.decode("utf-8", errors="replace").strip().splitlines()
+        raise ValueError(reason[-1] if reason else "ffmpeg cannot read it")
+    return comment_of_ffmetadata(done.stdout.decode("utf-8", errors="replace"))
+
+
+def comment_of_ffmetadata(text: str) -> str | None:
+    """The value of "comment" in ffmpeg's own metadata format, in which =, ;, #, \\ and line ends are escaped."""
+    value, inside, escaped = "", False, False
+    for line in text.splitlines(keepends=True):
+        if not inside:
+            if not line.lower().startswith("comment="):
+                continue
+            inside, line = True, line[len("comment=") :]
+        for character in line:
+            if escaped:
+                value, escaped = value + character, False
+            elif character == "\\":
+                escaped = True
+            elif character == "\n":
+                return value
+            else:
+                value += character
+    return value if inside else None
+
+
+_READERS: dict[str, Callable[[Path], str | None]] = {
+    **dict.fromkeys(VIDEO_SUFFIXES, _of_video),
+    ".tif": _of_tiff,
+    ".tiff": _of_tiff,
+    ".exr": _of_exr,
+    ".npz": _of_npz,
+    ".npy": _of_npy,
+    ".png": _of_png,
+    ".gif": _of_gif,
+}

@@ -1,0 +1,126 @@
+"""The maps of a picture as one float32 OpenEXR file, under the channel names that compositing programs look for.
+
+    R, G, B (, A)     colour in linear light, primaries of sRGB; with A premultiplied, as OpenEXR defines it
+    Z                 the depth that was asked for: Nuke's depth.Z, the Depth pass of Blender
+    Y                 the depth once more where there is no colour: OpenCV and imageio look for Y, R, G, B alone, and
+                      give zeros without a word where a file has none of them
+    opacity.V         1 - transmittance
+    spread.V          standard deviation of the distance at which light ends
+    disagreement.V    |median - conditional|
+
+Pixels without a value are NaN. The header carries the description as JSON in the attribute "nerfcli", and a sentence
+for people in "comments". Source: https://openexr.com/en/latest/TechnicalIntroduction.html, "Channel Names".
+"""
+
+import contextlib
+import io
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from nerfcli import __version__
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+from nerfcli.media.depth import KEY, DepthMeta, check_map
+
+CHANNELS = {"depth": "Z", "opacity": "opacity.V", "spread": "spread.V", "disagreement": "disagreement.V"}
+
+
+def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> None:
+    """Write the maps of a picture into one file, losslessly compressed; atomic.
+
+    Args:
+        path: the folder is made if need be.
+        maps: by name: depth, spread, disagreement, opacity (H, W), every bit of which comes back, and rgb (H, W, 3 or
+            4), sRGB in [0, 1] with straight alpha; float32.
+        meta: of the depth; of another map where there is no depth among them.
+
+    Raises:
+        UserError: the file cannot be written.
+        ValueError: a map is not float32, or meta holds a number that is not finite.
+    """
+    channels: dict[str, np.ndarray] = {}
+    for name, values in maps.items():
+        check_map(values, channels=name == "rgb")
+        if name == "rgb":
+            channels |= _colour_channels(values)
+        else:
+            channels[CHANNELS[name]] = np.ascontiguousarray(values)
+    if "Z" in channels and "R" not in channels:
+        channels["Y"] = channels["Z"]
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "software": f"nerfcli {__version__}",
+        "comments": meta.in_words(),
+        KEY: meta.to_text(),
+    }
+    encoded = io.BytesIO()  # OpenEXR's own errors of writing do not say what is wrong with the disk
+    OpenEXR.File(header, channels).write(encoded)
+    with atomic_path(path) as partial:
+        partial.write_bytes(encoded.getbuffer())
+
+
+def read_exr(path: Path) -> dict[str, np.ndarray]:
+    """Every channel of the first part by its name, as stored.
+
+    Raises:
+        UserError: missing or damaged.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}", "give an OpenEXR file") from error
+    with _told_on_stderr() as told:
+        try:
+            file = OpenEXR.File(io.BytesIO(content), separate_channels=True)
+            return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        except (RuntimeError, ValueError, TypeError) as error:
+            reason = told() or str(error)
+            raise UserError(f"{path} is damaged or no OpenEXR file: {reason}", "render the picture again") from error
+
+
+@contextlib.contextmanager
+def _told_on_stderr() -> Iterator[Callable[[], str]]:
+    """Keep what OpenEXR prints while it reads a damaged file, which says more than its exceptions, off the terminal.
+
+    Yields:
+        The last line so far.
+    """
+    sys.stderr.flush()
+    terminal = os.dup(2)
+    with tempfile.TemporaryFile() as log, contextlib.redirect_stdout(io.StringIO()):
+
+        def last_line() -> str:
+            log.seek(0)
+            lines = log.read().decode("utf-8", errors="replace").strip().splitlines()
+            return lines[-1].rpartition(") ")[2] if lines else ""
+
+        os.dup2(log.fileno(), 2)
+        try:
+            yield last_line
+        finally:
+            os.dup2(terminal, 2)
+            os.close(terminal)
+
+
+def _colour_channels(srgb: np.ndarray) -> dict[str, np.ndarray]:
+    """R, G, B and, where there is one, A."""
+    linear = linear_light(srgb[..., :3])
+    if srgb.shape[2] == 3:
+        return {name: np.ascontiguousarray(linear[..., index]) for index, name in enumerate("RGB")}
+    alpha = srgb[..., 3]
+    colours = {name: linear[..., index] * alpha for index, name in enumerate("RGB")}
+    return colours | {"A": np.ascontiguousarray(alpha)}
+
+
+def linear_light(srgb: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1] as linear light. Source: IEC 61966-2-1."""
+    low = srgb / 12.92
+    high = ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4
+    return np.where(srgb <= 0.04045, low, high).astype(srgb.dtype)

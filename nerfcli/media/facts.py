@@ -1,0 +1,154 @@
+"""What is known about a file of depth, a picture or a video: its own description, its size, the range of its numbers.
+
+A file of another program is told as what it is: numbers whose convention nobody states.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from nerfcli.errors import UserError
+from nerfcli.media.arrays import read_arrays
+from nerfcli.media.depth import FORMAT, DepthMeta
+from nerfcli.media.descriptions import VIDEO_SUFFIXES, damaged, description_of
+from nerfcli.media.exr import CHANNELS, read_exr
+from nerfcli.media.float_tiff import read_any_tiff
+from nerfcli.media.levels import depth_of_levels
+
+_KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npz": "NPZ", ".npy": "NPY", ".png": "PNG"}
+NOT_STATED = (
+    "nothing in the file says which depth this is (mean, median, ...), along the ray or the optical axis, in which unit"
+)
+_LEVELS_NOT_STATED = "the length of a level is not stated either: often a millimetre, 0.2 mm in TUM's data sets"
+
+
+def file_facts(path: Path) -> dict[str, Any]:
+    """The facts of one file as plain values.
+
+    Keys: kind ("depth", "preview", "picture", "video", "array"), format, width and height, meaning (`DepthMeta` as
+    plain values, None where nothing is stated), in_words, maps: per map its dtype, valid_share, min, median and max
+    in the unit of the meaning; texts: other text that a PNG carries; note: what is not known.
+
+    Raises:
+        UserError: missing, damaged, or of another kind.
+    """
+    entries = description_of(path)
+    meta = _meta(path, entries)
+    suffix = path.suffix.lower()
+    if suffix in VIDEO_SUFFIXES:
+        content = _video_facts(path)
+    elif suffix == ".png":
+        content = _png_facts(path, meta)
+    else:
+        maps = _maps(path, meta)
+        kind = "depth" if meta is not None else "array"
+        content = {"kind": kind, "format": _KINDS[suffix], **_size_of(maps), "maps": _statistics(maps)}
+    content["meaning"] = None if entries is None or meta is None else entries
+    content["in_words"] = None if meta is None else meta.in_words()
+    if meta is None and content["kind"] in ("array", "levels"):
+        content["note"] = f"{NOT_STATED}; {_LEVELS_NOT_STATED}" if content["kind"] == "levels" else NOT_STATED
+    return content
+
+
+def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
+    """The meaning in a description.
+
+    Raises:
+        UserError: the description is ours, but of a format that is not known here.
+    """
+    if entries is None:
+        return None
+    stated = entries.get("format", FORMAT)
+    if isinstance(stated, str) and stated.startswith("nerfcli depth") and stated > FORMAT:
+        raise UserError(f"{path} is of format {stated!r}, this version knows {FORMAT!r}", "update nerfcli")
+    try:
+        return DepthMeta.from_json(entries)
+    except (ValueError, TypeError):
+        return None
+
+
+def _maps(path: Path, meta: DepthMeta | None) -> dict[str, np.ndarray]:
+    """The arrays of a file by name."""
+    match path.suffix.lower():
+        case ".exr":
+            channels = read_exr(path)
+            if meta is None:
+                return channels
+            named = {name: channels[channel] for name, channel in CHANNELS.items() if channel in channels}
+            return named | {name: channels[name] for name in ("R", "G", "B", "A") if name in channels}
+        case ".tif" | ".tiff":
+            return {meta.quantity if meta else "array": read_any_tiff(path)[0]}
+        case _:
+            arrays = read_arrays(path)
+            return {meta.quantity if meta and name == "array" else name: array for name, array in arrays.items()}
+
+
+def _png_facts(path: Path, meta: DepthMeta | None) -> dict[str, Any]:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            texts = {key: str(value) for key, value in image.info.items() if isinstance(value, str)}
+            pixels = np.asarray(image)
+    except (OSError, SyntaxError, ValueError) as error:
+        raise damaged(path, error) from error
+    levels = pixels.ndim == 2 and pixels.dtype != np.uint8
+    facts: dict[str, Any] = {"format": "PNG", "width": pixels.shape[1], "height": pixels.shape[0]}
+    if levels and meta is not None and meta.units_per_level is not None:
+        depth = depth_of_levels(pixels, meta.units_per_level)
+        return {"kind": "depth", **facts, "maps": _statistics({meta.quantity: depth})}
+    if levels:
+        return {"kind": "levels", **facts, "maps": _statistics({"levels": pixels}), "texts": texts}
+    texts = {key: value for key, value in texts.items() if key != "nerfcli" or meta is None}
+    return {"kind": "picture" if meta is None else "preview", **facts, "texts": texts}
+
+
+def _video_facts(path: Path) -> dict[str, Any]:
+    if path.suffix.lower() == ".gif":
+        with Image.open(path) as image:
+            width, height = image.size
+            frames, seconds = getattr(image, "n_frames", 1), image.info.get("duration", 0) / 1000
+            fps = 1 / seconds if seconds else None
+    else:
+        video = cv2.VideoCapture(str(path))
+        width, height, frames, fps = (
+            video.get(key)
+            for key in (
+                cv2.CAP_PROP_FRAME_WIDTH,
+                cv2.CAP_PROP_FRAME_HEIGHT,
+                cv2.CAP_PROP_FRAME_COUNT,
+                cv2.CAP_PROP_FPS,
+            )
+        )
+        video.release()
+    facts = {"kind": "video", "format": path.suffix[1:].lower(), "width": int(width), "height": int(height)}
+    return facts | {"frames": int(frames), "fps": None if fps is None else round(fps, 3)}
+
+
+def _size_of(maps: dict[str, np.ndarray]) -> dict[str, int]:
+    """Width and height, where all maps have one."""
+    sizes = {array.shape[:2] for array in maps.values() if array.ndim >= 2}
+    if len(sizes) != 1:
+        return {}
+    height, width = sizes.pop()
+    return {"width": width, "height": height}
+
+
+def _statistics(maps: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
+    """Of each map: how its numbers are stored, how many are valid, and their range."""
+    return {name: _range(array) for name, array in maps.items()}
+
+
+def _range(array: np.ndarray) -> dict[str, Any]:
+    facts: dict[str, Any] = {"dtype": str(array.dtype), "shape": list(array.shape)}
+    if array.dtype.kind not in "fiu" or array.size == 0:
+        return facts
+    finite = array[np.isfinite(array)]
+    facts["valid_share"] = finite.size / array.size
+    if finite.size == 0:
+        return facts
+    reductions: dict[str, Callable[[np.ndarray], Any]] = {"min": np.min, "median": np.median, "max": np.max}
+    return facts | {name: float(reduce(finite)) for name, reduce in reductions.items()}

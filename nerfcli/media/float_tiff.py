@@ -1,0 +1,73 @@
+"""Depth maps as float32 TIFF: one map, losslessly compressed, what it means as JSON in the ImageDescription."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import tifffile
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+from nerfcli.media.depth import DepthMeta, check_map
+
+
+def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
+    """Write a depth map as float TIFF; atomic.
+
+    Args:
+        path: the folder is made if need be.
+        depth: float32 (height, width); every bit comes back, NaN too.
+        meta: what the numbers mean.
+
+    Raises:
+        UserError: the file cannot be written.
+        ValueError: depth is not float32 (height, width), or meta holds a number that is not finite.
+    """
+    check_map(depth)
+    description = meta.to_text()  # escapes all but ASCII, as the tag demands
+    with atomic_path(path) as partial:
+        tifffile.imwrite(
+            partial,
+            depth,
+            photometric="minisblack",
+            compression="zlib",
+            description=description,
+            metadata=None,  # else tifffile appends a description of its own
+        )
+
+
+def read_tiff(path: Path) -> tuple[np.ndarray, DepthMeta]:
+    """Read what `write_tiff` wrote: depth float32 (height, width), and what it means.
+
+    Raises:
+        UserError: missing, damaged, not a float32 map, or without a description of its convention.
+    """
+    depth, description = read_any_tiff(path)
+    if depth.dtype != np.float32 or depth.ndim != 2:
+        raise UserError(
+            f"{path} holds {depth.dtype} {depth.shape}, not a float32 depth map",
+            "give a file that nerfcli wrote",
+        )
+    try:
+        return depth, DepthMeta.from_json(json.loads(description))
+    except ValueError as error:
+        raise UserError(
+            f"{path} does not say what its depth means (ImageDescription: {description[:40]!r})",
+            "give a file that nerfcli wrote",
+        ) from error
+
+
+def read_any_tiff(path: Path) -> tuple[np.ndarray, str]:
+    """The first page of a TIFF and its ImageDescription, whoever wrote it.
+
+    Raises:
+        UserError: missing or damaged.
+    """
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            page = tiff.pages[0].aspage()
+            return page.asarray(), page.description
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}", "give a depth TIFF") from error
+    except Exception as error:  # tifffile lets through whatever its decoders raise
+        raise UserError(f"{path} is damaged or no TIFF: {error}", "render the depth map again") from error
