@@ -21,7 +21,9 @@ from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.images import read_image
 from nerfcli.poses import structure_from_motion, supervise
 from nerfcli.poses.mapping import refine_principal_point
-from nerfcli.poses.structure_from_motion import PoseSettings, PosesReport, estimate_poses
+from nerfcli.poses.report import PosesReport
+from nerfcli.poses.settings import PoseSettings
+from nerfcli.poses.structure_from_motion import estimate_poses
 
 WIDTH, HEIGHT, FOCAL_PX = 480, 360, 450.0
 # Where the photos are taken from, and whether each is stored lying (EXIF orientation 6) or is of the smaller size.
@@ -185,8 +187,10 @@ def test_every_file_is_registered_or_has_its_reason(solved: Solved):
     assert "notes.jpg is left out: not a picture that can be read" in solved.notes
 
 
-def test_the_scene_folder_holds_the_model_and_nothing_of_the_work(solved: Solved):
-    assert {path.name for path in solved.scene.iterdir()} == {"sparse", "scene.json", "poses_report.json"}
+def test_the_scene_folder_holds_the_model_and_of_the_work_what_helps_the_next(solved: Solved):
+    results = {"sparse", "scene.json", "poses_report.json", "database.db"}
+    assert {path.name for path in solved.scene.iterdir()} == {*results, "work"}
+    assert {path.suffix for path in (solved.scene / "work").iterdir()} == {".json", ".lock"}
     assert {path.name for path in solved.scene.parent.iterdir()} == {"my photos", "corner"}
     assert {"cameras.bin", "images.bin", "points3D.bin"} <= {
         path.name for path in (solved.scene / "sparse/0").iterdir()
@@ -237,16 +241,16 @@ def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], 
     )
 
 
-def test_photos_without_overlap_are_too_few_and_leave_nothing(tmp_path: Path):
+def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
     write_noise(tmp_path / "photos")
     with pytest.raises(UserError, match=r"only 0 of 5 photos could be placed.*matches no other photo well") as caught:
         estimate(tmp_path / "photos", tmp_path / "scene")
     assert caught.value.exit_code == TOO_FEW_PHOTOS
     assert "overlap" in caught.value.hint
-    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+    assert not (tmp_path / "scene" / "scene.json").exists()
 
 
-def test_an_interrupt_ends_the_worker_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_interrupt_ends_the_worker_and_leaves_no_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     workers: list[subprocess.Popen[bytes]] = []
 
     class Recorded(subprocess.Popen[bytes]):
@@ -263,7 +267,7 @@ def test_an_interrupt_ends_the_worker_and_leaves_nothing(tmp_path: Path, monkeyp
     with pytest.raises(KeyboardInterrupt):
         estimate(tmp_path / "photos", tmp_path / "scene", interrupt)
     assert [worker.returncode for worker in workers] == [-9]
-    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+    assert not (tmp_path / "scene" / "scene.json").exists()
 
 
 def test_a_dying_worker_is_told_with_its_last_words(tmp_path: Path):

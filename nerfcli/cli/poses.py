@@ -11,7 +11,7 @@ from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Seed, Threads, t
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.poses.structure_from_motion import PoseSettings
+    from nerfcli.poses.settings import PoseSettings
 
 NAMES_SHOWN = 8
 
@@ -41,7 +41,7 @@ def poses(
       nerfcli poses photos/kitchen -o kitchen --max-size 1000 --max-features 2048
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
-    from nerfcli.poses.structure_from_motion import CAMERA_MODELS, PoseSettings
+    from nerfcli.poses.settings import CAMERA_MODELS, PoseSettings
 
     if camera_model not in CAMERA_MODELS:
         raise typer.BadParameter(f"{camera_model!r}; choose {', '.join(CAMERA_MODELS)}", param_hint="--camera-model")
@@ -70,8 +70,9 @@ def estimate_scene(folder: Path, scene: Path, *, settings: "PoseSettings", overw
         UserError: see `estimate_poses`; or something else stands at `scene`.
     """
     from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
+    from nerfcli.scene import SCENE_FILE
 
-    if scene.exists() and not overwrite:
+    if (scene / SCENE_FILE).exists() and not overwrite:
         if is_same_scene(scene, folder, settings):
             console.note(f"{scene} is kept: it was made from these photos; --overwrite makes it again")
             return

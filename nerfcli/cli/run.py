@@ -56,7 +56,7 @@ def run(
     from nerfcli.cli.train import train_scene, was_interrupted
     from nerfcli.cli.views import Views
     from nerfcli.export.settings import OUTPUTS, ExportSettings
-    from nerfcli.poses.structure_from_motion import PoseSettings
+    from nerfcli.poses.settings import PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.train.settings import TrainSettings
 

@@ -1,37 +1,76 @@
-"""Features and matches: what pycolmap writes into its database, and what that says about each photo."""
+"""Features and matches: what pycolmap writes into its database, going on from what is there."""
 
-import sqlite3
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
 
 import pycolmap
 
-from nerfcli.poses.job import CameraGroup, Job, Report
+from nerfcli.poses.database import clear_matches, forget_features, keep_geometries, register_photos
+from nerfcli.poses.job import Job, Report
+from nerfcli.poses.stages import read_stage, stage_key, write_stage
 
 # A photo with this share of the features that were asked for is rich enough; measured poses are no better with more.
 _RICH_SHARE = 0.5
-# Matches are written, and so progress is seen, after each block.
+# Matches are written, and so progress is seen and kept, after each block.
 _PAIRS_PER_BLOCK = 128
+# To be changed with anything here that changes the features of the same photo, or the matches of the same features.
+_FEATURES_VERSION = "octaves 0, then -1 below half"
+_MATCHES_VERSION = "ratio 0.8, cross-checked"
+
+
+def feature_keys(job: Job) -> dict[str, str]:
+    """Per photo (by image id, as JSON wants its keys), a hash of all that its features depend on."""
+    settings = (_FEATURES_VERSION, job.max_image_size, job.max_features, pycolmap.__version__)
+    return {str(i): stage_key(key, *settings) for i, key in zip(job.image_ids, job.keys, strict=True)}
 
 
 def extract(job: Job, report: Report) -> None:
-    """SIFT features of every photo, one camera per group.
+    """SIFT features of every photo that has none yet, one camera per group.
 
     Seeking them in the enlarged picture too (SIFT's octave -1, pycolmap's default) takes three times as long. Rich
     pictures gain nothing, for pycolmap keeps the coarsest features; so only the poor ones get it, in a second pass.
     """
-    _extract_octaves(job, range(len(job.files)), first_octave=0, report=report)
-    poor = [number for number, photo in enumerate(evidence(job)) if photo["features"] < _RICH_SHARE * job.max_features]
-    if poor:
-        _forget_features(job, poor)
-        _extract_octaves(job, poor, first_octave=-1, report=report)
+    register_photos(job)
+    keys, known = feature_keys(job), _stage_file(job, "features")
+    there = read_stage(known, _FEATURES_VERSION) or {}
+    forget_features(job, [int(image_id) for image_id, key in keys.items() if there.get(image_id) != key])
+    # From here on, what features the database holds are those of `keys`.
+    write_stage(known, _FEATURES_VERSION, keys)
+    passes = _stage_file(job, "enlarged")
+    enlarged = {i: key for i, key in (read_stage(passes, _FEATURES_VERSION) or {}).items() if keys.get(i) == key}
+    first = [number for number, image_id in enumerate(job.image_ids) if str(image_id) not in enlarged]
+    _extract_octaves(job, first, first_octave=0, report=report)
+    counts = feature_counts(job)
+    poor = [number for number in first if counts[number] < _RICH_SHARE * job.max_features]
+    # First they go and then it is written that they are due: one that has features and is due has had its second pass.
+    forget_features(job, [job.image_ids[number] for number in poor])
+    enlarged |= {str(job.image_ids[number]): keys[str(job.image_ids[number])] for number in poor}
+    write_stage(passes, _FEATURES_VERSION, enlarged)
+    due = [number for number, image_id in enumerate(job.image_ids) if str(image_id) in enlarged]
+    _extract_octaves(job, due, first_octave=-1, report=report)
+
+
+def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
+    """Take out the matches of other settings, and hide those of other pairs from the mapper."""
+    matched, verified = _stage_file(job, "matches"), _stage_file(job, "geometries")
+    matches_key = stage_key(_MATCHES_VERSION, pycolmap.__version__)
+    verified_key = stage_key(matches_key, job.seed)
+    if read_stage(matched, matches_key) is None:
+        clear_matches(job, "matches", "two_view_geometries")
+        write_stage(matched, matches_key, {})
+    if read_stage(verified, verified_key) is None:
+        clear_matches(job, "two_view_geometries")
+        write_stage(verified, verified_key, {})
+    keep_geometries(job, pairs)
 
 
 def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
-    """Descriptor matches of the pairs, verified by two-view geometry."""
+    """Descriptor matches of the pairs that have none yet, verified by two-view geometry.
+
+    Each pair's random numbers start from the seed, so its result does not depend on what was done before.
+    """
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = job.threads
     options.use_gpu = False
@@ -41,15 +80,13 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(pair_list)
     pairing.block_size = _PAIRS_PER_BLOCK
-    with pycolmap.Database.open(str(job.database)) as database:
-        ids = {image.name: image.image_id for image in database.read_all_images()}
-        # A photo that pycolmap could not read after all is not in its database.
-        named = [(job.files[i], job.files[j]) for i, j in pairs if job.files[i] in ids and job.files[j] in ids]
-        pair_list.write_text("\n".join(f"{one} {other}" for one, other in named), encoding="utf-8")
-        pending = {(ids[one], ids[other]) for one, other in named}
+    pair_list.write_text("\n".join(f"{job.files[i]} {job.files[j]}" for i, j in pairs), encoding="utf-8")
+    ids = job.image_ids
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pending = {(ids[i], ids[j]) for i, j in pairs}
 
         def done() -> int:
-            pending.difference_update([pair for pair in pending if database.exists_matches(*pair)])
+            pending.difference_update([pair for pair in pending if database.exists_two_view_geometry(*pair)])
             return len(pairs) - len(pending)
 
         with _watched("match", done, len(pairs), report):
@@ -62,99 +99,48 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
             )
 
 
-def evidence(job: Job) -> list[dict[str, Any]]:
-    """Per photo: features found, and the photo that it shares most verified matches with."""
-    with pycolmap.Database.open(str(job.database)) as database:
-        numbers = {image.image_id: job.files.index(image.name) for image in database.read_all_images()}
-        features = dict.fromkeys(range(len(job.files)), 0)
-        for image_id, number in numbers.items():
-            features[number] = database.num_keypoints_for_image(image_id)
-        pair_ids, inliers = database.read_two_view_geometry_num_inliers()
-    best: dict[int, tuple[int, str | None]] = dict.fromkeys(features, (0, None))
-    for pair_id, count in zip(pair_ids, inliers, strict=True):
-        i, j = (numbers[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
-        for one, other in ((i, j), (j, i)):
-            if count > best[one][0]:
-                best[one] = (count, job.names[other])
-    return [
-        {"features": features[number], "best_matches": best[number][0], "best_partner": best[number][1]}
-        for number in sorted(features)
-    ]
+def feature_counts(job: Job) -> list[int]:
+    """Features in the database, per photo."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
 
 
-def _extract_octaves(job: Job, numbers: Sequence[int], *, first_octave: int, report: Report) -> None:
+def _extract_octaves(job: Job, numbers: Iterable[int], *, first_octave: int, report: Report) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = job.max_image_size
     options.num_threads = job.threads
     options.use_gpu = False
     options.sift.max_num_features = job.max_features
     options.sift.first_octave = first_octave
-    wanted = set(numbers)
-    with pycolmap.Database.open(str(job.database)) as database:
-        pending = {job.files[number] for number in numbers}
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        ids = dict(zip(job.image_ids, job.files, strict=True))
+        members = [job.files[number] for number in numbers]
+        pending = set(ids)
 
         def done() -> int:
-            for name in tuple(pending):
-                image = database.read_image_with_name(name)
-                if image is not None and database.exists_keypoints(image.image_id):
-                    pending.discard(name)
-            return len(job.files) - len(pending)
+            pending.difference_update([image_id for image_id in pending if database.exists_descriptors(image_id)])
+            return len(ids) - len(pending)
 
-        with _watched("extract", done, len(job.files), report):
-            for group in job.groups:
-                members = [job.files[number] for number in group.photos if number in wanted]
-                if not members:
-                    continue
+        with _watched("extract", done, len(ids), report):
+            if members:
                 pycolmap.extract_features(
                     str(job.database),
                     str(job.photos),
                     image_names=members,
-                    camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=_reader_options(group, job),
                     extraction_options=options,
                     device=pycolmap.Device.cpu,
                 )
 
 
-def _forget_features(job: Job, numbers: Sequence[int]) -> None:
-    """Delete the features of some photos, so that pycolmap extracts them again. Its own API deletes only all of them.
-
-    Only while pycolmap has the database closed: see `_watched` on two SQLite libraries in one process.
-    """
-    with closing(sqlite3.connect(job.database)) as database, database:
-        for number in numbers:
-            for table in ("keypoints", "descriptors"):
-                database.execute(
-                    f"DELETE FROM {table} WHERE image_id IN (SELECT image_id FROM images WHERE name = ?)",
-                    (job.files[number],),
-                )
-
-
-def _reader_options(group: CameraGroup, job: Job) -> pycolmap.ImageReaderOptions:
-    """Camera model of a group, and its focal length if EXIF tells it.
-
-    It is read from the original: an upright copy has no EXIF. Lying or upright, the focal length in pixels is the same.
-    """
-    options = pycolmap.ImageReaderOptions()
-    options.camera_model = group.model
-    original = Path(job.originals) / job.names[group.photos[0]]
-    try:
-        inferred = pycolmap.infer_camera_from_image(str(original))
-    except (RuntimeError, ValueError):  # a file format that only our own reader knows
-        return options
-    if inferred.has_prior_focal_length:
-        focal_px = inferred.focal_length
-        camera = pycolmap.Camera.create_from_model_name(1, group.model, focal_px, group.width, group.height)
-        options.camera_params = camera.params_to_string()
-    return options
+def _stage_file(job: Job, stage: str) -> Path:
+    return Path(job.folder) / f"{job.rung}{'-' if job.rung else ''}{stage}.json"
 
 
 @contextmanager
 def _watched(stage: str, done: Callable[[], int], total: int, report: Report) -> Iterator[None]:
-    """Report `done()` once a second while pycolmap works.
+    """Report `done()` once a second while pycolmap works, at the beginning and at the end.
 
-    pycolmap has no callbacks for these stages, so the database is asked. It must be asked from this process and
-    through pycolmap: a second SQLite library in the same process, closing the file, would drop the locks of the first.
+    pycolmap has no callbacks for these stages, so the database is asked, through pycolmap: see `database`.
     """
     finished = threading.Event()
 
@@ -162,7 +148,7 @@ def _watched(stage: str, done: Callable[[], int], total: int, report: Report) ->
         while not finished.wait(1.0):
             report(stage, done(), total)
 
-    report(stage, 0, total)
+    report(stage, done(), total)
     watcher = threading.Thread(target=watch)
     watcher.start()
     try:

@@ -23,20 +23,26 @@ class CameraGroup:
 class Job:
     """Structure from motion of photos 0, 1, 2...
 
-    folder: where to work. files: the numbered names below folder/photos. originals: the user's folder, and names:
-    the photos' names there. pairs: which to compare. The rest is as in `PoseSettings`.
+    folder: where to work. files: the photos' names below folder/photos, which are numbers that stay with a photo for
+    as long as the folder is there. originals: the user's folder, and names: the photos' names there. keys: of their
+    content. pairs: which to compare. neighbours: how many more each is compared with, those that look most alike; once
+    they are found, pairs has them too. rung: "" or the name of an attempt with other features, which has its own
+    database and stages: `replace(job, rung="full-size", max_image_size=...)`. The rest is as in `PoseSettings`.
     """
 
     folder: str
     files: tuple[str, ...]
     originals: str
     names: tuple[str, ...]
+    keys: tuple[str, ...]
     groups: tuple[CameraGroup, ...]
     pairs: tuple[tuple[int, int], ...]
+    neighbours: int
     max_image_size: int
     max_features: int
     seed: int
     threads: int
+    rung: str = ""
 
     @property
     def photos(self) -> Path:
@@ -45,8 +51,18 @@ class Job:
 
     @property
     def database(self) -> Path:
-        """pycolmap's database of features and matches."""
-        return Path(self.folder) / "database.db"
+        """pycolmap's database of features and matches; it stays beside the model."""
+        return database_path(Path(self.folder), self.rung)
+
+    @property
+    def image_ids(self) -> tuple[int, ...]:
+        """The photos' ids in the database, by number; pycolmap's ids start at 1."""
+        return tuple(int(Path(file).stem) + 1 for file in self.files)
+
+
+def database_path(work: Path, rung: str = "") -> Path:
+    """Where the database of a work folder is: in the scene's folder, above it; those of rungs inside."""
+    return work / f"{rung}.db" if rung else work.parent / "database.db"
 
 
 def write_job(path: Path, job: Job) -> None:
@@ -59,5 +75,6 @@ def read_job(path: Path) -> Job:
     content = json.loads(path.read_text(encoding="utf-8"))
     content["groups"] = tuple(CameraGroup(**group | {"photos": tuple(group["photos"])}) for group in content["groups"])
     content["pairs"] = tuple((i, j) for i, j in content["pairs"])
-    content["files"], content["names"] = tuple(content["files"]), tuple(content["names"])
+    for name in ("files", "names", "keys"):
+        content[name] = tuple(content[name])
     return Job(**content)

@@ -1,11 +1,13 @@
 """From matches to a model: incremental mapping with second chances, the principal point, COLMAP files."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-from nerfcli.poses.features import evidence, match
+from nerfcli.poses.database import evidence
+from nerfcli.poses.features import match
 from nerfcli.poses.job import Job, Report
 from nerfcli.poses.pairs import all_pairs
 from nerfcli.poses.reasons import FEW_FEATURES, FEW_MATCHES
@@ -105,6 +107,7 @@ def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
     for image in model.images.values():
         image.name = job.names[job.files.index(image.name)]
     folder = Path(job.folder) / "sparse" / "0"
+    shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed before it said that it was complete
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
 
@@ -125,7 +128,7 @@ def _map(
     options.mapper.init_min_num_inliers = int(init_min_num_inliers)
     options.mapper.abs_pose_min_num_inliers = FEW_MATCHES
     output = Path(job.folder) / f"models_{attempt}"
-    output.mkdir()
+    output.mkdir(exist_ok=True)
     placed = 0
 
     def started() -> None:

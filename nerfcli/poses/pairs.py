@@ -8,40 +8,61 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
+# What may be asked for. "auto" is one of the others, by the number of photos and what is known of them.
+PAIRINGS = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
+
 # Up to here every photo is compared with every other one, whatever the names say.
 EXHAUSTIVE_UP_TO = 60
-_NEIGHBOURS = 10
-_LANDMARKS = 40
-
-# Measured on one core of a 2-core server at 4096 features; within a factor of two on other CPUs.
-_SECONDS_PER_PAIR = 0.12
-_FEATURES_PER_PAIR = 4096
+# In an ordered capture, so many followers...
+_FOLLOWERS = 10
+# ...and so many that look alike though they are not near in the order, which closes loops.
+_LOOP_NEIGHBOURS = 8
+# In an unordered one.
+_NEIGHBOURS = 25
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """Pairs (i, j), i < j, of photo numbers, and the rule they follow: "exhaustive" or "sequential"."""
+    """The rule, one of `PAIRINGS` but "auto", or "file"; pairs (i, j), i < j, of photo numbers; and with how many more
+    that look alike each photo is compared, which is known once their features are.
+    """
 
     rule: str
     pairs: tuple[tuple[int, int], ...]
+    neighbours: int
 
 
-def choose_pairs(names: Sequence[str]) -> Pairing:
-    """Every pair for a small or unordered capture; for a large one that is numbered in order, neighbours and landmarks.
+def choose_pairs(names: Sequence[str], *, rule: str = "auto") -> Pairing:
+    """Which photos to compare: see the rules below. A small capture is compared exhaustively, a larger one as its
+    photos allow: in their order if their names have one, else by how alike they look.
 
-    In a numbered capture each photo is compared with the next 10 and with those 16, 32, 64... further on, and every
-    n-th photo (40 in all) with every other such one, which closes loops at any distance.
-
+    Raises:
+        ValueError: no such rule.
     """
-    order = capture_order(names)
-    count = len(names)
-    if count <= EXHAUSTIVE_UP_TO or order is None:
-        return Pairing("exhaustive", all_pairs(count))
-    steps = [*range(1, _NEIGHBOURS + 1), *(2**k for k in range(4, count.bit_length()))]
+    if rule == "auto":
+        rule = (
+            "exhaustive"
+            if len(names) <= EXHAUSTIVE_UP_TO
+            else "retrieval"
+            if not capture_order(names)
+            else "sequential"
+        )
+    if rule == "exhaustive":
+        return Pairing("exhaustive", all_pairs(len(names)), 0)
+    if rule == "sequential":
+        order = capture_order(names) or list(range(len(names)))
+        return Pairing("sequential", sequential_pairs(order), _LOOP_NEIGHBOURS)
+    if rule == "retrieval":
+        return Pairing("retrieval", (), _NEIGHBOURS)
+    raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {rule}")
+
+
+def sequential_pairs(order: Sequence[int]) -> tuple[tuple[int, int], ...]:
+    """Each photo with the next 10 in the order, and with those 16, 32, 64... further on."""
+    count = len(order)
+    steps = [*range(1, _FOLLOWERS + 1), *(2**k for k in range(4, count.bit_length()))]
     near = {(i, i + step) for step in steps for i in range(count - step)}
-    landmarks = [round(k * (count - 1) / (_LANDMARKS - 1)) for k in range(_LANDMARKS)]
-    places = near | set(combinations(landmarks, 2))
-    return Pairing("sequential", in_blocks({_rising(order[i], order[j]) for i, j in places}))
+    return in_blocks({_rising(order[i], order[j]) for i, j in near})
 
 
 def all_pairs(count: int) -> tuple[tuple[int, int], ...]:
@@ -68,11 +89,6 @@ def capture_order(names: Sequence[str]) -> list[int] | None:
     if len(set(numbers)) < len(numbers):
         return None
     return sorted(range(len(numbers)), key=numbers.__getitem__)
-
-
-def estimated_seconds(pair_count: int, *, max_features: int, threads: int) -> float:
-    """About how long the matching takes, to be said before it starts."""
-    return pair_count * _SECONDS_PER_PAIR * max_features / _FEATURES_PER_PAIR / threads
 
 
 def _rising(i: int, j: int) -> tuple[int, int]:

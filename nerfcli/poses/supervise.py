@@ -1,29 +1,46 @@
-"""Run the worker: hear its progress, end it when we end, and tell in words how it died if it did."""
+"""Run the worker: hear its progress, keep it within limits, end it when we end, and tell in words how it died."""
 
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import nerfcli
-from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
+from nerfcli.poses.memory import resident_bytes
+from nerfcli.poses.settings import Limits
 
 _STAGES = {"extract": "finding features", "match": "matching photos", "map": "placing photos"}
+_GO_ON = "what is complete is kept, and the same command goes on from there"
+_LESS_MEMORY = "use smaller photos (--max-size), fewer features (--max-features) or fewer threads (--threads)"
+# Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
+_LOOK_EVERY_SECONDS = 0.1
 
 
-def run_worker(job_path: Path, *, threads: int, progress: Callable[[str, int, int], None]) -> None:
+def run_worker(
+    job_path: Path,
+    *,
+    threads: int,
+    progress: Callable[[str, int, int], None],
+    limits: Limits = Limits(),
+    lock: int | None = None,
+) -> None:
     """Run `nerfcli.poses.worker` on a job until it is done; it is dead when this returns or raises.
 
     Args:
         job_path: the job's JSON file; the worker's log is written beside it.
         threads: for OpenMP inside pycolmap, -1 for all.
         progress: told (stage, done, total).
+        limits: the worker is ended when it goes beyond one of them.
+        lock: a descriptor that the worker inherits.
 
     Raises:
-        UserError: the worker died; the text says while doing what, and its last words.
+        UserError: the worker died or was ended; the text says while doing what, and its last words.
     """
     log = job_path.with_name("worker.log")
     package_root = str(Path(nerfcli.__file__).parent.parent)
@@ -38,9 +55,11 @@ def run_worker(job_path: Path, *, threads: int, progress: Callable[[str, int, in
             stdout=subprocess.PIPE,
             stderr=stderr,
             env=environment,
+            pass_fds=() if lock is None or sys.platform == "win32" else (lock,),
             # Ctrl-C on a terminal goes to its whole process group; only we answer it, by ending the worker.
             start_new_session=True,
         )
+        guard = _Guard(worker, limits)
         try:
             assert worker.stdout is not None
             for line in worker.stdout:
@@ -51,8 +70,12 @@ def run_worker(job_path: Path, *, threads: int, progress: Callable[[str, int, in
         finally:
             worker.kill()
             worker.communicate()
-    if worker.returncode != 0:
-        raise explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"))
+            guard.stop()
+    if worker.returncode == 0:
+        return
+    if guard.reached is not None:
+        raise _limit_reached(guard.reached, limits, stage)
+    raise explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"))
 
 
 def explain_death(returncode: int, stage: str, log: str) -> UserError:
@@ -60,13 +83,64 @@ def explain_death(returncode: int, stage: str, log: str) -> UserError:
     if returncode == -signal.SIGKILL:
         return UserError(
             f"structure from motion was killed while {stage}, most likely for want of memory",
-            "use smaller photos, fewer features or fewer threads",
+            f"{_LESS_MEMORY}; {_GO_ON}",
             OUT_OF_MEMORY,
+        )
+    if "bad_alloc" in log or "MemoryError" in log:
+        return UserError(
+            f"structure from motion ran out of memory while {stage}", f"{_LESS_MEMORY}; {_GO_ON}", OUT_OF_MEMORY
         )
     how = signal.Signals(-returncode).name if returncode < 0 else f"exit status {returncode}"
     return UserError(
         f"structure from motion died ({how}) while {stage}: {_last_words(log)}",
         "try once more with one thread; if it dies again, leave out the photos that came last, or report it",
+    )
+
+
+class _Guard:
+    """Watches a worker from a thread, and ends it when it goes beyond a limit; `reached` then says which."""
+
+    def __init__(self, worker: subprocess.Popen[bytes], limits: Limits):
+        self.reached: str | None = None
+        self._worker = worker
+        self._limits = limits
+        self._end = None if limits.seconds is None else time.monotonic() + limits.seconds
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Watch no longer. The worker is dead by now."""
+        self._stopped.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._stopped.wait(_LOOK_EVERY_SECONDS):
+            if self._end is not None and time.monotonic() > self._end:
+                self.reached = "time"
+            elif self._limits.memory_bytes is not None and self._resident() > self._limits.memory_bytes:
+                self.reached = "memory"
+            if self.reached is not None:
+                self._worker.kill()
+                return
+
+    def _resident(self) -> int:
+        return resident_bytes(self._worker.pid)
+
+
+def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:
+    if which == "memory":
+        assert limits.memory_bytes is not None
+        size = f"{limits.memory_bytes / 1e9:.3g} GB"
+        return UserError(
+            f"structure from motion was ended while {stage}: it needed more than the {size} of --memory",
+            f"{_LESS_MEMORY}, or allow more; {_GO_ON}",
+            OUT_OF_MEMORY,
+        )
+    return UserError(
+        f"structure from motion was ended while {stage}: the {limits.seconds:.0f} s of --time-limit are over",
+        f"allow more time or choose --quality fast; {_GO_ON}",
+        GATE_NOT_MET,
     )
 
 

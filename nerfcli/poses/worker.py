@@ -1,9 +1,9 @@
 """The child process: pycolmap from photos to a model on disk. Run as `python -m nerfcli.poses.worker JOB.json`.
 
-pycolmap is C++ that may end the process without a Python exception, so it gets one of its own. It reads a job, writes
-`sparse/0` and `result.json` into the job's folder, and tells its progress as JSON lines {"stage", "done", "total"} on
-stdout. Everything else, glog's lines included, goes to stderr. It ends by itself when its stdin closes, which is
-what happens when the parent dies, however it dies.
+pycolmap is C++ that may end the process without a Python exception, so it gets one of its own. It reads a job, goes on
+from the stages that are complete in the job's folder, leaves `sparse/0` and `result.json` there, and tells its progress
+as JSON lines {"stage", "done", "total"} on stdout. Everything else, glog's lines included, goes to stderr. It ends by
+itself when its stdin closes, which is what happens when the parent dies, however it dies.
 
 Photos go by number here: pycolmap sees `00000.jpg`, `00001.png`..., so that a space or an umlaut in a name
 cannot break the list of pairs.
@@ -16,12 +16,15 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-from nerfcli.poses.features import evidence, extract, match
+import nerfcli
+from nerfcli.poses.database import discard_if_damaged, evidence, name_images
+from nerfcli.poses.features import extract, match, start_matching
 from nerfcli.poses.job import Job, Report, read_job
 from nerfcli.poses.mapping import (
     describe_cameras,
@@ -30,6 +33,11 @@ from nerfcli.poses.mapping import (
     refine_principal_point,
     write_model,
 )
+from nerfcli.poses.retrieval import with_neighbours
+from nerfcli.poses.stages import read_stage, stage_key, write_stage
+
+# The last stage's file: what the report needs. The model stands beside it, in sparse/0.
+RESULT = "result.json"
 
 
 def main(job_path: str) -> None:
@@ -39,21 +47,41 @@ def main(job_path: str) -> None:
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     job = read_job(Path(job_path))
     pycolmap.set_random_seed(job.seed)
-    result = solve(job, report)
-    (Path(job.folder) / "result.json").write_text(json.dumps(result), encoding="utf-8")
+    solve(job, report)
 
 
-def solve(job: Job, report: Report) -> dict[str, Any]:
-    """Extraction, matching, mapping; writes `sparse/0` if there is a model and returns what the report needs."""
+def solve(job: Job, report: Report) -> None:
+    """Extraction, matching, mapping; each goes on from what is there."""
     seconds: dict[str, float] = {}
+    discard_if_damaged(job.database)
     with _timed(seconds, "extract"):
         extract(job, report)
     with _timed(seconds, "match"):
+        job = with_neighbours(job)
+        start_matching(job, job.pairs)
         match(job, job.pairs, report)
+    result, key = Path(job.folder) / RESULT, mapping_key(job)
+    if read_stage(result, key) is None:
+        result.unlink(missing_ok=True)
+        write_stage(result, key, _map(job, report, seconds=seconds))
+    name_images(job)
+
+
+def mapping_key(job: Job) -> str:
+    """A hash of all that the model depends on."""
+    content = asdict(job)
+    for name in ("folder", "originals", "threads"):
+        del content[name]
+    return stage_key(content, nerfcli.__version__, pycolmap.__version__)
+
+
+def _map(job: Job, report: Report, *, seconds: dict[str, float]) -> dict[str, Any]:
+    """Writes `sparse/0` if there is a model and returns what the report needs."""
     with _timed(seconds, "map"):
         models, attempts = reconstruct(job, report)
         best = refine_principal_point(models[0], job.threads) if models else None
     result: dict[str, Any] = {"seconds": seconds, "attempts": attempts, "evidence": evidence(job)}
+    result["pairs"] = len(job.pairs)
     result["versions"] = {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__}
     result["models"] = [photo_numbers(model, job) for model in models]
     if best is not None:

@@ -1,0 +1,37 @@
+"""Stages as files: what is complete, and on what it depends.
+
+A complete stage is a JSON file {"key", "content"} in the work folder. The key is a hash of all that the content depends
+on: a stage whose key is not the one that is asked for is as good as not there.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from nerfcli.atomic import write_json
+
+
+def stage_key(*parts: Any) -> str:
+    """A hash of plain values: equal for equal values, in every process and on every machine."""
+    text = json.dumps(parts, sort_keys=True, ensure_ascii=False)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def file_key(path: Path) -> str:
+    """A hash of a file's content."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+def write_stage(path: Path, key: str, content: Any) -> None:
+    """Say that a stage is complete. Whatever else belongs to it must be on disk by now."""
+    write_json(path, {"key": key, "content": content})
+
+
+def read_stage(path: Path, key: str) -> Any | None:
+    """The content of a complete stage with this key, None where there is none."""
+    if not path.is_file():
+        return None
+    stage = json.loads(path.read_text(encoding="utf-8"))
+    return stage["content"] if stage["key"] == key else None

@@ -1,0 +1,104 @@
+"""A scene's folder while the scene is in the making, and the step that makes it a scene.
+
+    SCENE/work/          what is complete so far: see `stages`
+    SCENE/database.db    features and matches, for the next time; COLMAP reads it
+    SCENE/scene.json     written last: with it the folder is a scene
+
+Whoever works in the folder holds its lock. A process that is killed lets go of it, and the next one goes on.
+"""
+
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerfcli.atomic import atomic_folder, cannot_write
+from nerfcli.errors import UserError
+from nerfcli.poses.job import database_path
+from nerfcli.scene import SCENE_FILE
+
+_LOCK = "poses.lock"
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """folder: SCENE/work. lock: a descriptor that the worker inherits, so that the lock outlives neither of the two."""
+
+    folder: Path
+    lock: int
+
+
+@contextmanager
+def workspace(scene_dir: Path) -> Iterator[Workspace]:
+    """The work folder of a scene, for one process at a time.
+
+    Raises:
+        UserError: another process works there, or nothing can be written there.
+    """
+    folder = scene_dir / "work"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise cannot_write(scene_dir, error) from error
+    try:
+        if not _take(lock):
+            raise UserError(
+                f"another nerfcli poses is at work on {scene_dir}",
+                "wait until it is done, or choose another folder with -o",
+            )
+        yield Workspace(folder, lock)
+    finally:
+        os.close(lock)
+
+
+def is_in_the_making(scene_dir: Path) -> bool:
+    """Whether an earlier call has worked on a scene here, complete or not."""
+    return (scene_dir / "work" / _LOCK).is_file()
+
+
+def publish(scene_dir: Path, describe: Callable[[], None]) -> None:
+    """Put the model that the worker left into its place; then `describe` writes the report and, last, scene.json.
+
+    Until then the folder is no scene, and calling again goes on from the complete model.
+    """
+    work = scene_dir / "work"
+    (scene_dir / SCENE_FILE).unlink(missing_ok=True)
+    with atomic_folder(scene_dir / "sparse") as sparse:
+        shutil.copytree(work / "sparse" / "0", sparse / "0")
+    describe()
+    for path in work.iterdir():
+        if path.suffix not in (".json", ".lock") or path.stem in ("job", "result"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def drop_database(scene_dir: Path) -> None:
+    """Remove features, matches and what is known of them. The scene stays; making it again starts from nothing."""
+    for path in scene_dir.glob(database_path(scene_dir / "work").name + "*"):
+        path.unlink()
+    if is_in_the_making(scene_dir):
+        shutil.rmtree(scene_dir / "work")
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _take(lock: int) -> bool:
+        try:
+            msvcrt.locking(lock, msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+
+else:
+    import fcntl
+
+    def _take(lock: int) -> bool:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
