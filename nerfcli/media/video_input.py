@@ -1,0 +1,276 @@
+"""Videos as input: their frames in order, decoded by ffmpeg, upright, with square pixels and their time stamps.
+
+By ffmpeg as a program, and not by OpenCV's VideoCapture: it mirrors frames as well as turning them where the metadata
+ask for it, goes on behind a damaged place, and says what is damaged or missing, where VideoCapture only ends early.
+Frames are handed on one at a time, so that a long video needs no more memory than a short one.
+"""
+
+import math
+import re
+import subprocess
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Generic, TypeVar
+
+import imageio_ffmpeg
+import numpy as np
+
+from nerfcli.errors import UserError
+
+T = TypeVar("T")
+
+# ffmpeg turns and mirrors frames as the metadata say before it filters them.
+_UPRIGHT = "scale=w='max(1,round(iw*if(gt(sar,0),sar,1)))':h=ih,setsar=1,format=rgb24"
+# What ffmpeg says of a file that ends too early, whatever the container.
+_CUT_SHORT = re.compile(r"ended prematurely|partial file|moov atom not found", re.IGNORECASE)
+_ERROR = re.compile(r"\[(error|fatal)\] (.*)")
+_TIME = re.compile(r" pts_time:(\S+)")
+# What ffmpeg would make pictures of although it is no video: text as screen art, photos, lists of other files.
+_NO_VIDEO = re.compile(r"Input #0, (tty|image2|concat|hls|dash|sdp|ico|\w+_pipe)\b")
+_HDR = re.compile(r"smpte2084|arib-std-b67")
+# Channels of the picture formats that say their own size.
+_CHANNELS = {b"P5": 1, b"P6": 3}
+_LINES_KEPT = 60
+
+
+@dataclass(frozen=True)
+class Video:
+    """What the head of a video says.
+
+    width and height are those of its frames, upright and with square pixels. seconds (stated duration) and fps (stated
+    mean frame rate) are NaN where nothing is stated. hdr: the colours are stored for HDR screens (PQ or HLG).
+    """
+
+    path: Path
+    width: int
+    height: int
+    seconds: float
+    fps: float
+    hdr: bool
+
+
+@dataclass(frozen=True)
+class Measured(Generic[T]):
+    """What was measured of each frame, its time (frames,) from the first one on, and how many errors decoding gave."""
+
+    seconds: np.ndarray
+    values: list[T]
+    errors: int
+
+
+def open_video(path: Path) -> Video:
+    """Read the head of a video and its first frame.
+
+    Raises:
+        UserError: no such file, no video in it, or none that can be decoded.
+    """
+    if not path.is_file():
+        raise UserError(f"there is no video {path}", "give a video file, or a folder of photos")
+    if path.stat().st_size == 0:
+        raise UserError(f"{path} is empty (0 bytes)", "copy the video once more")
+    with _decoding(path, _UPRIGHT, "ppm", more=("-frames:v", "1")) as decoder:
+        first = next(decoder.frames(), None)
+        decoder.finish()
+    head = "\n".join(decoder.head)
+    if _NO_VIDEO.search(head) or "matches no streams" in decoder.said:
+        raise UserError(f"there is no video stream in {path}", "give a video file, or a folder of photos")
+    if first is None:
+        raise _unreadable(path, decoder)
+    stream = next((line for line in decoder.head if re.search(r"Stream #0:.* Video: ", line)), "")
+    duration = re.search(r"Duration: (\d+):(\d+):([\d.]+)", head)
+    fps = re.search(r"([\d.]+) fps", stream)
+    return Video(
+        path=path,
+        width=first.shape[1],
+        height=first.shape[0],
+        seconds=int(duration[1]) * 3600 + int(duration[2]) * 60 + float(duration[3]) if duration else math.nan,
+        fps=float(fps[1]) if fps else math.nan,
+        hdr=bool(_HDR.search(stream)),
+    )
+
+
+def measure_frames(
+    video: Video, measure: Callable[[np.ndarray], T], *, longer_side: int, progress: Callable[[float], None]
+) -> Measured[T]:
+    """What `measure` says of every frame, in order.
+
+    Args:
+        video: from `open_video`.
+        measure: gets uint8 (height, width): the frame in grey, averaged down where it is larger than `longer_side`.
+        longer_side: pixels.
+        progress: told the share that is done, 0...1, where the video states its duration and frame rate.
+
+    Raises:
+        UserError: the video is cut short, or cannot be decoded.
+    """
+    factor = max(1.0, max(video.width, video.height) / longer_side)
+    size = f"{max(1, round(video.width / factor))}:{max(1, round(video.height / factor))}"
+    values: list[T] = []
+    with _decoding(video.path, f"showinfo=checksum=0,scale={size}:flags=area,format=gray", "pgm") as decoder:
+        for frame in decoder.frames():
+            values.append(measure(frame))
+            if video.seconds * video.fps > 0:
+                progress(min(1.0, len(values) / (video.seconds * video.fps)))
+        decoder.finish()
+    if decoder.cut_short:
+        raise _cut_short(video, decoder)
+    if not values or decoder.returncode != 0:
+        raise _unreadable(video.path, decoder)
+    return Measured(_times(decoder.times, len(values), video.fps), values, decoder.errors)
+
+
+def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
+    """Some frames in full size, one at a time.
+
+    Args:
+        video: from `open_video`.
+        numbers: which, counted from 0, rising.
+
+    Yields:
+        uint8 (height, width, 3) RGB, upright, with square pixels.
+
+    Raises:
+        UserError: the video has no such frame; it has changed since it was measured.
+    """
+    given = 0
+    with _decoding(video.path, f"select='{_one_of(numbers)}',{_UPRIGHT}", "ppm") as decoder:
+        for frame in decoder.frames():
+            given += 1
+            yield frame
+        decoder.finish()
+    if given != len(numbers):
+        raise _unreadable(video.path, decoder)
+
+
+class _Decoder:
+    """A running ffmpeg: its pictures on stdout, what it says on stderr sorted by a thread of its own.
+
+    Of a long or endless log only this is kept: head, the first lines; said, the last errors; errors, how many there
+    were; times, the seconds that showinfo names; cut_short, whether the file ends too early.
+    """
+
+    def __init__(self, process: "subprocess.Popen[bytes]"):
+        self._process = process
+        self.head: list[str] = []
+        self.times: list[str] = []
+        self.errors = 0
+        self.cut_short = False
+        self._said: deque[str] = deque(maxlen=_LINES_KEPT)
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
+
+    @property
+    def said(self) -> str:
+        """The last errors."""
+        return "\n".join(self._said)
+
+    @property
+    def returncode(self) -> int | None:
+        return self._process.returncode
+
+    def frames(self) -> Iterator[np.ndarray]:
+        """The pictures as they come."""
+        assert self._process.stdout is not None
+        while (picture := _read_picture(self._process.stdout)) is not None:
+            yield picture
+
+    def finish(self) -> None:
+        """Wait for the end, so that everything is heard."""
+        self._process.wait()
+        self._listener.join()
+
+    def _listen(self) -> None:
+        assert self._process.stderr is not None
+        for raw in self._process.stderr:
+            line = raw.decode("utf-8", errors="replace").rstrip()
+            if time := _TIME.search(line):
+                self.times.append(time[1])
+                continue
+            if len(self.head) < _LINES_KEPT:
+                self.head.append(line)
+            self.cut_short = self.cut_short or bool(_CUT_SHORT.search(line))
+            if error := _ERROR.search(line):
+                self.errors += 1
+                self._said.append(error[2])
+
+
+@contextmanager
+def _decoding(path: Path, filters: str, codec: str, *, more: Sequence[str] = ()) -> Iterator[_Decoder]:
+    """ffmpeg at work on the first video stream (covers and thumbnails are none); it is gone when the block ends."""
+    try:
+        ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        hint = "install ffmpeg, or name its program in the variable IMAGEIO_FFMPEG_EXE"
+        raise UserError(f"cannot read {path}: there is no ffmpeg", hint) from error
+    command = [
+        *(ffmpeg, "-hide_banner", "-nostats", "-nostdin", "-loglevel", "level+info"),
+        # "file:", because a colon in a name would read as a protocol; and no list of files may lead elsewhere.
+        *("-protocol_whitelist", "file,pipe", "-i", f"file:{path}", "-map", "0:V:0"),
+        # Each frame once, whatever its time: else ffmpeg repeats and drops frames to make the rate constant.
+        *("-fps_mode", "passthrough", "-vf", filters, *more, "-c:v", codec, "-f", "image2pipe", "-"),
+    ]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    decoder = _Decoder(process)
+    try:
+        yield decoder
+    finally:
+        process.kill()
+        decoder.finish()
+        for pipe in (process.stdout, process.stderr):
+            assert pipe is not None
+            with suppress(OSError):
+                pipe.close()
+
+
+def _read_picture(pipe: IO[bytes]) -> np.ndarray | None:
+    """The next PGM or PPM picture of 8 bits; None at the end, even if it comes amid one."""
+    magic = pipe.readline().strip()
+    if not magic:
+        return None
+    channels = _CHANNELS[magic]
+    width, height = (int(text) for text in pipe.readline().split())
+    assert pipe.readline().strip() == b"255"
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    pixels = pipe.read(width * height * channels)
+    return np.frombuffer(pixels, np.uint8).reshape(shape) if len(pixels) == width * height * channels else None
+
+
+def _one_of(numbers: Sequence[int]) -> str:
+    """ffmpeg's expression for "the number is one of these": a search tree, since sums of 100 terms are too deep."""
+    if len(numbers) == 1:
+        return f"eq(n,{numbers[0]})"
+    half = len(numbers) // 2
+    return f"if(lt(n,{numbers[half]}),{_one_of(numbers[:half])},{_one_of(numbers[half:])})"
+
+
+def _times(stamps: Sequence[str], count: int, fps: float) -> np.ndarray:
+    """Seconds from the first frame on; from the frame rate where the stamps are missing or do not rise."""
+    with suppress(ValueError):
+        seconds = np.array([float(stamp) for stamp in stamps])
+        if len(seconds) == count and np.isfinite(seconds).all() and (np.diff(seconds) > 0).all():
+            return seconds - seconds[0]
+    return np.arange(count) / (fps if fps > 0 else 30.0)
+
+
+def _cut_short(video: Video, decoder: _Decoder) -> UserError:
+    readable = _times(decoder.times, len(decoder.times), video.fps)
+    until = f"{readable[-1]:.1f} s" if len(readable) else "the start"
+    stated = f" of {video.seconds:.1f} s" if video.seconds > 0 else ""
+    return UserError(
+        f"{video.path} is cut short: it can be read up to {until}{stated}",
+        "copy the video once more, or save the part that is there as a new one: ffmpeg -i OLD.mp4 -c copy NEW.mp4",
+    )
+
+
+def _unreadable(path: Path, decoder: _Decoder) -> UserError:
+    said = decoder.said.splitlines()
+    reason = said[0] if said else "no frame can be decoded"
+    if decoder.cut_short:
+        return UserError(f"{path} is cut short: {reason}", "copy the video once more")
+    return UserError(
+        f"{path} cannot be read as a video: {reason}", "copy the video once more, or save it as MP4 (H.264)"
+    )

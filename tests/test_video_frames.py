@@ -1,0 +1,173 @@
+"""nerfcli.poses.frame_choice and video_frames: the sharpest frame of each stretch, nothing twice, nothing lost."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clips import encode, pan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.poses.frame_choice import MOVED_SHARE, FrameMeasure, FrameMeter, MotionPicture, choose_frames
+from nerfcli.poses.pairs import capture_order
+from nerfcli.poses.video_frames import FRAMES_FILE, extract_frames, frames_folder
+
+# One frame in five is sharp; each moves by 2 pixels of 160.
+SHARP = [3, 5, 13, 19, 20, 26, 34, 36]
+MOVING = [2.0 * number for number in range(40)]
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> Path:
+    """A camera that moves steadily, its frames blurred but for one in each fifth of a second at 25 per second."""
+    blurred = [number for number in range(40) if number not in SHARP]
+    return encode(tmp_path_factory.mktemp("clip") / "clip.mp4", pan(MOVING, blurred=blurred), fps=25)
+
+
+def extract(path: Path, folder: Path, *, count: int | None = None, overwrite: bool = False) -> list[str]:
+    """Extract frames and return the notes."""
+    notes: list[str] = []
+    shares: list[float] = []
+    extract_frames(
+        path,
+        folder,
+        count=count,
+        overwrite=overwrite,
+        notify=notes.append,
+        progress=lambda share, what: shares.append(share),
+    )
+    assert shares == sorted(shares)
+    return notes
+
+
+def numbers_in(folder: Path) -> list[int]:
+    return [int(path.stem.removeprefix("frame_")) for path in sorted(folder.glob("*.jpg"))]
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.5, 1.0, 3.0, 8.0])
+def test_motion_is_the_share_of_the_longer_side(shift):
+    """Closed form: a picture 160 wide that moves by `shift` pixels."""
+    one, other = pan([10.0, 10.0 + shift])
+    assert MotionPicture(one).moved_to(MotionPicture(other)) == pytest.approx(shift / 160, abs=0.1 / 160)
+
+
+def test_another_scene_has_moved_and_a_blank_wall_has_not():
+    (one,), other = pan([0.0]), np.random.default_rng(1).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    assert MotionPicture(one).moved_to(MotionPicture(other)) > MOVED_SHARE
+    grey = np.full((120, 160), 100, np.uint8)
+    assert MotionPicture(grey).moved_to(MotionPicture(grey + 1)) == 0
+    assert MotionPicture(grey).moved_to(MotionPicture(grey + 50)) == np.inf
+
+
+def test_the_sharp_frame_of_each_stretch_is_taken(clip, tmp_path):
+    """Truth by construction: one frame in each of eight stretches is sharp."""
+    (note,) = extract(clip, tmp_path / "frames", count=8)
+    assert numbers_in(tmp_path / "frames") == SHARP
+    assert note.endswith("8 of 40 frames of clip.mp4")
+    content = json.loads((tmp_path / "frames" / FRAMES_FILE).read_text())
+    assert [frame["number"] for frame in content["frames"]] == SHARP
+    np.testing.assert_allclose([frame["seconds"] for frame in content["frames"]], np.array(SHARP) / 25, atol=1e-3)
+
+
+def test_the_names_are_in_the_order_of_capture(clip, tmp_path):
+    extract(clip, tmp_path / "frames", count=8)
+    assert capture_order([path.name for path in sorted((tmp_path / "frames").glob("*.jpg"))]) == list(range(8))
+
+
+def test_the_same_video_gives_the_same_bytes(clip, tmp_path):
+    for name in ("one", "two"):
+        extract(clip, tmp_path / name, count=8)
+    one, two = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("one", "two"))
+    assert one == two
+
+
+def test_a_camera_that_stands_still_gets_no_frames_for_it(tmp_path):
+    """2 s of motion, 4 s of standing with noise, 2 s of motion: nothing from the standing but its ends."""
+    offsets = [*np.arange(50), *np.full(100, 50.0), *range(50, 100)]
+    noise = np.random.default_rng(0).normal(scale=3, size=(200, 120, 160, 1))
+    frames = [np.clip(f + n, 0, 255).astype(np.uint8) for f, n in zip(pan(offsets), noise, strict=True)]
+    extract(encode(tmp_path / "a.mp4", frames, fps=25), tmp_path / "frames", count=20)
+    numbers = np.array(numbers_in(tmp_path / "frames"))
+    assert len(numbers) == 20
+    assert np.sum((numbers > 52) & (numbers < 148)) <= 2
+    distances = np.diff(np.array(offsets)[numbers]) / 160
+    assert distances.min() > 0.9 * MOVED_SHARE
+
+
+def test_a_camera_that_never_moves_is_told(tmp_path):
+    path = encode(tmp_path / "still.mp4", pan([0.0] * 30))
+    with pytest.raises(UserError, match="shows only 1 different pictures, at least 4") as error:
+        extract(path, tmp_path / "frames", count=10)
+    assert error.value.exit_code == TOO_FEW_PHOTOS
+    assert not (tmp_path / "frames").exists()
+
+
+def test_frames_are_kept_and_not_replaced_unasked(clip, tmp_path):
+    folder = tmp_path / "frames"
+    extract(clip, folder, count=8)
+    before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
+    (note,) = extract(clip, folder, count=8, overwrite=True)
+    assert "is kept: it holds the 8 frames asked for" in note
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+    with pytest.raises(UserError, match=r"holds other frames: 8 of clip\.mp4"):
+        extract(clip, folder, count=6)
+    assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+    extract(clip, folder, count=6, overwrite=True)
+    assert len(numbers_in(folder)) == 6
+
+
+def test_frames_that_were_thrown_out_by_hand_stay_out(clip, tmp_path):
+    folder = tmp_path / "frames"
+    extract(clip, folder, count=8)
+    (folder / "frame_000013.jpg").unlink()
+    (note,) = extract(clip, folder, count=8)
+    assert note.endswith("1 of them are no longer there")
+    extract(clip, folder, count=8, overwrite=True)
+    assert numbers_in(folder) == SHARP
+
+
+def test_a_folder_of_something_else_is_never_replaced(clip, tmp_path):
+    (tmp_path / "letters.txt").write_text("dear")
+    with pytest.raises(UserError, match="it holds something else"):
+        extract(clip, tmp_path, count=8, overwrite=True)
+    assert (tmp_path / "letters.txt").read_text() == "dear"
+
+
+def test_fewer_frames_than_asked(clip, tmp_path):
+    with pytest.raises(UserError, match=r"has 40 frames, 41 were asked for") as error:
+        extract(clip, tmp_path / "frames", count=41)
+    assert "--frames 40 or fewer" in error.value.hint
+    extract(clip, tmp_path / "frames")  # without a number: as many as there are that differ
+    assert len(numbers_in(tmp_path / "frames")) == 40
+
+
+@given(data=st.data(), total=st.integers(1, 40))
+def test_as_many_rising_numbers_as_asked_for(data, total):
+    """Whatever the measures, infinite motion and equal sharpness included."""
+    moved = data.draw(st.lists(st.sampled_from([0.0, 0.004, 0.01, 0.3, np.inf]), min_size=total, max_size=total))
+    sharp = data.draw(st.lists(st.integers(0, 3), min_size=total, max_size=total))
+    steps = data.draw(st.lists(st.sampled_from([0.01, 0.04, 1.0]), min_size=total, max_size=total))
+    count = data.draw(st.integers(1, total))
+    measures = [FrameMeasure(float(s), m) for s, m in zip(sharp, moved, strict=True)]
+    numbers = choose_frames(np.cumsum(steps), measures, count=count)
+    assert len(numbers) == count
+    assert numbers == sorted(set(numbers))
+    assert numbers[0] >= 0
+    assert numbers[-1] < total
+
+
+def test_a_meter_keeps_one_picture():
+    meter = FrameMeter()
+    moved = [meter.measure(frame[..., 0]).moved for frame in pan([0.0, 1.0, 2.0, 3.0, 4.0])]
+    assert moved[0] == np.inf
+    # Against the anchor, which becomes the frame that has moved by 1 %, 1.6 of 160 pixels.
+    np.testing.assert_allclose(moved[1:], np.array([1, 2, 1, 2]) / 160, atol=0.1 / 160)
+
+
+@pytest.mark.parametrize(
+    ("scene", "frames"), [("a/clip-scene", "a/clip-frames"), ("kitchen", "kitchen-frames"), ("out/scene", "out/frames")]
+)
+def test_frames_stand_beside_the_scene(scene, frames):
+    assert frames_folder(Path(scene)) == Path(frames)
