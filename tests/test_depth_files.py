@@ -3,7 +3,7 @@
 import json
 import math
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,30 +14,17 @@ import numpy as np
 import OpenEXR
 import pytest
 import tifffile
+from depth_maps import ALL, FLOATS, FULL_META, META, plain_depth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.arrays import write_npy, write_npz
 from nerfcli.media.depth import DepthMeta, difference_of, refuse_mixing
 from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import linear_light, write_exr
 from nerfcli.media.float_tiff import read_tiff, write_tiff
 from nerfcli.media.levels import LARGEST_LEVEL, chosen_scale, depth_of_levels, write_png16
-
-META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
-FULL_META = DepthMeta(
-    convention="background",
-    axis="z",
-    unit="metre",
-    opacity_floor=1 / 3,
-    background_distance=12.25,
-    unit_source="GPS, ± 0.3 %",
-    error_bounds={"truncation_max": 1e-5, "words": "bounds the rendering"},
-    view={"name": "Küche 北.jpg", "camera": {"model": "PINHOLE", "width": 53, "height": 37, "params": [50.0, 1 / 3]}},
-    provenance={"run": "kitchen", "field_sha256": "ab" * 32},
-)
 
 
 def odd_depth() -> np.ndarray:
@@ -46,35 +33,6 @@ def odd_depth() -> np.ndarray:
     depth[0, :2] = np.array([0x7FC00000, 0xFFC12345], np.uint32).view(np.float32)
     depth[0, 2:8] = [np.inf, -np.inf, 0.0, -0.0, 1e-45, np.finfo(np.float32).max]
     return depth
-
-
-def plain_depth() -> np.ndarray:
-    """Between 0.5 and 60, a tenth of it without a value."""
-    generator = np.random.default_rng(1)
-    depth = generator.uniform(0.5, 60.0, (37, 53)).astype(np.float32)
-    depth[generator.random(depth.shape) < 0.1] = np.nan
-    return depth
-
-
-def write_tiff_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
-    write_tiff(path, depth, meta)
-
-
-def write_exr_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
-    write_exr(path, {"depth": depth}, meta)
-
-
-def write_npz_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
-    write_npz(path, {"depth": depth}, meta)
-
-
-def write_png_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
-    write_png16(path, depth, meta, units_per_level=1e-3)
-
-
-Writer = Callable[[Path, np.ndarray, DepthMeta], None]
-FLOATS: dict[str, Writer] = {".tiff": write_tiff_of, ".exr": write_exr_of, ".npz": write_npz_of, ".npy": write_npy}
-ALL: dict[str, Writer] = {**FLOATS, ".png": write_png_of}
 
 
 def read_elsewhere(path: Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""nerfcli info: what a folder is, and what is in it."""
+"""nerfcli info: what a folder or a file is, and what is in it."""
 
 import json as json_module
 from pathlib import Path
@@ -9,19 +9,28 @@ import typer
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json
+from nerfcli.cli.words import words_of
 
 
 @command
 def info(
-    path: Annotated[str, typer.Argument(help="A scene or a run, or - for paths on standard input.")],
+    path: Annotated[
+        str, typer.Argument(help="A scene, a run, renders, or one file of them; - for paths on standard input.")
+    ],
     json: Json = False,
 ) -> None:
     """Say what a scene or a run holds: cameras, photos, missing files, split, unit; settings, time, numbers.
 
     \b
+    Of a depth file (TIFF, EXR, NPZ, NPY, PNG), a picture, a video or a folder of renders: which depth it is, along
+    which axis, in which unit and how that is known, what stands for no value, which camera saw it, which run it is of,
+    and the range of its numbers. Of depth that another program wrote: what can be known, and what nobody states.
+
+    \b
     Examples:
       nerfcli info photos-scene
       nerfcli info photos-scene-run --json
+      nerfcli info photos-scene-run/renders/test-conditional-z/depth/a.tiff
     """
     console = Console(quiet=True, json_lines=True)
 
@@ -29,6 +38,8 @@ def info(
         content = describe(folder)
         if json:
             console.result(folder, content)
+        elif "in_words" in content:
+            typer.echo("\n".join([str(folder), *(f"  {line}" for line in words_of(content))]))
         else:
             typer.echo("\n".join([str(folder), *(f"  {key}: {_text(value)}" for key, value in content.items())]))
 
@@ -36,7 +47,15 @@ def info(
 
 
 def describe(folder: Path) -> dict[str, Any]:
-    """The facts of a run where there is one, else of a scene."""
+    """The facts of a file of depth, pictures or video, of renders, or of a run; else of a scene."""
+    from nerfcli.media.facts import RENDERS, file_facts, renders_facts
+
+    if folder.name == RENDERS:
+        folder = folder.parent
+    if folder.is_file() and folder.suffix.lower() != ".json":
+        return file_facts(folder)
+    if (folder / RENDERS).exists():
+        return renders_facts(folder)
     from nerfcli.train.run_folder import CONFIG
 
     return _describe_run(folder) if (folder / CONFIG).exists() else _describe_scene(folder)

@@ -61,11 +61,13 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         UserError: missing, damaged, or with other contents than numbers and text.
     """
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return {"array": loaded}
-        with loaded:
-            return {name: loaded[name] for name in loaded.files if name != META}
+        # Opened here, because NumPy leaves a file open that it cannot read.
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            if isinstance(loaded, np.ndarray):
+                return {"array": loaded}
+            with loaded:
+                return {name: loaded[name] for name in loaded.files if name != META}
     except FileNotFoundError as error:
         raise UserError(f"cannot read {path}: {error.strerror}", "give a .npy or .npz file") from error
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:

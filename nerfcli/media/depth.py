@@ -58,6 +58,7 @@ class DepthMeta:
             rendering of the field, not the field.
         view: the camera of the map: name, camera (model, width, height, params), world_from_cam; plain values.
         provenance: run, field_sha256 and what else says how the map was made; plain values.
+        layers: what else stands in the same file, by name: convention and opacity_floor of the other maps.
 
     Raises:
         ValueError: another axis or quantity.
@@ -75,6 +76,7 @@ class DepthMeta:
     error_bounds: dict[str, Any] = field(default_factory=dict)
     view: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
+    layers: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
         if self.axis not in AXES:
@@ -82,15 +84,18 @@ class DepthMeta:
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity must be one of {', '.join(QUANTITIES)}, got {self.quantity}")
 
-    def of(self, quantity: str) -> Self:
-        """The meaning of another map of the same picture.
-
-        The spread belongs to the same rays and axis; the disagreement is between two depths that are named in its
-        own convention.
-        """
+    def of(self, quantity: str, *, opacity_floor: float | None = None) -> Self:
+        """The meaning of another map of the same picture, along the same axis; the floor too if none is given."""
         if quantity == self.quantity:
             return self
-        return replace(self, quantity=quantity, convention=CONVENTION_OF[quantity], background_distance=None)
+        floor = self.opacity_floor if opacity_floor is None else opacity_floor
+        convention = CONVENTION_OF[quantity]
+        return replace(self, quantity=quantity, convention=convention, opacity_floor=floor, background_distance=None)
+
+    @property
+    def title(self) -> str:
+        """A few words for legends: "conditional depth", "spread"."""
+        return f"{self.convention} depth" if self.quantity == "depth" else self.quantity
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, with the format and the version that wrote them."""
@@ -123,8 +128,7 @@ class DepthMeta:
         meaning = _IN_WORDS.get(convention, "")
         if convention == "quantile":
             meaning = f"the distance at which {share} of all light has ended"
-        what = f"{self.convention} {self.quantity}" if self.quantity == "depth" else self.quantity
-        return f"{what} {AXES[self.axis]}, in {unit}{source}" + (f": {meaning}" if meaning else "")
+        return f"{self.title} {AXES[self.axis]}, in {unit}{source}" + (f": {meaning}" if meaning else "")
 
 
 def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:
@@ -134,6 +138,11 @@ def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:
         if a != b:
             return f"{name.replace('_', ' ')} {a} and {b}"
     return None
+
+
+def as_floats(meta: DepthMeta) -> DepthMeta:
+    """The meaning of a map once its levels are read as lengths."""
+    return replace(meta, invalid="nan", units_per_level=None)
 
 
 def refuse_mixing(metas: Iterable[tuple[Path, DepthMeta]]) -> None:

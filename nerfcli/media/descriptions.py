@@ -84,12 +84,13 @@ def _of_exr(path: Path) -> str | None:
 
 
 def _of_npz(path: Path) -> str | None:
-    with np.load(path, allow_pickle=False) as archive:
+    # Opened here, because NumPy leaves a file open that it cannot read.
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         return str(archive["meta"]) if "meta" in archive.files else None
 
 
 def _of_npy(path: Path) -> str | None:
-    np.load(path, allow_pickle=False, mmap_mode="r")
+    path.stat()
     sidecar = path.with_suffix(".json")
     return sidecar.read_text(encoding="utf-8") if sidecar.is_file() else None
 

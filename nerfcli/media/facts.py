@@ -3,7 +3,8 @@
 A file of another program is told as what it is: numbers whose convention nobody states.
 """
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,15 @@ from PIL import Image
 
 from nerfcli.errors import UserError
 from nerfcli.media.arrays import read_arrays
-from nerfcli.media.depth import FORMAT, DepthMeta
-from nerfcli.media.descriptions import VIDEO_SUFFIXES, damaged, description_of
+from nerfcli.media.depth import FORMAT, DepthMeta, as_floats, refuse_mixing
+from nerfcli.media.descriptions import VIDEO_SUFFIXES, damaged, depth_meta_of, description_of
 from nerfcli.media.exr import CHANNELS, read_exr
 from nerfcli.media.float_tiff import read_any_tiff
 from nerfcli.media.levels import depth_of_levels
 
 _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npz": "NPZ", ".npy": "NPY", ".png": "PNG"}
+# What an export writes about itself, beside the folders of its outputs.
+RENDERS = "render.json"
 NOT_STATED = (
     "nothing in the file says which depth this is (mean, median, ...), along the ray or the optical axis, in which unit"
 )
@@ -52,6 +55,53 @@ def file_facts(path: Path) -> dict[str, Any]:
     if meta is None and content["kind"] in ("array", "levels"):
         content["note"] = f"{NOT_STATED}; {_LEVELS_NOT_STATED}" if content["kind"] == "levels" else NOT_STATED
     return content
+
+
+def renders_facts(folder: Path) -> dict[str, Any]:
+    """The facts of a folder that `nerfcli render` wrote.
+
+    Keys: kind ("renders"), format, frames, meaning and in_words of its depth, files: how many depth files say so,
+    outputs, run.
+
+    Raises:
+        UserError: its description cannot be read, or its depth files do not mean the same.
+    """
+    try:
+        content = json.loads((folder / RENDERS).read_text(encoding="utf-8"))
+        frames, settings = content["frames"], content["settings"]
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise UserError(f"{folder / RENDERS} cannot be read: {error}", "render again with --overwrite") from error
+    entries = content.get("depth_meaning")
+    meta = _meta(folder / RENDERS, entries)
+    counted = 0
+    for kind in sorted(path for path in folder.iterdir() if path.is_dir()):
+        metas = [*_depth_metas(kind)]
+        counted += len(metas)
+        stated = [] if meta is None else [(folder / RENDERS, meta)]
+        same_kind = [pair for pair in metas if meta is None or pair[1].quantity == meta.quantity]
+        refuse_mixing([*stated, *((path, as_floats(found)) for path, found in same_kind)])
+        for quantity in {found.quantity for _, found in metas}:
+            refuse_mixing((path, found) for path, found in metas if found.quantity == quantity)
+    return {
+        "kind": "renders",
+        "format": "folder",
+        "frames": len(frames),
+        "files": counted,
+        "meaning": entries,
+        "in_words": "" if meta is None else meta.in_words(),
+        "outputs": settings.get("outputs"),
+        "run": content.get("run"),
+    }
+
+
+def _depth_metas(folder: Path) -> Iterator[tuple[Path, DepthMeta]]:
+    """Every file of numbers below a folder that says what its depth means."""
+    for path in sorted(folder.rglob("*")):
+        if path.suffix in _KINDS and path.is_file():
+            meta = depth_meta_of(path)
+            # Previews carry the meaning of what they show; they are no numbers.
+            if meta is not None and (path.suffix != ".png" or meta.units_per_level is not None):
+                yield path, meta
 
 
 def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
@@ -99,7 +149,8 @@ def _png_facts(path: Path, meta: DepthMeta | None) -> dict[str, Any]:
     facts: dict[str, Any] = {"format": "PNG", "width": pixels.shape[1], "height": pixels.shape[0]}
     if levels and meta is not None and meta.units_per_level is not None:
         depth = depth_of_levels(pixels, meta.units_per_level)
-        return {"kind": "depth", **facts, "maps": _statistics({meta.quantity: depth})}
+        statistics = {**_range(depth), "dtype": f"{pixels.dtype} levels"}
+        return {"kind": "depth", **facts, "maps": {meta.quantity: statistics}}
     if levels:
         return {"kind": "levels", **facts, "maps": _statistics({"levels": pixels}), "texts": texts}
     texts = {key: value for key, value in texts.items() if key != "nerfcli" or meta is None}

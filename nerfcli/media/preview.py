@@ -75,7 +75,7 @@ def _legend(meta: DepthMeta, *, lo: float, hi: float, width: int) -> np.ndarray:
     size = min(max(round(width / 40), 12), 28)
     font = ImageFont.load_default(size)
     unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
-    lines = [f"{meta.convention} depth in {unit}", f"{AXES[meta.axis]}; hatched: no value"]
+    lines = [f"{meta.title} in {unit}", f"{AXES[meta.axis]}; hatched: no value"]
     numbers = _tick_labels(lo, hi, suffix=" m" if meta.unit == "metre" else "")
     margin, line = size, round(1.4 * size)
     numbers_width = len(numbers) * max(font.getlength(f"  {text}") for text in numbers)

@@ -1,0 +1,89 @@
+"""Facts of depth files, pictures and videos as lines for people."""
+
+from collections.abc import Iterator
+from typing import Any
+
+
+def words_of(facts: dict[str, Any]) -> list[str]:
+    """The facts of `media.facts.file_facts` or of a folder of renders, a line each; what is not known is not said."""
+    return [
+        *_what(facts),
+        *([facts["in_words"]] if facts["in_words"] else []),
+        *([facts["note"]] if facts.get("note") else []),
+        *_maps(facts),
+        *_meaning(facts.get("meaning") or {}),
+        *(f"{key}: {value}" for key, value in facts.get("texts", {}).items()),
+    ]
+
+
+def _what(facts: dict[str, Any]) -> Iterator[str]:
+    kinds = {
+        "depth": "depth file",
+        "preview": "picture of a depth map; its colours are no numbers",
+        "array": "numbers of another program",
+        "levels": "16-bit levels of another program",
+    }
+    size = f", {facts['width']}x{facts['height']}" if "width" in facts else ""
+    frames = f", {facts['frames']} frames" if "frames" in facts else ""
+    rate = f" at {facts['fps']:g} a second" if facts.get("fps") else ""
+    files = f", {facts['files']} depth files that mean the same" if facts.get("files") else ""
+    yield f"{kinds.get(facts['kind'], facts['kind'])} ({facts['format']}{size}{frames}{rate}{files})"
+
+
+def _maps(facts: dict[str, Any]) -> Iterator[str]:
+    """The range of each map; lengths with their unit."""
+    meaning = facts.get("meaning") or {}
+    unit = {"metre": " m", "arbitrary": " units"}.get(meaning.get("unit", ""), "")
+    for name, of_map in facts.get("maps", {}).items():
+        suffix = unit if name in ("depth", "spread", "disagreement") else ""
+        shape = "" if len(of_map["shape"]) == 2 else f" {'x'.join(map(str, of_map['shape']))}"
+        line = f"{name}: {of_map['dtype']}{shape}"
+        if "valid_share" in of_map:
+            line += f", {100 * of_map['valid_share']:.1f} % valid"
+        if "min" in of_map:
+            line += f", {of_map['min']:.6g} to {of_map['max']:.6g}, median {of_map['median']:.6g}{suffix}"
+        yield line
+
+
+def _meaning(meaning: dict[str, Any]) -> Iterator[str]:
+    if not meaning:
+        return
+    invalid = {"nan": "NaN", "0": "0"}.get(meaning.get("invalid", "nan"), "marked")
+    if meaning["opacity_floor"] > 0:
+        yield f"pixels less opaque than {meaning['opacity_floor']:g} have no value ({invalid})"
+    if meaning.get("background_distance") is not None:
+        yield f"what passes counts at the background distance, {meaning['background_distance']:.6g}"
+    if meaning.get("units_per_level") is not None:
+        yield f"value = level x {meaning['units_per_level']:g}"
+    if meaning["unit"] != "metre":
+        yield "the scale of the scene is not known: lengths are in the units of its world, not in metres"
+    elif not meaning.get("unit_source"):
+        yield "how the metre is known was not written down"
+    for name, layer in meaning.get("layers", {}).items():
+        yield f"also in the file: {name} ({layer.get('convention')})"
+    bounds = dict(meaning.get("error_bounds", {}))
+    if "rounding_max" in bounds:
+        yield f"rounding to levels changed no depth by more than {bounds.pop('rounding_max'):.3g}"
+    if bounds:
+        listed = ", ".join(f"{name} {_number(value)}" for name, value in bounds.items())
+        yield f"error of the rendering: {listed}; it bounds the rendering, not the field"
+    yield from _camera(meaning.get("view", {}))
+    made = {**meaning.get("provenance", {})}
+    if made or meaning.get("nerfcli"):
+        listed = ", ".join(f"{name} {str(value)[:16]}" for name, value in made.items())
+        yield f"made by nerfcli {meaning.get('nerfcli', '?')}" + (f": {listed}" if listed else "")
+
+
+def _camera(view: dict[str, Any]) -> Iterator[str]:
+    if not view:
+        return
+    camera, pose = view.get("camera", {}), view.get("world_from_cam")
+    parameters = " ".join(f"{value:.6g}" for value in camera.get("params", []))
+    line = f"camera of {view.get('name')}: {camera.get('model')} {camera.get('width')}x{camera.get('height')}"
+    yield f"{line}, parameters {parameters}"
+    if pose:
+        yield f"its centre in the world: {' '.join(f'{row[3]:.6g}' for row in pose[:3])}"
+
+
+def _number(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

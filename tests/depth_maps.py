@@ -1,0 +1,50 @@
+"""Depth maps, their meanings, and the writers of all formats under one signature."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.media.arrays import write_npy, write_npz
+from nerfcli.media.depth import DepthMeta
+from nerfcli.media.exr import write_exr
+from nerfcli.media.float_tiff import write_tiff
+from nerfcli.media.levels import write_png16
+
+META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
+FULL_META = DepthMeta(
+    convention="background",
+    axis="z",
+    unit="metre",
+    opacity_floor=1 / 3,
+    background_distance=12.25,
+    unit_source="GPS, ± 0.3 %",
+    error_bounds={"truncation_max": 1e-5, "words": "bounds the rendering"},
+    view={"name": "Küche 北.jpg", "camera": {"model": "PINHOLE", "width": 53, "height": 37, "params": [50.0, 1 / 3]}},
+    provenance={"run": "kitchen", "field_sha256": "ab" * 32},
+)
+
+
+def plain_depth() -> np.ndarray:
+    """Between 0.5 and 60, a tenth of it without a value."""
+    generator = np.random.default_rng(1)
+    depth = generator.uniform(0.5, 60.0, (37, 53)).astype(np.float32)
+    depth[generator.random(depth.shape) < 0.1] = np.nan
+    return depth
+
+
+def write_exr_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
+    write_exr(path, {"depth": depth}, meta)
+
+
+def write_npz_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
+    write_npz(path, {"depth": depth}, meta)
+
+
+def write_png_of(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
+    write_png16(path, depth, meta, units_per_level=1e-3)
+
+
+Writer = Callable[[Path, np.ndarray, DepthMeta], None]
+FLOATS: dict[str, Writer] = {".tiff": write_tiff, ".exr": write_exr_of, ".npz": write_npz_of, ".npy": write_npy}
+ALL: dict[str, Writer] = {**FLOATS, ".png": write_png_of}

@@ -1,0 +1,177 @@
+"""nerfcli info on files: what ours say of themselves, what is known of others', damage told in two lines."""
+
+import json
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import OpenEXR
+import pytest
+import tifffile
+from depth_maps import ALL, FULL_META, META, plain_depth
+from PIL import Image
+from typer.testing import CliRunner, Result
+
+from nerfcli import cli
+from nerfcli.media.depth import KEY
+from nerfcli.media.descriptions import description_of
+from nerfcli.media.exr import write_exr
+from nerfcli.media.facts import NOT_STATED, RENDERS
+from nerfcli.media.float_tiff import write_tiff
+from nerfcli.media.images import write_png
+from nerfcli.media.levels import write_png16
+
+
+def info(*arguments: str | Path) -> Result:
+    result = CliRunner().invoke(cli.app, ["info", *map(str, arguments)])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.mark.parametrize("suffix", ALL)
+def test_a_depth_file_tells_all_that_it_knows(suffix, tmp_path):
+    path, depth = tmp_path / f"a{suffix}", plain_depth()
+    ALL[suffix](path, depth, FULL_META)
+    told = json.loads(info(path, "--json").stdout)
+    assert told["kind"] == "depth"
+    assert (told["width"], told["height"]) == (53, 37)
+    meaning = told["meaning"]
+    for name in ("convention", "axis", "unit", "unit_source", "opacity_floor", "background_distance", "view"):
+        assert meaning[name] == getattr(FULL_META, name)
+    assert meaning["provenance"] == FULL_META.provenance
+    tolerance = 0.5e-3 + 1e-5 if suffix == ".png" else 1e-6
+    numbers = told["maps"]["depth"]
+    assert numbers["valid_share"] == pytest.approx(np.isfinite(depth).mean())
+    for name, expected in (("min", np.nanmin), ("max", np.nanmax), ("median", np.nanmedian)):
+        assert numbers[name] == pytest.approx(float(expected(depth)), abs=tolerance)
+    text = info(path).stdout
+    for expected in (
+        "background depth along the optical axis (z), in metres (known from: GPS, ± 0.3 %)",
+        "pixels less opaque than 0.333333 have no value (" + ("0)" if suffix == ".png" else "NaN)"),
+        "background distance, 12.25",
+        "it bounds the rendering, not the field",
+        "camera of Küche 北.jpg: PINHOLE 53x37, parameters 50 0.333333",
+        "run kitchen",
+    ):
+        assert expected in text, expected
+
+
+def test_levels_tell_their_scale_and_rounding(tmp_path):
+    write_png16(tmp_path / "a.png", plain_depth(), META, units_per_level=2e-3)
+    text = info(tmp_path / "a.png").stdout
+    assert "value = level x 0.002" in text
+    assert "rounding to levels changed no depth by more than 0.001" in text
+    assert "the scale of the scene is not known" in text
+
+
+def test_several_maps_in_a_file_are_each_told(tmp_path):
+    depth = plain_depth()
+    meta = replace(META, layers={"spread": {"convention": "standard-deviation", "opacity_floor": 0.5}})
+    write_exr(tmp_path / "a.exr", {"depth": depth, "spread": depth / 10, "opacity": np.ones_like(depth)}, meta)
+    told = json.loads(info(tmp_path / "a.exr", "--json").stdout)
+    assert set(told["maps"]) == {"depth", "spread", "opacity"}
+    assert told["maps"]["spread"]["max"] == pytest.approx(np.nanmax(depth) / 10)
+    assert "also in the file: spread (standard-deviation)" in info(tmp_path / "a.exr").stdout
+
+
+def test_depth_of_another_program_is_told_as_what_nobody_states(tmp_path):
+    depth = plain_depth()
+    tifffile.imwrite(tmp_path / "a.tif", depth)
+    np.save(tmp_path / "a.npy", depth)
+    np.savez(tmp_path / "a.npz", depth=depth)
+    Image.fromarray((np.nan_to_num(depth) * 1000).astype(np.uint16)).save(tmp_path / "a.png")
+    OpenEXR.File({}, {"V": depth}).write(str(tmp_path / "a.exr"))
+    for path in sorted(tmp_path.iterdir()):
+        told = json.loads(info(path, "--json").stdout)
+        assert told["meaning"] is None, path
+        assert told["note"].startswith(NOT_STATED), path
+        assert (told["width"], told["height"]) == (53, 37), path
+        (numbers,) = told["maps"].values()
+        assert numbers["max"] == pytest.approx(np.nanmax(depth) * (1000 if path.suffix == ".png" else 1), rel=1e-4)
+        assert NOT_STATED in info(path).stdout, path
+    assert "often a millimetre" in info(tmp_path / "a.png").stdout
+
+
+def test_arrays_that_are_no_pictures_are_told_by_their_shape(tmp_path):
+    np.savez(tmp_path / "a.npz", poses=np.zeros((5, 3, 4)), names=np.array(["a", "b"]), empty=np.zeros((0, 3)))
+    told = json.loads(info(tmp_path / "a.npz", "--json").stdout)
+    assert {name: facts["shape"] for name, facts in told["maps"].items()} == {
+        "poses": [5, 3, 4],
+        "names": [2],
+        "empty": [0, 3],
+    }
+
+
+def test_a_preview_is_not_taken_for_numbers(tmp_path):
+    write_png(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8), metadata={KEY: META.to_text(), "range": "1.0 2.0"})
+    text = info(tmp_path / "a.png").stdout
+    assert "picture of a depth map; its colours are no numbers" in text
+    assert "conditional depth along the ray" in text
+    assert "range: 1.0 2.0" in text
+
+
+def test_the_comment_of_a_video_is_read_back(tmp_path):
+    """Everything that ffmpeg escapes: =, ;, #, backslash, line ends."""
+    path = tmp_path / "a;b #1.mp4"
+    told = {**META.to_json(), "provenance": {"run": "a=b;c#d\\e\nf 北"}}
+    frames = np.zeros((3, 16, 16, 3), np.uint8).tobytes()
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "16x16"]
+    command += ["-r", "12", "-i", "-", "-metadata", f"comment={json.dumps(told, indent=1)}", f"file:{path}"]
+    subprocess.run(command, input=frames, check=True)
+    assert description_of(path) == told
+    content = json.loads(info(path, "--json").stdout)
+    assert (content["kind"], content["width"], content["height"], content["frames"]) == ("video", 16, 16, 3)
+    assert content["meaning"]["provenance"]["run"] == "a=b;c#d\\e\nf 北"
+
+
+@pytest.mark.parametrize("suffix", [".tiff", ".exr", ".npz", ".npy", ".png", ".mp4"])
+def test_a_damaged_file_is_told_in_two_lines(suffix, tmp_path, capfd):
+    """Cut anywhere, it is refused: never half a map, no traceback, no chatter of libraries."""
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".mp4":
+        path.write_bytes(bytes(range(256)) * 40)
+    else:
+        ALL[suffix](path, plain_depth(), META)
+    whole = path.read_bytes()
+    for share in (0.0, 0.001, 0.02, 0.3, 0.6, 0.9, 0.99):
+        path.write_bytes(whole[: int(share * len(whole))])
+        result = info(path)
+        assert (result.exit_code, result.stdout) == (3, ""), share
+        lines = result.stderr.splitlines()
+        assert len(lines) == 2, lines
+        assert lines[0].startswith("Error: ")
+        assert str(path) in lines[0]
+        assert lines[1].startswith("Hint:  ")
+        assert capfd.readouterr() == ("", "")
+
+
+def test_what_is_no_file_of_depth_is_refused(tmp_path):
+    assert "there is no" in info(tmp_path / "a.tiff").stderr
+    (tmp_path / "a.txt").write_text("depth 1.0")
+    assert "is of no kind that carries depth or pictures" in info(tmp_path / "a.txt").stderr
+    tifffile.imwrite(
+        tmp_path / "b.tiff", plain_depth(), metadata=None, description=META.to_text().replace("depth 2", "depth 9")
+    )
+    assert "is of format 'nerfcli depth 9'" in info(tmp_path / "b.tiff").stderr
+
+
+def test_renders_whose_depth_files_differ_are_refused(tmp_path):
+    """Another axis, in a file that somebody put beside the others."""
+    description = {"frames": [{}, {}], "settings": {"outputs": ["depth"]}, "depth_meaning": META.to_json(), "run": "r"}
+    (tmp_path / RENDERS).write_text(json.dumps(description))
+    write_tiff(tmp_path / "depth" / "a.tiff", plain_depth(), META)
+    write_tiff(tmp_path / "depth" / "b.tiff", plain_depth(), META)
+    write_png16(tmp_path / "depth16" / "a.png", plain_depth(), META, units_per_level=1e-3)
+    told = json.loads(info(tmp_path, "--json").stdout)
+    assert (told["frames"], told["files"], told["meaning"]["axis"]) == (2, 3, "ray")
+    assert "3 depth files that mean the same" in info(tmp_path / RENDERS).stdout
+    write_png16(tmp_path / "depth16" / "b.png", plain_depth(), META, units_per_level=2e-3)
+    assert "units per level 0.001 and 0.002" in info(tmp_path).stderr
+    write_tiff(tmp_path / "depth" / "b.tiff", plain_depth(), replace(META, axis="z"))
+    result = info(tmp_path)
+    assert result.exit_code == 3
+    assert "b.tiff" in result.stderr
+    assert "do not mean the same: axis ray and z" in result.stderr
