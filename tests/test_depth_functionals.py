@@ -4,12 +4,13 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import quadrature_of_end_density
 
 from nerfcli import kernels
-from nerfcli.render import depth
+from nerfcli.kernels import depth
+from nerfcli.render.depth import DepthRequest, disagreement, requested, shares, spread
 
 
 def ray(seed, count=5, scale=1.0):
@@ -27,7 +28,7 @@ def test_moment_and_conditional_are_exact_for_piecewise_constant_density(seed):
     weights, _ = kernels.interval_weights(density, ends - starts, offsets)
     means = depth.interval_means(density, starts, ends)
     assert depth.moment(weights, means, offsets).item() == pytest.approx(first, rel=1e-8)
-    conditional = depth.conditional(weights, means, offsets=offsets, opacity_floor=0.0)
+    conditional = depth.conditional(weights, means, offsets)
     assert conditional.item() == pytest.approx(first / mass, rel=1e-8)
 
 
@@ -39,6 +40,7 @@ def test_one_place_per_interval_is_not_the_moment():
     assert abs(mean.item() - 1.5) > 0.4
 
 
+@settings(deadline=None)  # the first call imports
 @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 4), at=st.floats(0.01, 0.99))
 def test_splitting_an_interval_moves_no_depth_but_max_weight(seed, cut, at):
     density, starts, ends, offsets = ray(seed)
@@ -49,7 +51,7 @@ def test_splitting_an_interval_moves_no_depth_but_max_weight(seed, cut, at):
         torch.cat([ends[:cut], middle[None], ends[cut:]]),
         torch.tensor([0, 6]),
     )
-    for convention in (lambda *r: _conditional(*r), lambda d, s, e, o: depth.median(d, s, e, offsets=o)):
+    for convention in (lambda *r: _conditional(*r), lambda d, s, e, o: depth.quantile(d, s, e, offsets=o, share=0.5)):
         torch.testing.assert_close(
             convention(*split), convention(density, starts, ends, offsets), rtol=1e-11, atol=0, equal_nan=True
         )
@@ -58,7 +60,7 @@ def test_splitting_an_interval_moves_no_depth_but_max_weight(seed, cut, at):
 def _conditional(density, starts, ends, offsets):
     weights, _ = kernels.interval_weights(density, ends - starts, offsets)
     means = depth.interval_means(density, starts, ends)
-    return depth.conditional(weights, means, offsets=offsets, opacity_floor=0.0)
+    return depth.conditional(weights, means, offsets)
 
 
 def test_mean_fraction_in_float32_across_magnitudes():
@@ -90,7 +92,7 @@ def test_median_crossing_in_a_later_interval_and_through_a_gap():
     density = torch.tensor([0.2, 0.0, 1.0], dtype=torch.float64)
     starts = torch.tensor([1.0, 2.0, 5.0], dtype=torch.float64)
     ends = torch.tensor([2.0, 3.0, 9.0], dtype=torch.float64)
-    median = depth.median(density, starts, ends, offsets=torch.tensor([0, 3]))
+    median = depth.quantile(density, starts, ends, offsets=torch.tensor([0, 3]), share=0.5)
     assert median.item() == pytest.approx(5.0 + math.log(2) - 0.2, rel=1e-14)
 
 
@@ -99,19 +101,23 @@ def test_undefined_depths_are_nan_and_only_those():
     offsets = torch.tensor([0, 0, 1, 2])
     density = torch.tensor([-math.log(0.9), 50.0], dtype=torch.float64)
     starts, ends = torch.tensor([1.0, 1.0], dtype=torch.float64), torch.tensor([2.0, 2.0], dtype=torch.float64)
-    weights, behind = kernels.interval_weights(density, ends - starts, offsets)
-    means = depth.interval_means(density, starts, ends)
-    for values in (
-        depth.conditional(weights, means, offsets=offsets, opacity_floor=0.5),
-        depth.max_weight(weights, means, offsets=offsets, opacity_floor=0.5),
-        depth.median(density, starts, ends, offsets=offsets),
-    ):
-        assert values.isnan().tolist() == [True, True, False]
-    assert depth.moment(weights, means, offsets)[0] == 0
-    filled = depth.background_filled(weights, means, offsets=offsets, transmittance=behind, background_distance=7.0)
-    assert filled[0] == 7.0
-    low_floor = depth.conditional(weights, means, offsets=offsets, opacity_floor=0.0)
-    assert low_floor.isnan().tolist() == [True, False, False]
+    light = depth.light_ends(density, starts, ends, offsets=offsets, shares=(0.5,))
+
+    def undefined(convention, min_opacity):
+        request = DepthRequest(convention, "ray", min_opacity, 7.0)
+        light = depth.light_ends(density, starts, ends, offsets=offsets, shares=shares(request))
+        far = torch.full((3,), 7.0, dtype=torch.float64)
+        return requested(request, light, background_distance=far).isnan().tolist()
+
+    for convention in ("conditional", "max-weight", "median", "quantile:0.05"):
+        assert undefined(convention, 0.5) == [True, True, False]
+    for convention in ("conditional", "max-weight", "quantile:0.05"):
+        assert undefined(convention, 0.0) == [True, False, False]
+    assert undefined("median", 0.0) == [True, True, False]
+    for convention in ("moment", "background"):
+        assert undefined(convention, 1.0) == [False, False, False]
+    assert spread(DepthRequest("moment", "ray", 0.05), light).isnan().tolist() == [True, False, False]
+    assert disagreement(DepthRequest("moment", "ray", 0.05), light).isnan().tolist() == [True, True, False]
 
 
 def test_conditional_gradient_is_bounded_in_empty_space():
@@ -120,7 +126,7 @@ def test_conditional_gradient_is_bounded_in_empty_space():
     starts = torch.arange(3, dtype=torch.float64)
     weights, _ = kernels.interval_weights(density, torch.ones(3, dtype=torch.float64), torch.tensor([0, 3]))
     means = depth.interval_means(density, starts, starts + 1)
-    values = depth.conditional(weights, means, offsets=torch.tensor([0, 3]), opacity_floor=0.0)
+    values = depth.conditional(weights, means, torch.tensor([0, 3]))
     (gradient,) = torch.autograd.grad(torch.where(values.isnan(), 0.0, values).sum(), density)
     assert torch.isfinite(gradient).all()
     assert gradient.abs().max() == 0
@@ -129,5 +135,5 @@ def test_conditional_gradient_is_bounded_in_empty_space():
 def test_max_weight_takes_the_nearest_of_equals():
     weights = torch.tensor([0.2, 0.3, 0.3, 0.1])
     means = torch.tensor([1.0, 2.0, 3.0, 4.0])
-    nearest = depth.max_weight(weights, means, offsets=torch.tensor([0, 4]), opacity_floor=0.5)
+    nearest = depth.max_weight(weights, means, torch.tensor([0, 4]))
     assert nearest.tolist() == [2.0]

@@ -15,15 +15,16 @@ from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
 from nerfcli.export.frames import export_frames
 from nerfcli.export.names import file_names
-from nerfcli.export.settings import ExportSettings, effective_floor
+from nerfcli.export.settings import ExportSettings
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
 from nerfcli.media.preview import depth_range, preview
+from nerfcli.render.depth import effective_floor
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, render_picture
 
 CAMERA = Camera.pinhole(10, 8, 8.0)
-DEPTH = DepthRequest("conditional", "z", opacity_floor=0.1)
+DEPTH = DepthRequest("conditional", "z", min_opacity=0.1)
 
 
 def frame(name: str, distance: float = 2.0) -> Frame:
@@ -94,10 +95,17 @@ def test_only_what_is_asked_for_is_written(model, tmp_path):
 
 @pytest.mark.parametrize(
     ("convention", "floor"),
-    [("conditional", 0.1), ("max-weight", 0.1), ("moment", 0.0), ("background", 0.0), ("median", 0.5)],
+    [
+        ("conditional", 0.1),
+        ("max-weight", 0.1),
+        ("moment", 0.0),
+        ("background", 0.0),
+        ("median", 0.5),
+        ("quantile:0.05", 0.1),
+    ],
 )
 def test_each_convention_states_its_own_floor_and_background(convention, floor, model, tmp_path):
-    request = DepthRequest(convention, "ray", opacity_floor=0.1, background_distance=9.0)
+    request = DepthRequest(convention, "ray", min_opacity=0.1, background_distance=9.0)
     assert effective_floor(request) == floor
     export(model, [frame("a")], tmp_path / "views", outputs=("depth",), depth=request)
     _, meta = read_tiff(tmp_path / "views/depth/a.tiff")

@@ -116,7 +116,7 @@ def test_depth_of_a_slab_in_closed_form_along_both_axes(convention):
         model, pixels = fog(foggy_cells((-1, -1, 0.0), (1, 1, 1)), SIMILARITY), inside_slab(1.9 + math.log(2))
     else:
         model, pixels = fog(SLAB, SIMILARITY), inside_slab()
-    request = {"convention": convention, "opacity_floor": 0.1, "background_distance": 30.0}
+    request = {"convention": convention, "min_opacity": 0.1, "background_distance": 30.0}
     z = picture_of(model, towards_slab(), DepthRequest(axis="z", **request)).depth
     ray = picture_of(model, towards_slab(), DepthRequest(axis="ray", **request)).depth
     assert z is not None
@@ -133,7 +133,7 @@ def test_depth_of_a_slab_in_closed_form_along_both_axes(convention):
 def test_z_of_a_plane_is_constant_and_its_ray_depth_is_not():
     # A thin wall at right angles to the optical axis.
     wall = foggy_cells((-1, -1, 0.0), (1, 1, 2 / SIDE))
-    request = {"convention": "conditional", "opacity_floor": 0.0}
+    request = {"convention": "conditional", "min_opacity": 0.0}
     z = picture_of(fog(wall, SIMILARITY), towards_slab(), DepthRequest(axis="z", **request)).depth
     ray = picture_of(fog(wall, SIMILARITY), towards_slab(), DepthRequest(axis="ray", **request)).depth
     assert z is not None

@@ -10,7 +10,9 @@ from nerfcli import kernels
 from nerfcli.cameras.camera import Camera
 from nerfcli.field.cost import dense_grid_bytes, field_queries, parameter_bytes
 from nerfcli.field.encodings import fourier_features
-from nerfcli.render import depth, sampling, transmission
+from nerfcli.kernels import depth
+from nerfcli.render import sampling, transmission
+from nerfcli.render.depth import DepthRequest, requested
 
 DTYPES = [torch.float64, torch.float32]
 OFFSETS = torch.tensor([0, 3])
@@ -74,21 +76,23 @@ def test_depths_of_slabs_at_points(slabs, dtype):
     places = torch.tensor([1.0, 2.0, 3.0], dtype=dtype)
     close(depth.moment(weights, places, OFFSETS), [25 / 16], dtype)
     close(weights.sum(), 15 / 16, dtype)
-    close(depth.conditional(weights, places, offsets=OFFSETS, opacity_floor=0.0), [5 / 3], dtype)
+    mean = depth.conditional(weights, places, OFFSETS)
+    close(mean, [5 / 3], dtype)
+    heaviest = depth.max_weight(weights, places, OFFSETS)
+    close(heaviest, [1.0], dtype)
+    none = mean.new_empty(1, 0)
+    ends = depth.LightEnds(1 - transmittance, transmittance, mean, mean, heaviest, weights.max()[None], none)
     for far in (4.0, 100.0):
-        filled = depth.background_filled(
-            weights, places, offsets=OFFSETS, transmittance=transmittance, background_distance=far
-        )
-        close(filled, [25 / 16 + far / 16], dtype)
-    close(depth.max_weight(weights, places, offsets=OFFSETS, opacity_floor=0.0), [1.0], dtype)
+        request = DepthRequest("background", "ray", background_distance=far)
+        close(requested(request, ends, background_distance=mean.new_tensor([far])), [25 / 16 + far / 16], dtype)
 
 
 def test_median_of_slabs_is_inside_the_interval(slabs, dtype):
     # T falls to 1/2 exactly at the end of the first slab, t = 1; with twice the density, half way through it.
     density, _, lengths = slabs
     starts = torch.tensor([0.0, 1.0, 2.0], dtype=dtype)
-    close(depth.median(density, starts, starts + lengths, offsets=OFFSETS), [1.0], dtype)
-    close(depth.median(2 * density, starts, starts + lengths, offsets=OFFSETS), [0.5], dtype)
+    close(depth.quantile(density, starts, starts + lengths, offsets=OFFSETS, share=0.5), [1.0], dtype)
+    close(depth.quantile(2 * density, starts, starts + lengths, offsets=OFFSETS, share=0.5), [0.5], dtype)
 
 
 @pytest.mark.parametrize(("optical_depth", "length"), [(1e-12, 2.0), (0.1, 1.0), (1.0, 3.0), (30.0, 0.5), (1e6, 1.0)])

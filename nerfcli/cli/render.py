@@ -33,10 +33,10 @@ def render(
     ] = None,
     outputs: Annotated[str, typer.Option(help="Some of rgb,depth,opacity.")] = "rgb,depth,opacity",
     depth: Annotated[
-        str, typer.Option(help="Which depth: conditional, moment, background, max-weight or median.")
+        str, typer.Option(help="Which depth: conditional, moment, background, max-weight, median or quantile:0.05.")
     ] = "conditional",
     depth_axis: Annotated[str, typer.Option(help="ray: along the ray; z: along the optical axis.")] = "z",
-    opacity_floor: Annotated[float, typer.Option(help="Less opaque pixels have no depth (NaN).", min=0, max=1)] = 0.5,
+    min_opacity: Annotated[float, typer.Option(help="Less opaque pixels have no depth (NaN).", min=0, max=1)] = 0.5,
     background_distance: Annotated[
         float | None, typer.Option(help="What --depth background counts for light that passes, scene units.", min=0)
     ] = None,
@@ -61,12 +61,13 @@ def render(
     """Render a trained run: colours, depth maps that say what they mean, opacity, videos.
 
     \b
-    The five depths of a ray, exact inside each interval:
-      conditional  mean distance of where light ends, given that it ends     (NaN below --opacity-floor)
-      moment       the same, not divided by the opacity
-      background   mean distance with what passes counted at --background-distance
-      max-weight   the interval that stops most light
-      median       where half of the light has ended                        (NaN if less than half ends)
+    The depths of a ray, exact inside each interval; less opaque pixels than --min-opacity have none (NaN):
+      conditional    mean distance of where light ends, given that it ends
+      moment         the same, not divided by the opacity                  (every pixel)
+      background     mean, with what passes at --background-distance       (every pixel)
+      max-weight     mean inside the interval that stops most light
+      median         where half of all light has ended                     (NaN if less than half ends)
+      quantile:0.05  where that share of all light has ended               (NaN if less ends)
     Depth files are float32 TIFF; convention, axis, unit, opacity floor and invalid value are in each file.
     Writes RUN/renders/CAMERAS/.
 
@@ -79,21 +80,21 @@ def render(
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
     """
     from nerfcli.export.settings import OUTPUTS, ExportSettings
-    from nerfcli.render.depth import CONVENTIONS
+    from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.render.model import load_model
-    from nerfcli.render.pictures import DepthRequest
     from nerfcli.train.run_folder import FIELD
 
     chosen = tuple(dict.fromkeys(outputs.split(",")))
     if unknown := [name for name in chosen if name not in OUTPUTS]:
         raise typer.BadParameter(f"{unknown[0]!r}; choose some of {','.join(OUTPUTS)}", param_hint="--outputs")
-    if depth not in CONVENTIONS:
-        raise typer.BadParameter(f"{depth!r}; choose one of {', '.join(CONVENTIONS)}", param_hint="--depth")
+    if not is_convention(depth):
+        known = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
+        raise typer.BadParameter(f"{depth!r}; choose {known}", param_hint="--depth")
     if depth_axis not in ("ray", "z"):
         raise typer.BadParameter(f"{depth_axis!r}; choose ray or z", param_hint="--depth-axis")
     console = Console(quiet=quiet, json_lines=json)
     request = DepthRequest(
-        convention=depth, axis=depth_axis, opacity_floor=opacity_floor, background_distance=background_distance
+        convention=depth, axis=depth_axis, min_opacity=min_opacity, background_distance=background_distance
     )
     settings = ExportSettings(outputs=chosen, depth=request, npy=npy, video=video, fps=fps)
 
@@ -130,7 +131,7 @@ def folder_name(views: Views, settings: "ExportSettings") -> str:
     """The folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
     if "depth" not in settings.outputs:
         return views.name
-    return f"{views.name}-{settings.depth.convention}-{settings.depth.axis}"
+    return f"{views.name}-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}"
 
 
 def render_run(

@@ -4,8 +4,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from nerfcli.media.depth import DepthMeta
+from nerfcli.render.depth import DepthRequest, effective_floor
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import DepthRequest
 
 OUTPUTS = ("rgb", "depth", "opacity")
 
@@ -41,8 +41,3 @@ def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
         opacity_floor=effective_floor(request),
         background_distance=request.background_distance if request.convention == "background" else None,
     )
-
-
-def effective_floor(request: DepthRequest) -> float:
-    """The opacity below which a pixel has no depth: none for the conventions that every ray has, 1/2 for the median."""
-    return {"moment": 0.0, "background": 0.0, "median": 0.5}.get(request.convention, request.opacity_floor)

@@ -12,7 +12,9 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
+from nerfcli.kernels import depth as depth_reference
 from nerfcli.kernels import reference
+from nerfcli.kernels.depth import LightEnds
 from nerfcli.kernels.reference import contract, grid_coordinates, sum_along_rays
 
 __all__ = [
@@ -24,6 +26,8 @@ __all__ = [
     "grid_coordinates",
     "hash_encode",
     "interval_weights",
+    "light_ends",
+    "mixture_quantile",
     "optical_depth_before",
     "pixel_rays",
     "prepare",
@@ -118,6 +122,24 @@ def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> T
 def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """See `reference.interval_weights`."""
     return _module_for(density, lengths, constant=(density, lengths)).interval_weights(density, lengths, offsets)
+
+
+def light_ends(
+    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, shares: tuple[float, ...]
+) -> LightEnds:
+    """See `depth.light_ends`."""
+    module = _module_for(density, starts, ends, constant=(density, starts, ends))
+    module = depth_reference if module is reference else module
+    return module.light_ends(density, starts, ends, offsets=offsets, shares=shares)
+
+
+def mixture_quantile(
+    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, share: float
+) -> Tensor:
+    """See `depth.mixture_quantile`."""
+    module = _module_for(density, starts, ends)
+    module = depth_reference if module is reference else module
+    return module.mixture_quantile(density, starts, ends, offsets=offsets, rays_per_pixel=rays_per_pixel, share=share)
 
 
 def visible_samples(

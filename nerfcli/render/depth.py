@@ -1,116 +1,120 @@
-"""Five meanings of "the depth of a ray". They differ wherever a ray meets more than one surface or none.
+"""The meanings of "the depth of a ray". They differ wherever a ray meets more than one surface or none.
 
-For a ray with density sigma(t), transmittance T(t) and end density p(t) = T(t) sigma(t), whose integral is the
-opacity:
+With end density p(t) = T(t) sigma(t), whose integral is the opacity:
 
-    moment       integral of t p(t): small where the ray is not opaque; a building block, not a distance
-    conditional  moment / opacity: the mean place where light ends, given that it ends
-    background   moment + T * background distance: the mean with what passes counted at the background
-    max-weight   the mean place inside the interval with the largest weight
-    median       where half of all light has ended: T(t) = 1/2
+    conditional   integral of t p(t) / opacity: the mean place where light ends, given that it ends
+    moment        integral of t p(t): small where the ray is not opaque; a building block, not a distance
+    background    moment + T * background distance: the mean with what passes counted at the background
+    max-weight    the mean place inside the interval that stops most light; depends on where the ray is cut
+    median        where half of all light has ended: T(t) = 1/2
+    quantile:q    where the share q of all light has ended: T(t) = 1 - q
 
-Density is constant inside an interval, and all five are exact for it: no midpoints. Packed samples as in
-`kernels.reference`; distances are along the ray. What is undefined is NaN, never a plausible number.
+All are exact for density that is constant inside an interval; `kernels.depth` defines them. Which rays have one:
+moment and background every ray; conditional and max-weight those with at least `min_opacity`, which must not be zero
+opacity; a quantile q those with at least max(q, min_opacity), as it counts all light and not only that which ends.
+What is undefined is NaN, never a plausible number.
 """
 
-import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
+from nerfcli.kernels.depth import LightEnds
 
 CONVENTIONS = ("conditional", "moment", "background", "max-weight", "median")
+AXES = ("ray", "z")
+QUANTILE = "quantile:"
+# `LightEnds.quantiles` of a picture: the median for the disagreement, then the one that was asked for.
+MEDIAN = 0.5
 
-# Below this optical depth the mean place is taken from its series, whose next term is then 5e-14.
-SERIES_BELOW = 0.25
 
-
-def mean_fraction(optical_depth: Tensor) -> Tensor:
-    """Mean place, as a share of the interval, where light ends that ends inside an interval of constant density.
-
-    g(x) = 1/x - 1/(exp(x) - 1), written as 1/x - exp(-x) / (1 - exp(-x)); 1/2 at 0, 1/x at infinity.
+@dataclass(frozen=True)
+class DepthRequest:
+    """Which depth to render.
 
     Args:
-        optical_depth: density * length, >= 0.
+        convention: one of `CONVENTIONS`, or "quantile:0.05" with a share between 0 and 1.
+        axis: "ray" for the distance along the ray, "z" for that along the optical axis.
+        min_opacity: rays that are less opaque have no depth, spread or disagreement; see `effective_floor`.
+        background_distance: distance along the ray that the background convention counts for what passes, in the
+            scene's unit; needed by that convention only.
 
-    Returns:
-        The same shape, in (0, 1/2]. Relative error of some units of the dtype's precision everywhere.
-
-    Differentiable, also at 0 (where the slope is -1/12) and for large arguments.
+    Raises:
+        ValueError: no such convention or axis.
     """
-    thin = optical_depth < SERIES_BELOW
-    x = torch.where(thin, optical_depth, 0.0)
-    x2 = x * x
-    # Bernoulli numbers: g(x) = 1/2 - sum B_2n x^(2n - 1) / (2n)!
-    tail = 1 / 30240 - x2 * (1 / 1209600 - x2 / 47900160)
-    series = 0.5 - x * (1 / 12 - x2 * (1 / 720 - x2 * tail))
-    y = torch.where(thin, 1.0, optical_depth)
-    closed = 1.0 / y + torch.exp(-y) / torch.expm1(-y)
-    return torch.where(thin, series, closed)
+
+    convention: str
+    axis: str
+    min_opacity: float = 0.5
+    background_distance: float | None = None
+
+    def __post_init__(self) -> None:
+        if not is_convention(self.convention):
+            raise ValueError(f"unknown depth convention {self.convention!r}")
+        if self.axis not in AXES:
+            raise ValueError(f"unknown depth axis {self.axis!r}")
+
+    @property
+    def share(self) -> float | None:
+        """The share of light of a quantile or the median; None for the others."""
+        if self.convention == "median":
+            return MEDIAN
+        return float(self.convention.removeprefix(QUANTILE)) if self.convention.startswith(QUANTILE) else None
 
 
-def interval_means(density: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-    """Mean distance (N,) where light ends that ends inside each interval: t0 + 1/s - d / (exp(s d) - 1).
+def is_convention(name: str) -> bool:
+    """Whether a depth goes by this name."""
+    if not name.startswith(QUANTILE):
+        return name in CONVENTIONS
+    try:
+        return 0.0 < float(name.removeprefix(QUANTILE)) < 1.0
+    except ValueError:
+        return False
 
-    Differentiable in all arguments.
+
+def effective_floor(request: DepthRequest) -> float:
+    """The opacity below which a pixel has no depth: 0 for the conventions that every ray has."""
+    if request.convention in ("moment", "background"):
+        return 0.0
+    return max(request.min_opacity, request.share or 0.0)
+
+
+def shares(request: DepthRequest) -> tuple[float, ...]:
+    """The quantiles that a picture needs: the median, and the one asked for."""
+    return (MEDIAN,) if request.share in (None, MEDIAN) else (MEDIAN, request.share)
+
+
+def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Tensor) -> Tensor:
+    """The depth (R,) that was asked for.
+
+    Args:
+        request: which depth.
+        ends: where light ends, with the quantiles of `shares(request)`, along the axis and in the unit wanted.
+        background_distance: (R,) the request's, along that axis and in that unit.
     """
-    lengths = ends - starts
-    return starts + lengths * mean_fraction(density * lengths)
+    moment = torch.where(ends.mean.isnan(), 0.0, ends.mean * ends.opacity)
+    match request.convention:
+        case "moment":
+            return moment
+        case "background":
+            return moment + ends.transmittance * background_distance
+        case "conditional":
+            depth = ends.mean
+        case "max-weight":
+            depth = ends.heaviest
+        case _:
+            depth = ends.quantiles[:, -1]
+    # Quantiles are NaN by themselves where the opacity does not reach them.
+    return torch.where(ends.opacity >= request.min_opacity, depth, torch.nan)
 
 
-def moment(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
-    """sum_i weight_i * mean_i, (R,). Differentiable; 0 for a ray without samples."""
-    return kernels.sum_along_rays(weights * means, offsets)
+def spread(request: DepthRequest, ends: LightEnds) -> Tensor:
+    """Standard deviation (R,) of where light ends, given that it ends; NaN below the request's `min_opacity`."""
+    return torch.where(ends.opacity >= request.min_opacity, ends.spread, torch.nan)
 
 
-def conditional(weights: Tensor, means: Tensor, *, offsets: Tensor, opacity_floor: float) -> Tensor:
-    """moment / opacity, (R,); NaN where the opacity is not above `opacity_floor` (>= 0).
-
-    Differentiable where defined. The division is by the sum of the weights, so that weights that underflow
-    together still give their mean.
-    """
-    opacity = kernels.sum_along_rays(weights, offsets)
-    defined = opacity > opacity_floor
-    mean = moment(weights, means, offsets) / torch.where(defined, opacity, 1.0)
-    return torch.where(defined, mean, torch.nan)
-
-
-def background_filled(
-    weights: Tensor, means: Tensor, *, offsets: Tensor, transmittance: Tensor, background_distance: float
-) -> Tensor:
-    """moment + T * background_distance, (R,). Defined for every ray. Differentiable."""
-    return moment(weights, means, offsets) + transmittance * background_distance
-
-
-def max_weight(weights: Tensor, means: Tensor, *, offsets: Tensor, opacity_floor: float) -> Tensor:
-    """`means` of the interval with the largest weight, the nearest of equals, (R,).
-
-    NaN where the opacity is not above the floor. The choice depends on how the ray was cut into intervals.
-    """
-    rays = kernels.ray_indices(offsets)
-    count = len(offsets) - 1
-    largest = torch.zeros(count, dtype=weights.dtype, device=weights.device)
-    largest = largest.scatter_reduce(0, rays, weights, "amax")
-    candidates = torch.where(weights == largest[rays], means, torch.inf)
-    nearest = torch.full((count,), torch.inf, dtype=means.dtype, device=means.device)
-    nearest = nearest.scatter_reduce(0, rays, candidates, "amin")
-    opacity = kernels.sum_along_rays(weights, offsets)
-    return torch.where(opacity > opacity_floor, nearest, torch.nan)
-
-
-def median(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor) -> Tensor:
-    """The distance at which the transmittance is 1/2, solved inside its interval, (R,).
-
-    t = t0 + (log 2 - tau_before) / density in the interval where the optical depth passes log 2; NaN for a ray
-    whose opacity stays below 1/2.
-    """
-    lengths = ends - starts
-    before = kernels.optical_depth_before(density, lengths, offsets)
-    reached = before + density * lengths >= math.log(2)
-    inside = (math.log(2) - before) / torch.where(density > 0, density, 1.0)
-    inside = torch.minimum(inside.clamp_min(0.0), lengths)
-    distance = torch.where(reached, starts + inside, torch.inf)  # the nearest of these holds the crossing
-    result = torch.full((len(offsets) - 1,), torch.inf, dtype=density.dtype, device=density.device)
-    result = result.scatter_reduce(0, kernels.ray_indices(offsets), distance, "amin")
-    return torch.where(result.isinf(), torch.nan, result)
+def disagreement(request: DepthRequest, ends: LightEnds) -> Tensor:
+    """|median - conditional| (R,); NaN where either is undefined: below 1/2 or below the request's `min_opacity`."""
+    apart = (ends.quantiles[:, 0] - ends.mean).abs()
+    return torch.where(ends.opacity >= request.min_opacity, apart, torch.nan)

@@ -1,4 +1,4 @@
-"""Whole pictures of a trained model: colour, opacity and any of the five depths, tile by tile."""
+"""Whole pictures of a trained model, tile by tile: colour, opacity, depth, and how far they can be trusted."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,51 +7,58 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
 from nerfcli.cameras.frame import Frame
-from nerfcli.render import depth as depth_of_rays
+from nerfcli.render.depth import DepthRequest, disagreement, requested, shares, spread
 from nerfcli.render.model import Model
-from nerfcli.render.rays import frame_rays
+from nerfcli.render.pixels import pixels_of_rays
+from nerfcli.render.rays import Rays, pixel_rays, places_in_pixel
+from nerfcli.render.tracing import TOLERANCE, render_rays
 
-# Colour is asked for only where the weight of a sample can show: forty of these make one grey level.
-NEGLIGIBLE_WEIGHT = 1e-4
-# Rays end where a hundred-thousandth of the light is left, far less than a grey level.
-DEEPEST = 11.5
 RAYS_PER_TILE = 4096
+# Rays are made for this many at a time, whatever the tile: their last bits must not depend on it.
+RAYS_PER_BLOCK = 2**18
 
 
 @dataclass(frozen=True)
-class DepthRequest:
-    """Which depth to render.
+class Quality:
+    """How much work goes into a picture.
 
     Args:
-        convention: one of `depth.CONVENTIONS`.
-        axis: "ray" for the distance along the ray, "z" for that along the optical axis.
-        opacity_floor: rays that are not more opaque than this have no conditional or max-weight depth.
-        background_distance: distance along the ray that the background convention counts for what passes, in the
-            scene's unit; needed by that convention only.
+        tolerance: what a channel of a colour may miss for speed, in (0, 1]; see `tracing`.
+        samples_per_pixel: rays of a pixel, at the places of `rays.places_in_pixel`.
+
+    Raises:
+        ValueError: out of range.
     """
 
-    convention: str
-    axis: str
-    opacity_floor: float = 0.5
-    background_distance: float | None = None
+    tolerance: float = TOLERANCE
+    samples_per_pixel: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.tolerance <= 1.0 or self.samples_per_pixel < 1:
+            raise ValueError(f"need 0 < tolerance <= 1 and samples_per_pixel >= 1, got {self}")
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What was seen from one frame, in NumPy.
+    """What was seen from one frame: NumPy float32, lengths in the scene's unit, NaN where undefined.
 
     Args:
-        rgb: (H, W, 3) float32 sRGB in [0, 1], composited on the background.
-        opacity: (H, W) float32 in [0, 1].
-        depth: (H, W) float32 in the scene's unit, NaN where undefined; None when not asked for.
+        rgb: (H, W, 3) sRGB in [0, 1], composited on the background; on black, it is premultiplied by the opacity.
+        opacity: (H, W) in [0, 1].
+        depth: (H, W) as requested; None when not asked for.
+        spread: (H, W) standard deviation of where light ends, along the axis of depth; None without depth.
+        disagreement: (H, W) |median - conditional| along that axis; None without depth.
+        truncation_error: (H, W) bound on what was left out of each channel of rgb; the tolerance at most.
         valid: (H, W) bool; False where the lens has no ray (rgb is then the background, opacity 0).
     """
 
     rgb: np.ndarray
     opacity: np.ndarray
     depth: np.ndarray | None
+    spread: np.ndarray | None
+    disagreement: np.ndarray | None
+    truncation_error: np.ndarray
     valid: np.ndarray
 
 
@@ -62,104 +69,81 @@ def render_picture(
     *,
     background: tuple[float, float, float],
     depth: DepthRequest | None = None,
+    quality: Quality = Quality(),
     on_tile: Callable[[int], None] | None = None,
 ) -> Picture:
-    """Render one frame.
+    """Render one frame; every bit of it is the same for any size of tiles and any number of threads.
+
+    A pixel of several samples is the mean of its rays in colour and opacity; its depth, spread and disagreement are
+    those of the mixture of their end distances along the axis of depth: see `pixels`.
 
     Args:
         model: the trained model.
         frame: camera and pose in the scene's frame.
         background: sRGB behind everything.
         depth: which depth to compute along with the colour.
-        on_tile: called with the number of rays after each tile.
+        quality: how much work to put into it.
+        on_tile: called with the number of pixels after each tile.
     """
-    rays = frame_rays(frame, model.training_from_scene, model.device)
-    behind = rays.directions.new_tensor(background)
-    columns = []
-    for directions in rays.directions.split(RAYS_PER_TILE):
-        origins = rays.origin.expand_as(directions)
-        columns.append(render_rays(model, origins, directions, background=behind, depth=depth))
-        if on_tile is not None:
-            on_tile(len(directions))
-    rgb, opacity, distance = (torch.cat(column) for column in zip(*columns, strict=True))
-    rgb[~rays.valid] = behind
-    opacity[~rays.valid] = 0.0
-    shape = (rays.height, rays.width)
-    picture_depth = None
-    if depth is not None:
-        distance = distance / model.training_from_scene.scale
-        distance = distance * rays.cosines if depth.axis == "z" else distance
-        distance[~rays.valid] = torch.nan
-        picture_depth = distance.reshape(shape).cpu().numpy()
+    if depth is not None and depth.convention == "background" and depth.background_distance is None:
+        raise ValueError("the background convention needs a background distance")
+    width, height, count = frame.camera.width, frame.camera.height, quality.samples_per_pixel
+    places = places_in_pixel(count)
+    behind = torch.tensor(background, dtype=torch.float32, device=model.device)
+    columns: list[tuple[Tensor, ...]] = []
+    block, tile = max(1, RAYS_PER_BLOCK // count), max(1, RAYS_PER_TILE // count)
+    for first in range(0, width * height, block):
+        chosen = slice(first, min(first + block, width * height))
+        rays = pixel_rays(frame, model.training_from_scene, pixels=chosen, places=places, device=model.device)
+        for begin in range(0, chosen.stop - chosen.start, tile):
+            part = slice(begin * count, min((begin + tile) * count, len(rays.directions)))
+            columns.append(_render_tile(model, rays, part, background=behind, depth=depth, quality=quality))
+            if on_tile is not None:
+                on_tile((part.stop - part.start) // count)
+    rgb, opacity, error, valid, *distances = (
+        torch.cat(column).reshape(height, width, *column[0].shape[1:]).cpu().numpy()
+        for column in zip(*columns, strict=True)
+    )
+    depth_map, spread_map, disagreement_map = distances if depth is not None else (None, None, None)
     return Picture(
-        rgb=rgb.clamp(0.0, 1.0).reshape(*shape, 3).cpu().numpy(),
-        opacity=opacity.reshape(shape).cpu().numpy(),
-        depth=picture_depth,
-        valid=rays.valid.reshape(shape).cpu().numpy(),
+        rgb=rgb,
+        opacity=opacity,
+        depth=depth_map,
+        spread=spread_map,
+        disagreement=disagreement_map,
+        truncation_error=error,
+        valid=valid,
     )
 
 
-def render_rays(
-    model: Model, origins: Tensor, directions: Tensor, *, background: Tensor, depth: DepthRequest | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Colour (R, 3) on `background` (3,), opacity (R,), and distance (R,) in the training frame, NaN if not asked for.
-
-    Args:
-        model: the trained model.
-        origins, directions: (R, 3) in the training frame, unit directions.
-        background: (3,) sRGB.
-        depth: which depth; its axis is the caller's business.
-    """
-    starts, ends, density, encoded, _, offsets = kernels.visible_samples(
-        origins,
+def _render_tile(
+    model: Model, rays: Rays, part: slice, *, background: Tensor, depth: DepthRequest | None, quality: Quality
+) -> tuple[Tensor, ...]:
+    """Colour, opacity, truncation error, validity of the pixels of some rays; depth, spread, disagreement if wanted."""
+    directions, count = rays.directions[part], quality.samples_per_pixel
+    wanted = shares(depth) if depth is not None else ()
+    seen = render_rays(
+        model,
+        rays.origin.expand_as(directions),
         directions,
-        model.marching.edges().to(directions),
-        jitter=torch.full_like(directions[:, 0], 0.5),
-        occupied=model.occupied,
-        unbounded=model.field.settings.unbounded,
-        table=model.field.table,
-        resolutions=model.field.settings.resolutions,
-        weights=tuple(model.field.weights),
-        deepest=DEEPEST,
+        background=background,
+        shares=wanted,
+        tolerance=quality.tolerance,
     )
-    weights, _ = kernels.interval_weights(density, ends - starts, offsets)
-    seen = (weights > NEGLIGIBLE_WEIGHT).nonzero()[:, 0]
-    rgb = density.new_zeros(len(density), 3)
-    rays = kernels.ray_indices(offsets)[seen]
-    rgb[seen] = model.field.radiance_of_encoded(encoded[seen], directions, rays)[1]
-    colour, transmittance, _ = kernels.composite(
-        density, rgb, ends - starts, offsets=offsets, background=background.expand(len(origins), 3)
+    scale = model.training_from_scene.scale
+    # From the training frame's distance along the ray to the scene's along the axis; there is no z behind the camera.
+    factor, ahead = torch.full_like(rays.cosines[part], 1.0 / scale), torch.ones_like(rays.valid[part])
+    if depth is not None and depth.axis == "z":
+        ahead = rays.cosines[part] > 0
+        factor = torch.where(ahead, rays.cosines[part], 1.0) / scale
+    pixels = pixels_of_rays(
+        seen, valid=rays.valid[part], background=background, factor=factor, shares=wanted, count=count
     )
+    colours = (pixels.rgb.clamp(0.0, 1.0), pixels.ends.opacity, pixels.truncation_error, pixels.valid)
     if depth is None:
-        return colour, 1.0 - transmittance, torch.full_like(transmittance, torch.nan)
-    distance = _distance(depth, model, density=density, starts=starts, ends=ends, offsets=offsets)
-    return colour, 1.0 - transmittance, distance
-
-
-def _distance(
-    request: DepthRequest, model: Model, *, density: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor
-) -> Tensor:
-    """The requested depth along each ray, in the training frame."""
-    if request.convention == "median":
-        return depth_of_rays.median(density, starts, ends, offsets=offsets)
-    weights, transmittance = kernels.interval_weights(density, ends - starts, offsets)
-    means = depth_of_rays.interval_means(density, starts, ends)
-    floor = request.opacity_floor
-    match request.convention:
-        case "moment":
-            return depth_of_rays.moment(weights, means, offsets)
-        case "conditional":
-            return depth_of_rays.conditional(weights, means, offsets=offsets, opacity_floor=floor)
-        case "max-weight":
-            return depth_of_rays.max_weight(weights, means, offsets=offsets, opacity_floor=floor)
-        case "background":
-            if request.background_distance is None:
-                raise ValueError("the background convention needs a background distance")
-            return depth_of_rays.background_filled(
-                weights,
-                means,
-                offsets=offsets,
-                transmittance=transmittance,
-                background_distance=request.background_distance * model.training_from_scene.scale,
-            )
-    raise ValueError(f"unknown depth convention {request.convention!r}")
+        return colours
+    far = (depth.background_distance or 0.0) * scale * pixels.to_background
+    asked = requested(depth, pixels.ends, background_distance=far)
+    maps = (asked, spread(depth, pixels.ends), disagreement(depth, pixels.ends))
+    defined = pixels.valid & ahead.view(-1, count).all(1)
+    return *colours, *(torch.where(defined, values, torch.nan) for values in maps)

@@ -1,4 +1,4 @@
-"""Rays of a camera through the centres of its pixels, in the training frame.
+"""Rays of a camera through its pixels, in the training frame.
 
 Ray of pixel p:  origin = R c + t scaled,  direction = R_frame R_cam bearing(p)  with unit norm, so that distances
 along rays are lengths and density times length is an optical depth.
@@ -13,32 +13,44 @@ from torch import Tensor
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 
+# One sample of a pixel: its centre.
+CENTRES = np.array([[0.5, 0.5]])
+
 
 @dataclass(frozen=True)
 class Rays:
-    """The rays of one picture, row by row.
+    """Rays of pixels of one picture, row by row, those of a pixel side by side.
 
     Args:
         origin: (3,) the camera's centre, training frame.
-        directions: (H * W, 3) unit.
-        valid: (H * W,) bool; pixels that the lens model cannot invert have no ray.
-        cosines: (H * W,) between each ray and the optical axis: z = distance * cosine.
-        width, height: of the picture.
+        directions: (N, 3) unit.
+        valid: (N,) bool; places that the lens model cannot invert have no ray.
+        cosines: (N,) between each ray and the optical axis: z = distance * cosine.
     """
 
     origin: Tensor
     directions: Tensor
     valid: Tensor
     cosines: Tensor
-    width: int
-    height: int
 
 
 def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> Rays:
-    """Rays of every pixel of a frame; geometry in float64, the result in float32."""
-    bearings, valid = frame.camera.pixel_bearings()
+    """Rays of every pixel centre of a frame; geometry in float64, the result in float32."""
+    pixels = slice(0, frame.camera.width * frame.camera.height)
+    return pixel_rays(frame, training_from_scene, pixels=pixels, places=CENTRES, device=device)
+
+
+def pixel_rays(
+    frame: Frame, training_from_scene: Similarity, *, pixels: slice, places: np.ndarray, device: torch.device
+) -> Rays:
+    """Rays of some pixels, counted row by row, at the same places (P, 2) inside [0, 1]^2 of each: N = pixels * P."""
+    number = np.arange(pixels.start, pixels.stop)
+    corners = np.stack([number % frame.camera.width, number // frame.camera.width], axis=-1)
+    bearings, valid = frame.camera.bearings((corners[:, None] + places).reshape(-1, 2))
     world_from_cam = training_from_scene.apply_pose(frame.world_from_cam)
-    directions = bearings @ world_from_cam[:3, :3].T
+    # Component by component: products of matrices round differently with the number of rows.
+    columns = world_from_cam[:3, :3].T
+    directions = bearings[:, :1] * columns[0] + bearings[:, 1:2] * columns[1] + bearings[:, 2:] * columns[2]
 
     def tensor(values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=device)
@@ -48,6 +60,18 @@ def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.devi
         directions=tensor(directions),
         valid=torch.as_tensor(valid, device=device),
         cosines=tensor(bearings[:, 2]),
-        width=frame.camera.width,
-        height=frame.camera.height,
     )
+
+
+def places_in_pixel(count: int) -> np.ndarray:
+    """Where to look inside each pixel: (count, 2) in [0, 1]^2, the same for every pixel and every picture.
+
+    x_i = (i + 1/2) / count, y_i = (rank of the base-2 radical inverse of i + 1/2) / count: one place in every row and
+    every column of a count x count grid, and one in each of count equal boxes where count is a power of two. Their mean
+    is the pixel's centre.
+
+    Source: Hammersley 1960; as n-rooks, Shirley 1991, Discrepancy as a quality measure for sample distributions.
+    """
+    inverse = [int(f"{i:032b}"[::-1], 2) for i in range(count)]
+    rank = np.argsort(np.argsort(inverse))
+    return (np.stack([np.arange(count), rank], axis=-1) + 0.5) / count

@@ -7,7 +7,7 @@ import torch
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import render_rays
+from nerfcli.render.tracing import render_rays
 from nerfcli.train.losses import over_background
 from nerfcli.train.photos import Photo, PixelPool
 
@@ -27,7 +27,7 @@ class HeldoutPixels:
     def psnr(self, model: Model) -> float:
         """PSNR in dB over these pixels together, clipped to [0, 1], on the model's background."""
         background = self.colours.new_tensor(model.background)
-        rendered, _, _ = render_rays(model, self.origins, self.directions, background=background, depth=None)
+        rendered = render_rays(model, self.origins, self.directions, background=background).rgb
         wanted = over_background(self.colours, background.expand(len(self.colours), 3))
         error = (rendered.clamp(0.0, 1.0) - wanted).square().mean().item()
         return -10.0 * math.log10(max(error, 1e-12))

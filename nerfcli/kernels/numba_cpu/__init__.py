@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
+from nerfcli.kernels.numba_cpu.depth import light_ends, mixture_quantile
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
 from nerfcli.kernels.numba_cpu.pixels import pixel_rays
@@ -22,6 +23,8 @@ __all__ = [
     "hash_encode",
     "interval_weights",
     "is_compiled",
+    "light_ends",
+    "mixture_quantile",
     "optical_depth_before",
     "pixel_rays",
     "radiance",
@@ -54,6 +57,8 @@ def warm_up() -> None:
     optical_depth_before(density(encoded, weights), lengths, offsets)
     thickness, rgb = radiance(encoded, torch.zeros(1, 16), ray_indices(offsets), weights)
     interval_weights(thickness, lengths, offsets)
+    light_ends(thickness, starts, starts + 1, offsets=offsets, shares=(0.5,))
+    mixture_quantile(thickness, starts, starts + 1, offsets=offsets, rays_per_pixel=1, share=0.5)
     colour, _, spread = composite(thickness, rgb, lengths, offsets=offsets, background=torch.zeros(3))
     (colour.sum() + distortion(spread, starts, starts + 1, offsets).sum()).backward()
     pixel = torch.zeros(1, dtype=torch.int64)

@@ -1,0 +1,102 @@
+"""From rays to pixels: one ray, or the mixture of several, all of which count alike.
+
+The end distance of a pixel of several rays is that of a ray drawn from them: the conditional mean is the mean of the
+rays' means weighted by their opacity, its variance holds that between the rays, a quantile is that of all their light,
+and max-weight looks at the intervals of all of them. Distances along z are those of each ray's own direction.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.kernels.depth import LightEnds
+from nerfcli.render.tracing import RaysSeen
+
+
+class Pixels(NamedTuple):
+    """What P pixels saw.
+
+    Args:
+        rgb: (P, 3) sRGB on the background.
+        ends: where their light ends, as long as the factor says.
+        truncation_error: (P,) bound on what was left out of each channel of rgb.
+        to_background: (P,) from a background's distance along the ray to that wanted, for the light that passes.
+        valid: (P,) whether all rays of the pixel exist; the others have the background and no opacity.
+    """
+
+    rgb: Tensor
+    ends: LightEnds
+    truncation_error: Tensor
+    to_background: Tensor
+    valid: Tensor
+
+
+def pixels_of_rays(
+    seen: RaysSeen, *, valid: Tensor, background: Tensor, factor: Tensor, shares: tuple[float, ...], count: int
+) -> Pixels:
+    """Pixels of `count` rays each, which stand side by side.
+
+    Args:
+        seen: of R rays, with the quantiles `shares`.
+        valid: (R,) rays that exist.
+        background: (3,) sRGB.
+        factor: (R,) > 0, from distances along the ray to those wanted.
+        shares: of the quantiles.
+        count: rays per pixel, a divisor of R.
+    """
+    rgb, error, ends, to_background = seen.rgb, seen.truncation_error, _scaled(seen.ends, factor), factor
+    if count > 1:
+        ends = _mixture(seen, ends, factor=factor, shares=shares, count=count)
+        rgb, error, valid = rgb.view(-1, count, 3).mean(1), error.view(-1, count).mean(1), valid.view(-1, count).all(1)
+        # The light that passes counts the backgrounds of the rays that it passes along.
+        passing = seen.ends.transmittance.view(-1, count) + torch.finfo(factor.dtype).tiny
+        to_background = (passing * factor.view(-1, count)).sum(1) / passing.sum(1)
+    return Pixels(
+        rgb=torch.where(valid[:, None], rgb, background),
+        ends=ends._replace(opacity=torch.where(valid, ends.opacity, 0.0)),
+        truncation_error=torch.where(valid, error, 0.0),
+        to_background=to_background,
+        valid=valid,
+    )
+
+
+def _scaled(ends: LightEnds, factor: Tensor) -> LightEnds:
+    return ends._replace(
+        mean=ends.mean * factor,
+        spread=ends.spread * factor,
+        heaviest=ends.heaviest * factor,
+        quantiles=ends.quantiles * factor[:, None],
+    )
+
+
+def _mixture(seen: RaysSeen, ends: LightEnds, *, factor: Tensor, shares: tuple[float, ...], count: int) -> LightEnds:
+    """Where light ends that goes along one of `count` rays; `ends` are theirs, scaled by `factor`."""
+    opacity = ends.opacity.view(-1, count)
+    total = opacity.sum(1)
+    defined = total > 0
+    weights = opacity / torch.where(defined, total, 1.0)[:, None]
+    # A ray on which nothing ends has no mean, and no weight.
+    means = torch.where(opacity > 0, ends.mean.view(-1, count), 0.0)
+    spreads = torch.where(opacity > 0, ends.spread.view(-1, count), 0.0)
+    mean = (weights * means).sum(1)
+    spread = (weights * (spreads.square() + (means - mean[:, None]).square())).sum(1).sqrt()
+    largest, ray = ends.largest.view(-1, count).max(1)
+    density, starts, stops, offsets = seen.intervals
+    own = factor[kernels.ray_indices(offsets)]
+    quantiles = [
+        kernels.mixture_quantile(
+            density / own, starts * own, stops * own, offsets=offsets, rays_per_pixel=count, share=share
+        )
+        for share in shares
+    ]
+    return LightEnds(
+        opacity=opacity.mean(1),
+        transmittance=ends.transmittance.view(-1, count).mean(1),
+        mean=torch.where(defined, mean, torch.nan),
+        spread=torch.where(defined, spread, torch.nan),
+        heaviest=ends.heaviest.view(-1, count).gather(1, ray[:, None])[:, 0],
+        largest=largest,
+        quantiles=torch.stack(quantiles, dim=-1) if quantiles else mean.new_empty(len(mean), 0),
+    )
