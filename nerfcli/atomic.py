@@ -44,21 +44,33 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         UserError: as for `atomic_path`.
     """
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    old = path.with_name(f".{path.name}.old-{os.getpid()}")
     with _write_errors_told(path):
         try:
             partial.mkdir(parents=True)
             yield partial
+            replace_folder(partial, path)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def replace_folder(complete: Path, path: Path) -> None:
+    """Put a folder in the place of another that may stand there, which is kept until this has worked.
+
+    Raises:
+        UserError: it cannot be moved.
+    """
+    old = path.with_name(f".{path.name}.old-{os.getpid()}")
+    with _write_errors_told(path):
+        try:
             if path.exists():
                 os.replace(path, old)
             try:
-                os.replace(partial, path)
+                os.replace(complete, path)
             except OSError:
                 if old.exists():
                     os.replace(old, path)
                 raise
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
             shutil.rmtree(old, ignore_errors=True)
 
 

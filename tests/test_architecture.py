@@ -44,9 +44,22 @@ CONFINED = {
     "pycolmap": {"poses", "cameras", "convert"},  # convert: the other reader of a verification
     "typer": {"cli"},
     "rich": {"cli"},
+    "matplotlib": {"media"},
 }
 # The command line starts in a fraction of a second because these are imported inside the commands that need them.
-NOT_AT_START = ("torch", "numpy", "numba", "scipy", "cv2", "pycolmap", "skimage", "PIL", "imageio_ffmpeg", "rich")
+NOT_AT_START = (
+    "torch",
+    "numpy",
+    "numba",
+    "scipy",
+    "cv2",
+    "pycolmap",
+    "skimage",
+    "PIL",
+    "imageio_ffmpeg",
+    "rich",
+    "matplotlib",
+)
 MOST_LINES = 400
 
 

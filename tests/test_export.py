@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
@@ -15,10 +16,12 @@ from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
 from nerfcli.export.frames import export_frames
 from nerfcli.export.names import file_names
-from nerfcli.export.settings import ExportSettings
+from nerfcli.export.order import Order
+from nerfcli.export.presentation import value_range
+from nerfcli.export.settings import ExportSettings, VideoSettings
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
-from nerfcli.media.preview import depth_range, preview
+from nerfcli.media.preview import preview
 from nerfcli.render.depth import effective_floor
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, render_picture
@@ -38,12 +41,14 @@ def model() -> Model:
     return fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32, unit="metre")
 
 
-def export(
-    model: Model, frames: list[Frame], folder: Path, *, outputs: tuple[str, ...] = ("rgb", "depth", "opacity"),
-    npy: bool = False, video: bool = False, depth: DepthRequest = DEPTH,
-) -> list[Path]:  # fmt: skip
-    settings = ExportSettings(outputs=outputs, depth=depth, npy=npy, video=video, fps=12)
-    return export_frames(model, frames, folder, settings, provenance={"run": "a run"}, on_rays=lambda rays: None)
+def order(frames: list[Frame], *, outputs: tuple[str, ...] = ("rgb", "depth", "opacity"), **settings: Any) -> Order:
+    settings = {"depth": DEPTH} | settings
+    return Order(tuple(frames), ExportSettings(outputs=outputs, **settings), {"run": "a run"})
+
+
+def export(model: Model, frames: list[Frame], folder: Path, **settings: Any) -> list[Path]:
+    ordered = order(frames, **settings)
+    return export_frames(model, ordered, folder, on_rays=lambda rays: None, notify=lambda text: None)
 
 
 def listing(folder: Path) -> list[str]:
@@ -145,7 +150,7 @@ def test_previews_share_one_range_over_all_frames(model, tmp_path):
     frames = [frame("near", 1.0), frame("far", 3.0)]
     export(model, frames, tmp_path / "views", outputs=("depth",))
     depths = [read_tiff(tmp_path / f"views/depth/{name}.tiff") for name in ("near", "far")]
-    lo, hi = depth_range(depth for depth, _ in depths)
+    lo, hi = value_range(lambda: iter([depth for depth, _ in depths]), "depth")
     assert hi - lo > 1.5
     for name, (depth, meta) in zip(("near", "far"), depths, strict=True):
         expected = preview(depth, meta, lo=lo, hi=hi)
@@ -154,27 +159,13 @@ def test_previews_share_one_range_over_all_frames(model, tmp_path):
 
 def test_one_video_per_output_with_every_frame_in_it(model, tmp_path):
     frames = [frame(f"view_{index:04d}", 1.5 + 0.1 * index) for index in range(5)]
-    written = export(model, frames, tmp_path / "views", outputs=("rgb", "depth"), video=True)
+    written = export(model, frames, tmp_path / "views", outputs=("rgb", "depth"), video=VideoSettings(fps=12))
     assert written == [tmp_path / "views/rgb.mp4", tmp_path / "views/depth.mp4"]
     for path in written:
         count, seconds = imageio_ffmpeg.count_frames_and_secs(str(path))
         assert count == 5
         assert seconds == pytest.approx(5 / 12, abs=0.05)
     assert len(listing(tmp_path / "views/rgb")) == 5
-
-
-def test_an_export_that_is_stopped_leaves_the_old_one(model, tmp_path):
-    export(model, [frame("old")], tmp_path / "views", outputs=("rgb",))
-
-    def stop(rays: int) -> None:
-        raise KeyboardInterrupt
-
-    settings = ExportSettings(outputs=("rgb",), depth=DEPTH, npy=False, video=False, fps=24)
-    with pytest.raises(KeyboardInterrupt):
-        export_frames(model, [frame("new")], tmp_path / "views", settings, provenance={}, on_rays=stop)
-    assert listing(tmp_path) == ["views/render.json", "views/rgb/old.png"]
-    export(model, [frame("new")], tmp_path / "views", outputs=("rgb",))
-    assert listing(tmp_path) == ["views/render.json", "views/rgb/new.png"]
 
 
 def test_a_file_in_the_folders_place_is_told(model, tmp_path):

@@ -1,4 +1,4 @@
-"""nerfcli.media.preview: one range over all frames; previews show what they say."""
+"""nerfcli.media.preview: previews show what they say."""
 
 import math
 
@@ -6,28 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib import colormaps
+from skimage.color import rgb2lab
 
+from nerfcli.media.colour_maps import COLOUR_MAPS, levels_of
 from nerfcli.media.depth import DepthMeta
-from nerfcli.media.preview import depth_range, preview
+from nerfcli.media.preview import beside, preview
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)
-
-
-def test_range_is_the_percentiles_of_all_finite_values():
-    rng = np.random.default_rng(0)
-    frames = [rng.gamma(2.0, 3.0, (20, 30)).astype(np.float32) for _ in range(4)]
-    frames[1][5:9] = np.nan
-    frames[2][0, 0] = np.inf
-    values = np.concatenate([f[np.isfinite(f)] for f in frames])
-    assert depth_range(iter(frames)) == pytest.approx(np.percentile(values, (1, 99)), rel=1e-6)
-
-
-def test_range_of_large_frames_and_of_nothing():
-    ramp = np.linspace(0, 1, 1000 * 1001, dtype=np.float32).reshape(1000, 1001)
-    assert depth_range([ramp]) == pytest.approx((0.01, 0.99), abs=1e-4)  # one value of 16 is looked at
-    assert depth_range([np.full((3, 4), np.nan, np.float32)]) == (0.0, 1.0)
-    assert depth_range([]) == (0.0, 1.0)
-    assert depth_range([np.full((3, 4), 7, np.float32)]) == (7.0, 7.0)
 
 
 def test_preview_shows_turbo_above_the_legend_and_grey_where_nothing_is():
@@ -87,3 +73,27 @@ def test_preview_refuses_a_range_out_of_order():
     for lo, hi in ((2.0, 1.0), (0.0, math.nan), (0.0, math.inf)):
         with pytest.raises(ValueError, match="lo <= hi must be finite"):
             preview(np.zeros((2, 2), np.float32), META, lo=lo, hi=hi)
+
+
+@pytest.mark.parametrize("colour_map", COLOUR_MAPS)
+def test_previews_have_the_colours_of_matplotlib(colour_map):
+    depth = np.linspace(0, 1, 256, dtype=np.float32).repeat(2)[None]
+    expected = colormaps[COLOUR_MAPS[colour_map]](np.arange(256))[:, :3] * 255
+    assert np.abs(preview(depth, META, lo=0.0, hi=1.0, colour_map=colour_map)[0, ::2] - expected).max() <= 0.5
+
+
+@pytest.mark.parametrize("colour_map", ["viridis", "grey"])
+def test_even_maps_grow_lighter_in_even_steps(colour_map):
+    """Lightness of CIELAB, as scikit-image computes it; both maps are made to be linear in it or close."""
+    lightness = rgb2lab(levels_of(colour_map)[None])[0, :, 0]
+    assert (np.diff(lightness) > -0.05).all()  # a level of blue is 0.1 or less
+    assert np.corrcoef(lightness, np.arange(256))[0, 1] > 0.99
+
+
+def test_pictures_beside_each_other_are_aligned_at_the_top():
+    low, high = np.full((2, 3, 3), 10, np.uint8), np.full((4, 1, 3), 20, np.uint8)
+    sheet = beside([low, high])
+    assert sheet.shape == (4, 4, 3)
+    assert (sheet[:2, :3] == 10).all()
+    assert (sheet[2:, :3] == 255).all()
+    assert (sheet[:, 3] == 20).all()

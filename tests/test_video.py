@@ -1,15 +1,19 @@
-"""nerfcli.media.video: what ffmpeg reads back, and nothing left after an exception."""
+"""nerfcli.media.video: what ffmpeg and Pillow read back, and nothing left after an exception."""
 
+import json
 import re
 import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.video import VideoWriter
+from nerfcli.media.video import FORMATS, check_encoders, write_video
 
 
 def smooth_frames(count: int, *, height: int, width: int) -> list[np.ndarray]:
@@ -28,32 +32,93 @@ def stream_line(path: Path) -> str:
 
 def decoded(path: Path, *, height: int, width: int) -> np.ndarray:
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", f"file:{path}"]
-    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    command += ["-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     raw = subprocess.run(command, capture_output=True, check=True).stdout
     return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
 
 
-@pytest.mark.parametrize("name", ["video.mp4", "mit Leerzeichen ä北.mp4", "a:b %d.mp4", "-y.mp4"])
-def test_video_has_every_frame_in_its_colours(tmp_path, name):
+def write(path: Path, frames: list[np.ndarray], *, kind: str = "mp4", fps: float = 30, **options: Any) -> None:
+    write_video(path, lambda: frames, form=FORMATS[kind], fps=fps, **options)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "parts"),
+    [
+        ("mp4", "video.mp4", ("h264", "yuv420p(tv, bt709/bt709/iec61966-2-1", "12.50 fps")),
+        ("mp4", "mit Leerzeichen ä北.mp4", ("h264",)),
+        ("mp4", "a:b %d.mp4", ("h264",)),
+        ("mp4", "-y.mp4", ("h264",)),
+        ("h265", "a:b %d.h265.mp4", ("hevc", "hvc1", "yuv420p(tv, bt709/bt709/iec61966-2-1", "12.50 fps")),
+        ("webm", "a:b %d.webm", ("vp9", "yuv420p(tv, bt709/bt709/iec61966-2-1", "12.50 fps")),
+        ("gif", "a:b %d.gif", ("gif", "12.50 fps")),
+    ],
+)
+def test_video_has_every_frame_in_its_colours(tmp_path, kind, name, parts):
     """64 x 48, 7 frames: the matrix is tagged and applied, so that colours come back within a few levels."""
     path, frames = tmp_path / "new" / name, smooth_frames(7, height=48, width=64)
-    with VideoWriter(path, fps=12.5) as video:
-        for frame in frames:
-            video.add(frame)
+
+    def source() -> Iterator[np.ndarray]:
+        yield from frames
         assert not path.exists()
+
+    write_video(path, source, form=FORMATS[kind], fps=12.5)
     assert [p.name for p in path.parent.iterdir()] == [name]
     found = decoded(path, height=48, width=64)
     assert len(found) == 7
-    assert np.abs(found.astype(int) - np.stack(frames)).mean() < 2
-    line = stream_line(path)
-    for part in ("h264", "yuv420p(tv, bt709", "64x48", "12.50 fps"):
-        assert part in line
+    # The gif has 256 colours for all of it; VP9 has another scale of quality.
+    assert np.abs(found.astype(int) - np.stack(frames)).mean() < {"gif": 15, "webm": 3}.get(kind, 2)
+    assert all(part in stream_line(path) for part in ("64x48", *parts))
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_the_same_frames_give_the_same_bytes_and_the_comment_is_in_them(tmp_path, kind):
+    comment = json.dumps({"axis": "z", "run": "Küche = 1; #2", "text": 300 * "long "}, ensure_ascii=False)
+    frames = smooth_frames(3, height=16, width=16)
+    paths = [tmp_path / f"{name}{FORMATS[kind].suffix}" for name in "ab"]
+    for path in paths:
+        write(path, frames, kind=kind, comment=comment)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    assert len(decoded(paths[0], height=16, width=16)) == 3
+    if kind == "gif":
+        with Image.open(paths[0]) as image:
+            assert image.info["comment"].decode() == comment
+    else:
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", paths[0], "-f", "ffmetadata", "-"]
+        told = subprocess.run(command, capture_output=True, check=True).stdout.decode()
+        (line,) = re.findall("^comment=(.*)$", told, flags=re.MULTILINE | re.IGNORECASE)
+        assert re.sub(r"\\(.)", r"\1", line) == comment
+
+
+def test_quality_follows_crf(tmp_path):
+    noise = list(np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8))
+    for crf in (0, 51):
+        write(tmp_path / f"{crf}.mp4", noise, crf=crf)
+    errors = [
+        np.abs(decoded(tmp_path / f"{crf}.mp4", height=64, width=64).astype(int) - np.stack(noise)).mean()
+        for crf in (0, 51)
+    ]
+    assert errors[0] < errors[1]
+    assert (tmp_path / "0.mp4").stat().st_size > 5 * (tmp_path / "51.mp4").stat().st_size
+
+
+@pytest.mark.parametrize(("plays", "told"), [(0, 0), (1, None), (3, 2)])
+def test_a_gif_tells_the_player_how_often_it_plays(tmp_path, plays, told):
+    """Pillow reads the extension of Netscape: the number of repetitions, 0 for ever, none for once."""
+    write(tmp_path / "a.gif", smooth_frames(2, height=8, width=8), kind="gif", plays=plays)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.info.get("loop") == told
+
+
+def test_other_videos_hold_the_clip_as_often_as_it_plays(tmp_path):
+    frames = [np.full((16, 16, 3), level, np.uint8) for level in (0, 100, 200)]
+    write(tmp_path / "a.mp4", frames, plays=2)
+    levels = decoded(tmp_path / "a.mp4", height=16, width=16).mean(axis=(1, 2, 3))
+    np.testing.assert_allclose(levels, [0, 100, 200, 0, 100, 200], atol=2)
 
 
 def test_relative_names_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with VideoWriter(Path("-a:b.mp4"), fps=30) as video:
-        video.add(np.zeros((2, 2, 3), np.uint8))
+    write(Path("-a:b.mp4"), [np.zeros((2, 2, 3), np.uint8)])
     assert [p.name for p in tmp_path.iterdir()] == ["-a:b.mp4"]
 
 
@@ -61,8 +126,7 @@ def test_relative_names_work(tmp_path, monkeypatch):
 def test_odd_sizes_are_padded_with_their_edge(tmp_path, height, width):
     path = tmp_path / "odd.mp4"
     (frame,) = smooth_frames(1, height=height, width=width)
-    with VideoWriter(path, fps=30) as video:
-        video.add(frame)
+    write(path, [frame])
     even_height, even_width = height + height % 2, width + width % 2
     (found,) = decoded(path, height=even_height, width=even_width).astype(int)
     assert f"{even_width}x{even_height}" in stream_line(path)
@@ -73,91 +137,108 @@ def test_odd_sizes_are_padded_with_their_edge(tmp_path, height, width):
 def test_the_index_stands_before_the_frames(tmp_path):
     """Fast start: a player on the web begins before the whole file is there."""
     path = tmp_path / "a.mp4"
-    with VideoWriter(path, fps=30) as video:
-        video.add(np.zeros((16, 16, 3), np.uint8))
+    write(path, [np.zeros((16, 16, 3), np.uint8)])
     content = path.read_bytes()
     assert 0 < content.index(b"moov") < content.index(b"mdat")
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 5])
 @pytest.mark.parametrize("problem", [KeyError("ours"), KeyboardInterrupt()])
-def test_nothing_is_left_after_an_exception(tmp_path, num_frames, problem):
-    def interrupted():
-        with VideoWriter(tmp_path / "a.mp4", fps=30) as video:
-            for frame in smooth_frames(num_frames, height=32, width=32):
-                video.add(frame)
-            encoders.append(video._encoder)
-            raise problem
-
+@pytest.mark.parametrize("kind", ["mp4", "gif"])
+def test_nothing_is_left_after_an_exception(tmp_path, num_frames, problem, kind, monkeypatch):
     encoders = []
+    start = subprocess.Popen
+
+    def started(*args: Any, **options: Any) -> subprocess.Popen[bytes]:
+        encoders.append(start(*args, **options))
+        return encoders[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", started)
+
+    def interrupted() -> Iterator[np.ndarray]:
+        yield from smooth_frames(num_frames, height=32, width=32)
+        raise problem
+
     with pytest.raises(type(problem)) as caught:
-        interrupted()
+        write_video(tmp_path / "a", interrupted, form=FORMATS[kind], fps=30)
     assert caught.value is problem
     assert list(tmp_path.iterdir()) == []
-    assert all(encoder is None or encoder.poll() is not None for encoder in encoders)
+    assert len(encoders) == (num_frames > 0)
+    assert all(encoder.poll() is not None for encoder in encoders)
 
 
 def test_an_exception_keeps_the_video_that_stood_there(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_bytes(b"the video of yesterday")
-    with pytest.raises(ValueError, match="no frame was added"), VideoWriter(path, fps=30):
-        pass
+    with pytest.raises(ValueError, match="no frame came"):
+        write(path, [])
     assert path.read_bytes() == b"the video of yesterday"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_frames_must_be_alike(tmp_path):
-    def add_all(*frames: np.ndarray) -> None:
-        with VideoWriter(tmp_path / "a.mp4", fps=30) as video:
-            for frame in frames:
-                video.add(frame)
-
+    path = tmp_path / "a.mp4"
     with pytest.raises(ValueError, match=r"frame must be \(4, 6, 3\) as the first one, got \(6, 4, 3\)"):
-        add_all(np.zeros((4, 6, 3), np.uint8), np.zeros((6, 4, 3), np.uint8))
+        write(path, [np.zeros((4, 6, 3), np.uint8), np.zeros((6, 4, 3), np.uint8)])
     with pytest.raises(ValueError, match=r"frame must be uint8 \(H, W, 3\), got float64"):
-        add_all(np.zeros((4, 6, 3)))
+        write(path, [np.zeros((4, 6, 3))])
     with pytest.raises(ValueError, match="fps must be positive, got 0"):
-        VideoWriter(tmp_path / "a.mp4", fps=0)
+        write(path, [], fps=0)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_place_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "a.mp4").mkdir()
-    with (
-        pytest.raises(UserError, match=r"cannot write .*a\.mp4: Is a directory"),
-        VideoWriter(tmp_path / "a.mp4", fps=30) as video,
-    ):
-        video.add(np.zeros((4, 6, 3), np.uint8))
+    with pytest.raises(UserError, match=r"cannot write .*a\.mp4: Is a directory"):
+        write(tmp_path / "a.mp4", [np.zeros((4, 6, 3), np.uint8)])
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
 
 
-def test_an_encoder_that_fails_is_quoted(tmp_path, monkeypatch):
+@pytest.fixture
+def broken_ffmpeg(tmp_path, monkeypatch) -> Callable[[str], Path]:
+    """Puts a shell script in the place of ffmpeg."""
+
+    def put(script: str) -> Path:
+        program = tmp_path / "ffmpeg"
+        program.write_text(f"#!/bin/sh\n{script}\n")
+        program.chmod(0o755)
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+        return program
+
+    return put
+
+
+def test_an_encoder_that_fails_is_quoted(tmp_path, broken_ffmpeg):
     """ffmpeg cannot open its output; the error names the file that was asked for and the encoder's reason."""
-    broken = tmp_path / "ffmpeg"
-    broken.write_text("#!/bin/sh\necho 'first line' >&2\necho 'No space left on device' >&2\nexit 1\n")
-    broken.chmod(0o755)
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(broken))
-    with (
-        pytest.raises(UserError, match=r"cannot write .*a\.mp4: No space left on device"),
-        VideoWriter(tmp_path / "a.mp4", fps=30) as video,
-    ):
-        video.add(np.zeros((1024, 1024, 3), np.uint8))  # more than a pipe holds: `add` meets the closed end
-    with (
-        pytest.raises(UserError, match=r"cannot write .*a\.mp4: No space left on device"),
-        VideoWriter(tmp_path / "a.mp4", fps=30) as video,
-    ):
-        video.add(np.zeros((2, 2, 3), np.uint8))  # less: closing meets the exit status
-    assert list(tmp_path.iterdir()) == [broken]
+    program = broken_ffmpeg("echo 'first line' >&2\necho 'No space left on device' >&2\nexit 1")
+    for side in (1024, 2):  # more than a pipe holds: writing meets the closed end; less: closing meets the status
+        with pytest.raises(UserError, match=r"cannot write .*a\.mp4: No space left on device"):
+            write(tmp_path / "a.mp4", [np.zeros((side, side, 3), np.uint8)])
+    assert list(tmp_path.iterdir()) == [program]
 
 
-def test_a_missing_encoder_is_told(tmp_path, monkeypatch):
+def test_all_encoders_are_in_the_ffmpeg_that_comes_along():
+    check_encoders(FORMATS)
+
+
+def test_a_missing_encoder_is_told_with_what_there_is(broken_ffmpeg):
+    broken_ffmpeg("echo ' V....D libx264 H.264'; echo ' V....D gif GIF'")
+    check_encoders(["mp4", "gif"])
+    with pytest.raises(UserError, match=r"cannot make h265 videos: .*ffmpeg has no encoder libx265") as caught:
+        check_encoders(["mp4", "h265"])
+    assert caught.value.hint.startswith("it can make mp4, gif; choose one of these, or install ffmpeg")
+    broken_ffmpeg("exit 3")
+    with pytest.raises(UserError, match="does not run"):
+        check_encoders(["mp4"])
+
+
+def test_a_missing_ffmpeg_is_told(tmp_path, monkeypatch):
     def nothing():
         raise RuntimeError("No ffmpeg exe could be found.")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", nothing)
-    with (
-        pytest.raises(UserError, match=r"cannot write .*a\.mp4: there is no ffmpeg"),
-        VideoWriter(tmp_path / "a.mp4", fps=30) as video,
-    ):
-        video.add(np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(UserError, match="cannot make videos: there is no ffmpeg"):
+        check_encoders(["mp4"])
+    with pytest.raises(UserError, match="cannot make videos: there is no ffmpeg"):
+        write(tmp_path / "a.mp4", [np.zeros((4, 4, 3), np.uint8)])
     assert list(tmp_path.iterdir()) == []

@@ -8,6 +8,7 @@ import typer
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
+from nerfcli.cli.playing import frame_range, one_of, video_settings
 from nerfcli.cli.views import Views, chosen_frames, write_frames
 from nerfcli.errors import UserError
 
@@ -41,9 +42,29 @@ def render(
         float | None, typer.Option(help="What --depth background counts for light that passes, scene units.", min=0)
     ] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Depth as .npy beside the TIFF.")] = False,
-    video: Annotated[bool, typer.Option("--video", help="An MP4 of each output.")] = False,
+    colour_map: Annotated[str, typer.Option(help="Of depth to look at: turbo, viridis or grey.")] = "turbo",
+    video: Annotated[bool, typer.Option("--video", help="A video of each output: --video-format mp4.")] = False,
+    video_format: Annotated[
+        str | None, typer.Option(help="Some of mp4 (H.264), h265 (in mp4), webm (VP9), gif; implies --video.")
+    ] = None,
+    video_layout: Annotated[
+        str, typer.Option(help="separate: a video of each output; side-by-side: all outputs in one.")
+    ] = "separate",
+    direction: Annotated[str, typer.Option(help="forward, reverse or ping-pong.")] = "forward",
+    crf: Annotated[
+        int | None,
+        typer.Option(help="Constant quality of videos, 0 is best.  [default: mp4 16, h265 18, webm 20]", min=0),
+    ] = None,
+    loop: Annotated[
+        int | None, typer.Option(help="Times a video plays; 0 is for ever, gif only.  [default: 1, gif 0]", min=0)
+    ] = None,
     count: Annotated[int, typer.Option(help="Views of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
     fps: Annotated[float, typer.Option(help="Frames per second of the video.", min=1, max=240)] = 24,
+    frames: Annotated[
+        str | None,
+        typer.Option(help="START:STOP[:STEP]: render these views alone, counted from 0; assemble nothing."),
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="Processes that share the views, and --threads.", min=1)] = 1,
     cameras_only: Annotated[
         bool,
         typer.Option("--cameras-only", help="Render nothing; write cameras.json and camera_path.json."),
@@ -69,17 +90,21 @@ def render(
       median         where half of all light has ended                     (NaN if less than half ends)
       quantile:0.05  where that share of all light has ended               (NaN if less ends)
     Depth files are float32 TIFF; convention, axis, unit, opacity floor and invalid value are in each file.
-    Writes RUN/renders/CAMERAS/.
+    Writes RUN/renders/CAMERAS/. A command that was interrupted goes on with the missing views when it is given again.
+    A cluster renders --frames 0:100, --frames 100:200, ... at a time; without --frames the same command then assembles.
 
     \b
     Examples:
       nerfcli render photos-scene-run --cameras test --outputs rgb,depth --depth median --depth-axis ray
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
+      nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-layout side-by-side --video-format gif
+      nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 100:200 --jobs 4
       nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
       nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
     """
     from nerfcli.export.settings import OUTPUTS, ExportSettings
+    from nerfcli.media.colour_maps import COLOUR_MAPS
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.render.model import load_model
     from nerfcli.train.run_folder import FIELD
@@ -96,8 +121,14 @@ def render(
     request = DepthRequest(
         convention=depth, axis=depth_axis, min_opacity=min_opacity, background_distance=background_distance
     )
-    settings = ExportSettings(outputs=chosen, depth=request, npy=npy, video=video, fps=fps)
-
+    one_of(colour_map, COLOUR_MAPS, "--colour-map")
+    part = None if frames is None else frame_range(frames)
+    videos = None
+    if video or video_format is not None:
+        videos = video_settings(
+            video_format or "mp4", layout=video_layout, direction=direction, fps=fps, crf=crf, loop=loop
+        )
+    settings = ExportSettings(outputs=chosen, depth=request, npy=npy, colour_map=colour_map, video=videos)
     views = Views(cameras, count, through, nerfstudio_frame, max_size)
 
     def work(folder: Path, one_of_many: bool) -> None:
@@ -118,6 +149,8 @@ def render(
             settings=settings,
             device=device_name(device),
             threads=thread_count(threads),
+            jobs=jobs,
+            part=part,
             overwrite=overwrite,
             console=console,
         )
@@ -144,23 +177,27 @@ def render_run(
     threads: int,
     overwrite: bool,
     console: Console,
+    jobs: int = 1,
+    part: slice | None = None,
 ) -> list[Path]:
     """Render into `target`, or keep what stands there if it is the same.
 
+    Args:
+        part: render these views alone, for a later call to find them.
+
     Returns:
-        The paths to show: videos, or the folders of the outputs.
+        The paths to show: videos, or the folders of the outputs; the unfinished folder where only a part is rendered.
 
     Raises:
         UserError: no such run, no such cameras, or other files stand at `target`.
     """
     import hashlib
-    import json as json_module
     from dataclasses import replace
 
     import torch
 
-    from nerfcli.export.frames import DESCRIPTION, export_frames
-    from nerfcli.export.names import describe_frames
+    from nerfcli.export.frames import Workers, export_frames, export_part
+    from nerfcli.export.order import Order, refuse_foreign
     from nerfcli.render.model import load_model
     from nerfcli.train.run_folder import FIELD
 
@@ -177,23 +214,25 @@ def render_run(
         "run": run.name,
         "field_sha256": hashlib.sha256((run / FIELD).read_bytes()).hexdigest(),
     }
-    if target.is_file() or (target.is_dir() and not (target / DESCRIPTION).exists() and any(target.iterdir())):
-        raise UserError(f"{target} holds something else than renders", "choose another place with -o")
-    if (target / DESCRIPTION).exists() and not overwrite:
-        made = json_module.loads((target / DESCRIPTION).read_text(encoding="utf-8"))
-        wanted = {"settings": settings.to_json(), "frames": describe_frames(frames), **provenance}
-        if any(made.get(key) != value for key, value in wanted.items()):
-            raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another place with -o")
+    order = Order(tuple(frames), settings, provenance)
+    chosen = range(len(frames))[part] if part is not None else range(len(frames))
+    if not chosen:
+        raise UserError(f"--frames: there are {len(frames)} views", "count from 0", exit_code=2)
+    refuse_foreign(target)
+    if not overwrite and order.is_held_by(target):
         console.note(f"{target} is kept: it was rendered with these settings; --overwrite renders again")
-        return [target / (f"{name}.mp4" if settings.video else name) for name in settings.outputs]
+        return order.results(target)
 
-    total = sum(frame.camera.width * frame.camera.height for frame in frames)
+    total = sum(frames[index].camera.width * frames[index].camera.height for index in chosen)
     done = 0
     with console.progress(f"render {views.name}") as update:
 
         def on_rays(rays: int) -> None:
             nonlocal done
             done += rays
-            update(done / total, f"{len(frames)} frames")
+            update(done / total, f"{len(chosen)} frames")
 
-        return export_frames(model, frames, target, settings, provenance=provenance, on_rays=on_rays)
+        workers = Workers(jobs, threads)
+        if part is not None:
+            return [export_part(model, order, target, chosen, on_rays=on_rays, notify=console.note, workers=workers)]
+        return export_frames(model, order, target, on_rays=on_rays, notify=console.note, workers=workers)

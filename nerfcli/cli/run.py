@@ -55,7 +55,7 @@ def run(
     from nerfcli.cli.render import folder_name, render_run
     from nerfcli.cli.train import train_scene, was_interrupted
     from nerfcli.cli.views import Views
-    from nerfcli.export.settings import OUTPUTS, ExportSettings
+    from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
     from nerfcli.poses.settings import PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.train.settings import TrainSettings
@@ -85,7 +85,9 @@ def run(
         console.result(field)
         console.result(metrics, numbers)
         for cameras, video in (("test", False), ("orbit", True)):
-            settings = ExportSettings(outputs=OUTPUTS[: 2 if video else 3], depth=depth, npy=False, video=video, fps=24)
+            settings = ExportSettings(
+                outputs=OUTPUTS[: 2 if video else 3], depth=depth, video=VideoSettings() if video else None
+            )
             views = Views(cameras, count, max_size=max_size if video else None)
             written = render_run(
                 field,

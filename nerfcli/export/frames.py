@@ -1,92 +1,133 @@
-"""The walk over all frames of an export: each rendered and written, then what needs all of them."""
+"""The walk over all frames of an order: what is missing is rendered, then what needs all of them is made."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from nerfcli import __version__
-from nerfcli.atomic import atomic_folder, write_json
-from nerfcli.cameras.frame import Frame
-from nerfcli.export.names import describe_frames, file_names
-from nerfcli.export.picture_files import read_values, write_picture
-from nerfcli.export.settings import ExportSettings, depth_meta
-from nerfcli.media.depth import DepthMeta
-from nerfcli.media.images import read_image, write_png
-from nerfcli.media.preview import depth_range, preview
-from nerfcli.media.video import VideoWriter
+from nerfcli.atomic import write_json
+from nerfcli.export.one_frame import render_frame
+from nerfcli.export.order import DESCRIPTION, Order
+from nerfcli.export.presentation import write_previews, write_videos
+from nerfcli.export.processes import render_in_processes
+from nerfcli.export.settings import depth_meta
+from nerfcli.export.unfinished import Unfinished, unfinished_of
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import render_picture
 
-DESCRIPTION = "render.json"
+
+@dataclass(frozen=True)
+class Workers:
+    """Who renders.
+
+    Args:
+        jobs: processes that each take a frame at a time; 1 renders in this process.
+        threads: of all of them together.
+    """
+
+    jobs: int = 1
+    threads: int = 1
 
 
 def export_frames(
     model: Model,
-    frames: Sequence[Frame],
+    order: Order,
     folder: Path,
-    settings: ExportSettings,
     *,
-    provenance: dict[str, Any],
     on_rays: Callable[[int], None],
+    notify: Callable[[str], None],
+    workers: Workers = Workers(),
 ) -> list[Path]:
-    """Render every frame and write what `settings` asks for; the folder appears when it is complete.
+    """Render every frame and write what was ordered; the folder appears when it is complete.
 
     Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; rgb.mp4, depth.mp4,
-    opacity.mp4; render.json with settings, cameras and `provenance`. The colours of all depth previews share one
-    range, so that a video does not flicker.
+    opacity.mp4 or rgb+depth+opacity.mp4; render.json. The colours of all depth previews share one range, so that a
+    video does not flicker. Until then everything gathers in a hidden folder beside it, which stays when the command
+    ends early: the same order then renders the missing frames alone. Memory does not grow with the number of frames.
 
     Args:
         model: the trained model.
-        frames: cameras and poses in the scene's frame.
+        order: what is to be rendered.
         folder: the folder to write; a folder that stands there is replaced at the end.
-        settings: what to write.
-        provenance: goes into render.json.
-        on_rays: called with the number of rays after each tile.
+        on_rays: called with numbers of rays that are done; frames that are there already count.
+        notify: takes a line for the user.
+        workers: who renders; the files are the same for any number.
 
     Returns:
-        The videos if there are any, else the folders of the outputs.
+        The paths to show, see `Order.results`.
 
     Raises:
-        UserError: the folder cannot be written.
+        UserError: the folder cannot be written, a video cannot be made, or processes die again and again.
     """
-    meta = depth_meta(model, settings.depth)
-    names = file_names(frames)
-    wanted = settings.depth if "depth" in settings.outputs else None
-    with atomic_folder(folder) as partial:
-        for frame, name in zip(frames, names, strict=True):
-            picture = render_picture(model, frame, background=model.background, depth=wanted, on_tile=on_rays)
-            write_picture(picture, partial, name, settings=settings, meta=meta, background=model.background)
-        if "depth" in settings.outputs:
-            _write_previews(partial, names, meta)
-        if settings.video:
-            for output in settings.outputs:
-                with VideoWriter(partial / f"{output}.mp4", fps=settings.fps) as video:
-                    for name in names:
-                        video.add(read_image(partial / output / f"{name}.png")[..., :3])
-        description = {
-            "nerfcli": __version__,
-            "settings": settings.to_json(),
-            **({"depth_meaning": meta.to_json()} if "depth" in settings.outputs else {}),
-            "frames": describe_frames(frames),
-            **provenance,
-        }
-        write_json(partial / DESCRIPTION, description)
-    return [folder / (f"{output}.mp4" if settings.video else output) for output in settings.outputs]
-
-
-def _write_previews(folder: Path, names: Sequence[str], meta: DepthMeta) -> None:
-    """A coloured PNG beside each depth file, all on one range."""
-
-    def depths() -> Iterator[np.ndarray]:
-        for name in names:
-            yield read_values(folder, "depth", name)
-
-    lo, hi = depth_range(depths())
-    metadata = {key: str(value) for key, value in asdict(meta).items() if value not in (None, {})} | {
-        "range": f"{lo} {hi}"
+    order.check()
+    unfinished = unfinished_of(order, folder)
+    everything = range(len(order.frames))
+    _render_missing(model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers)
+    meta = depth_meta(model, order.settings.depth)
+    ranges = write_previews(unfinished.folder, order, meta)
+    write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
+    description = {
+        **order.of_pictures(),
+        **order.settings.of_presentation(),
+        **({"depth_meaning": meta.to_json()} if "depth" in order.settings.outputs else {}),
+        "ranges": ranges,
+        "facts": {name: unfinished.facts(name) for name in order.names},
     }
-    for name, depth in zip(names, depths(), strict=True):
-        write_png(folder / "depth" / f"{name}.png", preview(depth, meta, lo=lo, hi=hi), metadata=metadata)
+    write_json(unfinished.folder / DESCRIPTION, description)
+    unfinished.finish(folder)
+    return order.results(folder)
+
+
+def export_part(
+    model: Model,
+    order: Order,
+    folder: Path,
+    part: range,
+    *,
+    on_rays: Callable[[int], None],
+    notify: Callable[[str], None],
+    workers: Workers = Workers(),
+) -> Path:
+    """Render some frames of an order, for `export_frames` to find them there; see there.
+
+    Args:
+        part: indices of frames; several machines that share a disk may render different ones at a time.
+
+    Returns:
+        The unfinished folder.
+    """
+    order.check()
+    unfinished = unfinished_of(order, folder)
+    _render_missing(model, order, part, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers)
+    there = sum(map(unfinished.has, order.names))
+    notify(f"{there} of {len(order.names)} frames are there; without --frames the same command renders the others")
+    return unfinished.folder
+
+
+def _render_missing(
+    model: Model,
+    order: Order,
+    part: range,
+    *,
+    unfinished: Unfinished,
+    on_rays: Callable[[int], None],
+    notify: Callable[[str], None],
+    workers: Workers,
+) -> None:
+    missing = [index for index in part if not unfinished.has(order.names[index])]
+    if len(missing) < len(part):
+        notify(f"{len(part) - len(missing)} of {len(part)} frames are there already, in {unfinished.folder}")
+        cameras = [order.frames[index].camera for index in part if index not in set(missing)]
+        on_rays(sum(camera.width * camera.height for camera in cameras))
+    if workers.jobs > 1 and len(missing) > 1:
+        render_in_processes(
+            model,
+            order,
+            missing,
+            unfinished=unfinished,
+            jobs=min(workers.jobs, len(missing)),
+            threads=workers.threads,
+            on_rays=on_rays,
+            notify=notify,
+        )
+        return
+    for index in missing:
+        render_frame(model, order, index, unfinished=unfinished, on_rays=on_rays)

@@ -1,4 +1,4 @@
-"""What an export shall hold, and what its depth files mean."""
+"""What an export shall hold: which pictures, in which files, and which videos of them."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -8,6 +8,31 @@ from nerfcli.render.depth import DepthRequest, effective_floor
 from nerfcli.render.model import Model
 
 OUTPUTS = ("rgb", "depth", "opacity")
+# Those that are measured: floats on disk, and pictures in colours to look at.
+MEASURED = ("depth",)
+LAYOUTS = ("separate", "side-by-side")
+DIRECTIONS = ("forward", "reverse", "ping-pong")
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """Which videos to make of the pictures.
+
+    Args:
+        formats: some of `media.video.FORMATS`; a video in each.
+        layout: one of `LAYOUTS`: a video of each output, or all outputs in one.
+        direction: one of `DIRECTIONS`; "ping-pong" goes back without showing the ends twice, so that it loops evenly.
+        fps: frames per second.
+        crf: constant quality, 0 is best; the format's own if None.
+        plays: times the clip is shown; 0 is for ever, in a gif only. None: for ever in a gif, else once.
+    """
+
+    formats: tuple[str, ...] = ("mp4",)
+    layout: str = "separate"
+    direction: str = "forward"
+    fps: float = 24.0
+    crf: int | None = None
+    plays: int | None = None
 
 
 @dataclass(frozen=True)
@@ -18,18 +43,26 @@ class ExportSettings:
         outputs: some of `OUTPUTS`.
         depth: which depth, where "depth" is among the outputs.
         npy: depth as .npy beside the TIFF.
-        video: an MP4 of each output.
-        fps: frames per second of the videos.
+        colour_map: of what is measured, one of `media.colour_maps.COLOUR_MAPS`.
+        video: which videos; None for none.
     """
 
     outputs: tuple[str, ...]
     depth: DepthRequest
-    npy: bool
-    video: bool
-    fps: float
+    npy: bool = False
+    colour_map: str = "turbo"
+    video: VideoSettings | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        return {**asdict(self), "outputs": list(self.outputs)}
+    def of_pictures(self) -> dict[str, Any]:
+        """Plain values of what decides over the rendered numbers and their files."""
+        settings = asdict(self)
+        del settings["colour_map"], settings["video"]
+        return settings | {"outputs": list(self.outputs)}
+
+    def of_presentation(self) -> dict[str, Any]:
+        """Plain values of what decides over the previews and videos that are made of these files."""
+        video = None if self.video is None else asdict(self.video) | {"formats": list(self.video.formats)}
+        return {"colour_map": self.colour_map, "video": video}
 
 
 def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:

@@ -1,41 +1,21 @@
 """Depth maps to look at: colours on one range, with a legend that names convention, axis and unit."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from nerfcli.media.colour_maps import levels_of
 from nerfcli.media.depth import AXES, DepthMeta
 
-_LEVELS = np.arange(256, dtype=np.uint8)[None]
-_TURBO = cv2.applyColorMap(_LEVELS, cv2.COLORMAP_TURBO)[0, :, ::-1]  # (256, 3) RGB
 _HATCH = np.array([[112, 112, 112], [160, 160, 160]], dtype=np.uint8)
 _INK, _PAPER = (20, 20, 20), (255, 255, 255)
 _NUM_TICKS = 5
-# More values per frame do not move a percentile that anyone could see, but cost memory over a long video.
-_MAX_VALUES_PER_FRAME = 2**16
 
 
-def depth_range(depths: Iterable[np.ndarray]) -> tuple[float, float]:
-    """The 1st and the 99th percentile of all finite depths, so that all frames of a video share one range.
-
-    At most 65536 evenly spaced values of a frame are looked at. (0, 1) if there is no finite depth at all.
-    """
-    samples = [np.empty(0)]
-    for depth in depths:
-        finite = depth[np.isfinite(depth)]
-        samples.append(finite[:: math.ceil(finite.size / _MAX_VALUES_PER_FRAME) or 1])
-    values = np.concatenate(samples)
-    if values.size == 0:
-        return 0.0, 1.0
-    lo, hi = np.percentile(values, (1, 99))
-    return float(lo), float(hi)
-
-
-def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float) -> np.ndarray:
-    """Depth in the colours of turbo (blue near, red far) with a legend below it.
+def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_map: str = "turbo") -> np.ndarray:
+    """Depth in colours (turbo: blue near, red far) with a legend below it.
 
     Depths outside lo...hi have the colours of the ends, as the legend says; pixels that are not finite are
     hatched grey. A picture too narrow for the legend is centred on a wider sheet. The size depends on the
@@ -44,8 +24,9 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float) -> np.n
     Args:
         depth: (height, width).
         meta: named in the legend.
-        lo: the depth that is drawn blue, in the unit of `meta`.
-        hi: the depth that is drawn red, >= lo.
+        lo: the depth that has the first colour, in the unit of `meta`.
+        hi: the depth that has the last colour, >= lo.
+        colour_map: one of `colour_maps.COLOUR_MAPS`.
 
     Returns:
         uint8 RGB (height + legend, at least width, 3).
@@ -58,11 +39,11 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float) -> np.n
     valid = np.isfinite(depth)
     # float64, and clipped before the division: a narrow range neither underflows nor overflows.
     level = (np.where(valid, depth, lo).astype(np.float64).clip(lo, hi) - lo) / (hi - lo or 1.0)
-    picture = _TURBO[np.rint(level * 255).astype(np.uint8)]
+    picture = levels_of(colour_map)[np.rint(level * 255).astype(np.uint8)]
     rows, columns = np.indices(depth.shape)
     picture[~valid] = _HATCH[(rows + columns) // 4 % 2][~valid]
 
-    legend = _legend(meta, lo=lo, hi=hi, width=depth.shape[1])
+    legend = _legend(meta, lo=lo, hi=hi, colour_map=colour_map, width=depth.shape[1])
     sheet = np.full((len(picture) + len(legend), legend.shape[1], 3), _PAPER, dtype=np.uint8)
     left = (legend.shape[1] - depth.shape[1]) // 2
     sheet[: len(picture), left : left + depth.shape[1]] = picture
@@ -70,7 +51,22 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float) -> np.n
     return sheet
 
 
-def _legend(meta: DepthMeta, *, lo: float, hi: float, width: int) -> np.ndarray:
+def beside(sheets: Sequence[np.ndarray]) -> np.ndarray:
+    """Pictures side by side, aligned at the top; white below those that are less high.
+
+    Args:
+        sheets: uint8 (height, width, 3), at least one.
+    """
+    height = max(len(sheet) for sheet in sheets)
+    filled = []
+    for sheet in sheets:
+        column = np.full((height, *sheet.shape[1:]), _PAPER, dtype=np.uint8)
+        column[: len(sheet)] = sheet
+        filled.append(column)
+    return np.concatenate(filled, axis=1)
+
+
+def _legend(meta: DepthMeta, *, lo: float, hi: float, colour_map: str, width: int) -> np.ndarray:
     """Colour bar, numbers and two lines of text; wider than `width` if the text needs it."""
     size = min(max(round(width / 40), 12), 28)
     font = ImageFont.load_default(size)
@@ -84,7 +80,7 @@ def _legend(meta: DepthMeta, *, lo: float, hi: float, width: int) -> np.ndarray:
 
     sheet = Image.new("RGB", (width, size // 2 + line * (2 + len(lines)) + size // 2), _PAPER)
     bar = (width - 2 * margin, size)
-    ramp = _TURBO[np.linspace(0, 255, bar[0]).round().astype(np.uint8)]
+    ramp = levels_of(colour_map)[np.linspace(0, 255, bar[0]).round().astype(np.uint8)]
     sheet.paste(Image.fromarray(np.repeat(ramp[None], bar[1], axis=0)), (margin, size // 2))
     draw = ImageDraw.Draw(sheet)
     below = size // 2 + bar[1]

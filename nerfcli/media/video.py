@@ -1,11 +1,16 @@
-"""Videos of rendered frames: H.264 that every player reads, written whole or not at all."""
+"""Videos of frames, streamed to ffmpeg: H.264 and H.265 in mp4, VP9 in webm, gif; written whole or not at all."""
 
+import os
+import re
+import shutil
 import subprocess
 import tempfile
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import IO
 
 import imageio_ffmpeg
 import numpy as np
@@ -13,126 +18,211 @@ import numpy as np
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 
-# Constant quality of x264: 0 is lossless, 18 is taken for visually lossless, 23 is the default.
-_CRF = 16
-# Left alone, ffmpeg converts by the matrix of standard television and tags nothing; players guess another.
-_COLOURS = [
-    *("-vf", "scale=out_color_matrix=bt709:out_range=tv"),
-    *(
-        "-colorspace",
-        "bt709",
-        "-color_primaries",
-        "bt709",
-        "-color_trc",
-        "iec61966-2-1",
-        "-color_range",
-        "tv",
-    ),
-]
+# Left alone, ffmpeg converts by the matrix of standard television and tags nothing; players guess another. A picture
+# holds sRGB, so that is the transfer curve; "setparams" tags the frames, which is where encoders read it.
+_COLOURS = (
+    "scale=out_color_matrix=bt709:out_range=tv,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
+)
+# Players take a delay under 2 hundredths of a second for 10.
+GIF_FASTEST_FPS = 50.0
+# Ordered dither does not crawl over areas that stand still, as error diffusion does.
+_DITHER = "[0:v][1:v]paletteuse=dither=bayer:bayer_scale=4"
+_ANOTHER_FFMPEG = "install ffmpeg, and name its program in the variable IMAGEIO_FFMPEG_EXE"
 
 
-class VideoWriter:
-    """A context that encodes frames (H.264, yuv420p, fast start) and puts the video in place when it closes.
-
-        with VideoWriter(path, fps=30) as video:
-            for frame in frames:
-                video.add(frame)
-
-    Frames of odd width or height get their last column or row twice, because the format stores colour for
-    pairs of pixels. If an exception leaves the block, no file remains and one that stood at `path` is kept.
+@dataclass(frozen=True)
+class VideoFormat:
+    """How ffmpeg makes one kind of video.
 
     Args:
-        path: the file to write, ending in .mp4.
-        fps: frames per second, > 0.
-
-    Raises:
-        UserError: the file cannot be written, or there is no ffmpeg.
-        ValueError: fps is not positive, or the block ended without a frame.
+        suffix: of the files; two formats never share one, so that their videos stand side by side.
+        encoder: the name that `ffmpeg -encoders` lists.
+        crf: constant quality that is hardly told from the pictures, 0 is best; None where there is no such scale.
+        worst_crf: the end of that scale.
+        arguments: of ffmpeg besides.
     """
 
-    def __init__(self, path: Path, *, fps: float):
-        if not fps > 0:
-            raise ValueError(f"fps must be positive, got {fps}")
-        self._path = path
-        self._fps = fps
-        self._shape: tuple[int, ...] = ()
-        self._encoder: subprocess.Popen[bytes] | None = None
+    suffix: str
+    encoder: str
+    crf: int | None
+    worst_crf: int
+    arguments: tuple[str, ...] = ()
 
-    def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            self._partial = stack.enter_context(atomic_path(self._path))
-            self._log = stack.enter_context(tempfile.TemporaryFile())
-            stack.callback(self._stop)
-            self._closing = stack.pop_all()
-        return self
 
-    def add(self, image: np.ndarray) -> None:
-        """Append a frame.
+FORMATS = {
+    "mp4": VideoFormat(".mp4", "libx264", 16, 51, ("-movflags", "+faststart")),
+    # Apple's players want the tag hvc1.
+    "h265": VideoFormat(
+        *(".h265.mp4", "libx265", 18, 51),
+        ("-tag:v", "hvc1", "-x265-params", "log-level=error", "-movflags", "+faststart"),
+    ),
+    "webm": VideoFormat(
+        *(".webm", "libvpx-vp9", 20, 63), ("-b:v", "0", "-row-mt", "1", "-deadline", "good", "-cpu-used", "4")
+    ),
+    "gif": VideoFormat(".gif", "gif", None, 0),
+}
 
-        Args:
-            image: uint8 (height, width, 3) sRGB, all frames of one size.
 
-        Raises:
-            UserError: the encoder stopped, for example because the disk is full.
-            ValueError: another shape or type than that.
-        """
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise ValueError(f"frame must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
-        height, width = image.shape[:2]
-        if self._encoder is None:
-            self._shape = image.shape
-            self._encoder = self._start(width + width % 2, height + height % 2)
-        if image.shape != self._shape:
-            raise ValueError(f"frame must be {self._shape} as the first one, got {image.shape}")
-        even = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-        assert self._encoder.stdin is not None
-        try:
-            self._encoder.stdin.write(even.tobytes())
-        except OSError as error:  # a broken pipe: the encoder's own words are in its log
-            self._encoder.wait()
-            raise self._failure() from error
+def check_encoders(formats: Iterable[str]) -> None:
+    """Whether this machine's ffmpeg can make these formats; asked before hours of rendering.
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        if kind is None:
-            self._closing.callback(self._finish)
-        return self._closing.__exit__(kind, error, trace)
+    Args:
+        formats: keys of `FORMATS`.
 
-    def _start(self, width: int, height: int) -> subprocess.Popen[bytes]:
-        try:
-            ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-        except RuntimeError as error:
-            hint = "install ffmpeg, or name its program in the variable IMAGEIO_FFMPEG_EXE"
-            raise UserError(f"cannot write {self._path}: there is no ffmpeg", hint) from error
-        command = [
-            *(ffmpeg, "-hide_banner", "-loglevel", "error", "-y"),
-            *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-framerate", f"{self._fps}"),
-            *("-i", "-", *_COLOURS, "-c:v", "libx264", "-crf", f"{_CRF}", "-pix_fmt", "yuv420p"),
-            # "file:", because a colon in a name would read as a protocol.
-            *("-movflags", "+faststart", f"file:{self._partial}"),
-        ]
-        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._log)
+    Raises:
+        UserError: there is no ffmpeg, it does not run, or lacks an encoder.
+    """
+    ffmpeg = _ffmpeg()
+    try:
+        listed = subprocess.run([ffmpeg, "-hide_banner", "-encoders"], capture_output=True, check=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise UserError(f"{ffmpeg} does not run: {error}", _ANOTHER_FFMPEG) from error
+    there = set(re.findall(r"^ V\S+ +(\S+)", listed.stdout, flags=re.MULTILINE))
+    for name in formats:
+        if FORMATS[name].encoder not in there:
+            able = ", ".join(other for other, form in FORMATS.items() if form.encoder in there) or "no video at all"
+            raise UserError(
+                f"cannot make {name} videos: {ffmpeg} has no encoder {FORMATS[name].encoder}",
+                f"it can make {able}; choose one of these, or {_ANOTHER_FFMPEG}",
+            )
 
-    def _finish(self) -> None:
-        if self._encoder is None:
-            raise ValueError(f"no frame was added to {self._path}")
-        self._encoder.communicate()
-        if self._encoder.returncode != 0:
-            raise self._failure()
 
-    def _stop(self) -> None:
-        """End the encoder where it has not ended by itself."""
-        if self._encoder is None:
+def write_video(
+    path: Path,
+    frames: Callable[[], Iterable[np.ndarray]],
+    *,
+    form: VideoFormat,
+    fps: float,
+    crf: int | None = None,
+    plays: int = 1,
+    comment: str = "",
+) -> None:
+    """Encode frames as they come; memory does not grow with their number. The file appears when it is complete.
+
+    Frames of odd width or height get their last column or row twice, because video formats store colour for pairs of
+    pixels (gif does not, and keeps them as they are). The same frames give the same bytes.
+
+    Args:
+        path: the file to write, with the suffix of `form`.
+        frames: gives the frames from the first to the last, uint8 (height, width, 3) sRGB, all of one size; called
+            for each pass over them (a gif takes one for its palette and one for its pixels).
+        form: one of `FORMATS`.
+        fps: frames per second, > 0.
+        crf: constant quality from 0, best, to `form.worst_crf`; the format's own if None.
+        plays: times the clip is shown: repeated in the file, or told to the player of a gif, where 0 is for ever.
+        comment: what the container's comment shall say.
+
+    Raises:
+        UserError: the file cannot be written, there is no ffmpeg, or it fails.
+        ValueError: fps is not positive, no frame came, or one of another shape or type.
+    """
+    if not fps > 0:
+        raise ValueError(f"fps must be positive, got {fps}")
+    with atomic_path(path) as partial:
+        if form.encoder == "gif":
+            _write_gif(partial, frames, fps=fps, plays=plays, comment=comment, told=path)
             return
-        self._encoder.kill()
-        assert self._encoder.stdin is not None
-        with suppress(OSError):
-            self._encoder.stdin.close()
-        self._encoder.wait()
+        quality = form.crf if crf is None else crf
+        arguments = [
+            *("-vf", _COLOURS, "-c:v", form.encoder, "-crf", f"{quality}", "-pix_fmt", "yuv420p"),
+            *(*form.arguments, "-metadata", f"comment={comment}"),
+        ]
+        repeated = chain.from_iterable(frames() for _ in range(plays))
+        _encode(map(_even, repeated), partial, arguments, fps=fps, told=path)
 
-    def _failure(self) -> UserError:
-        self._log.seek(0)
-        lines = self._log.read().decode("utf-8", errors="replace").strip().splitlines()
-        reason = lines[-1] if lines else "the encoder stopped"
-        return UserError(f"cannot write {self._path}: {reason}", "free space on the disk, or write elsewhere")
+
+def _write_gif(
+    partial: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, plays: int, comment: str, told: Path
+) -> None:
+    """One palette over the whole clip, then the pixels; ffmpeg would keep all frames in memory to do it in one go."""
+    with tempfile.TemporaryDirectory(prefix=f"{partial.name}-", dir=partial.parent) as folder:
+        palette, plain = Path(folder) / "palette.png", Path(folder) / "plain.gif"
+        _encode(frames(), palette, ["-vf", "palettegen=reserve_transparent=0", "-update", "1"], fps=fps, told=told)
+        # The format counts repetitions; ffmpeg takes -1 for none, 0 for ever.
+        arguments = ["-i", f"file:{palette}", "-lavfi", _DITHER, "-loop", f"{plays - 1 or -1 if plays else 0}"]
+        _encode(frames(), plain, arguments, fps=fps, told=told)
+        _add_gif_comment(plain, partial, comment)
+
+
+def _add_gif_comment(plain: Path, commented: Path, comment: str) -> None:
+    """Copy a gif with a comment extension before the first picture (GIF89a, section 24); ffmpeg writes none."""
+    text = comment.encode()
+    if not text:  # an empty extension makes ffmpeg stumble
+        os.replace(plain, commented)
+        return
+    blocks = b"".join(bytes([len(part)]) + part for part in (text[i : i + 255] for i in range(0, len(text), 255)))
+    with plain.open("rb") as source, commented.open("wb") as target:
+        header = source.read(13)
+        colours = 3 * 2 ** ((header[10] & 7) + 1) if header[10] & 0x80 else 0
+        target.write(header + source.read(colours) + b"\x21\xfe" + blocks + b"\x00")
+        shutil.copyfileobj(source, target)
+
+
+def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *, fps: float, told: Path) -> None:
+    """Run ffmpeg with `frames` on its standard input; `told` is the path that errors name."""
+    ffmpeg, process, shape = _ffmpeg(), None, (0, 0, 0)
+    with tempfile.TemporaryFile() as log:
+        try:
+            for frame in frames:
+                if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
+                    raise ValueError(f"frame must be uint8 (H, W, 3), got {frame.dtype} {frame.shape}")
+                if process is None:
+                    shape = frame.shape
+                    command = [
+                        *(ffmpeg, "-hide_banner", "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"),
+                        *("-s", f"{shape[1]}x{shape[0]}", "-framerate", f"{fps}", "-i", "-", *arguments),
+                        # No random numbers and no dates; "file:", because a colon in a name would read as a protocol.
+                        *("-bitexact", f"file:{output}"),
+                    ]
+                    # Of a session of its own: Ctrl-C is ours to handle.
+                    process = subprocess.Popen(
+                        command,
+                        stdin=subprocess.PIPE,
+                        stdout=subprocess.DEVNULL,
+                        stderr=log,
+                        start_new_session=True,
+                    )
+                if frame.shape != shape:
+                    raise ValueError(f"frame must be {shape} as the first one, got {frame.shape}")
+                assert process.stdin is not None
+                try:
+                    process.stdin.write(frame.tobytes())
+                except OSError as error:  # a broken pipe: the encoder's own words are in its log
+                    process.wait()
+                    raise _failure(told, log) from error
+            if process is None:
+                raise ValueError(f"no frame came for {told}")
+            process.communicate()
+            if process.returncode != 0:
+                raise _failure(told, log)
+        finally:
+            if process is not None:
+                _stop(process)
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    """End the encoder where it has not ended by itself."""
+    process.kill()
+    assert process.stdin is not None
+    with suppress(OSError):
+        process.stdin.close()
+    process.wait()
+
+
+def _even(frame: np.ndarray) -> np.ndarray:
+    return np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
+
+
+def _ffmpeg() -> str:
+    try:
+        return imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise UserError("cannot make videos: there is no ffmpeg", f"{_ANOTHER_FFMPEG}, or leave videos out") from error
+
+
+def _failure(told: Path, log: IO[bytes]) -> UserError:
+    log.seek(0)
+    lines = log.read().decode("utf-8", errors="replace").strip().splitlines()
+    reason = lines[-1] if lines else "the encoder stopped"
+    return UserError(f"cannot write {told}: {reason}", "free space on the disk, or write elsewhere")

@@ -1,0 +1,103 @@
+"""An order: which views, what of them, from which field; and whether a folder holds what was ordered."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from nerfcli import __version__
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+from nerfcli.export.names import describe_frames, file_names
+from nerfcli.export.settings import ExportSettings
+from nerfcli.media.video import FORMATS, check_encoders
+
+DESCRIPTION = "render.json"
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be rendered and written.
+
+    Args:
+        frames: cameras and poses in the scene's frame.
+        settings: what to write of them.
+        provenance: what else decides over the pictures, the run and the hash of its field first of all; plain values.
+    """
+
+    frames: tuple[Frame, ...]
+    settings: ExportSettings
+    provenance: dict[str, Any]
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Of the files of each frame, without suffix."""
+        return file_names(self.frames)
+
+    def of_pictures(self) -> dict[str, Any]:
+        """Plain values of all that decides over the rendered numbers."""
+        return {
+            "nerfcli": __version__,
+            "settings": self.settings.of_pictures(),
+            "frames": describe_frames(self.frames),
+            **self.provenance,
+        }
+
+    @cached_property
+    def digest(self) -> str:
+        """Twelve hexadecimal digits that differ where the rendered numbers may differ."""
+        text = json.dumps(self.of_pictures(), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    def results(self, folder: Path) -> list[Path]:
+        """The paths to show: the videos if there are any, else the folders of the outputs."""
+        video = self.settings.video
+        if video is None:
+            return [folder / output for output in self.settings.outputs]
+        together = ["+".join(self.settings.outputs)]
+        names = together if video.layout == "side-by-side" else self.settings.outputs
+        return [folder / f"{name}{FORMATS[form].suffix}" for form in video.formats for name in names]
+
+    def check(self) -> None:
+        """Refuse what would fail only when the last picture is rendered.
+
+        Raises:
+            UserError: an encoder is missing, or a video shall be made of pictures of different sizes.
+        """
+        if self.settings.video is None:
+            return
+        check_encoders(self.settings.video.formats)
+        sizes = sorted({(frame.camera.width, frame.camera.height) for frame in self.frames})
+        if len(sizes) > 1:
+            listed = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
+            raise UserError(
+                f"the views have {len(sizes)} sizes ({listed}); a video has one",
+                "leave the video out, or choose cameras of one size",
+            )
+
+    def is_held_by(self, folder: Path) -> bool:
+        """Whether the finished folder holds this order, pictures and presentation.
+
+        Raises:
+            UserError: it holds another one.
+        """
+        if not (folder / DESCRIPTION).exists():
+            return False
+        made = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+        wanted = self.of_pictures() | self.settings.of_presentation()
+        del wanted["nerfcli"]
+        if any(made.get(key) != value for key, value in wanted.items()):
+            raise UserError(f"{folder} exists", "add --overwrite to replace it, or choose another place with -o")
+        return True
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Refuse a place that is taken by what is no export of ours.
+
+    Raises:
+        UserError: a file, or a folder of other things.
+    """
+    if folder.is_file() or (folder.is_dir() and not (folder / DESCRIPTION).exists() and any(folder.iterdir())):
+        raise UserError(f"{folder} holds something else than renders", "choose another place with -o")

@@ -1,0 +1,137 @@
+"""What needs all frames of an order: previews on one range of colours, and videos."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli import __version__
+from nerfcli.export.order import Order
+from nerfcli.export.picture_files import read_values
+from nerfcli.export.settings import MEASURED
+from nerfcli.media.depth import KEY, DepthMeta
+from nerfcli.media.images import read_image, write_png
+from nerfcli.media.preview import beside, preview
+from nerfcli.media.quantiles import quantiles
+from nerfcli.media.video import FORMATS, write_video
+
+# The ends of a colour range: shares of all valid pixels of the clip, so that a single speck does not stretch it.
+RANGE_SHARES = (0.01, 0.99)
+
+
+def write_previews(folder: Path, order: Order, meta: DepthMeta) -> dict[str, tuple[float, float]]:
+    """A coloured PNG beside each file that is measured; all of an output on one range.
+
+    Args:
+        folder: holds the complete files of every frame.
+        order: what was ordered.
+        meta: the meaning of the depth.
+
+    Returns:
+        The range of each output that is measured, in the unit of `meta`.
+
+    Raises:
+        UserError: a file cannot be read or written.
+    """
+    ranges = {}
+    for output in [output for output in order.settings.outputs if output in MEASURED]:
+
+        def maps(output: str = output) -> Iterator[np.ndarray]:
+            for name in order.names:
+                yield read_values(folder, output, name)
+
+        lo, hi = ranges[output] = value_range(maps, output)
+        meaning = meta.of(output)
+        metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": order.settings.colour_map}
+        for name, values in zip(order.names, maps(), strict=True):
+            picture = preview(values, meaning, lo=lo, hi=hi, colour_map=order.settings.colour_map)
+            write_png(_picture(folder, output, name), picture, metadata=metadata)
+    return ranges
+
+
+def write_videos(
+    folder: Path,
+    order: Order,
+    meta: DepthMeta,
+    *,
+    ranges: dict[str, tuple[float, float]],
+    notify: Callable[[str], None],
+) -> None:
+    """The videos that were ordered, from the pictures in the folder; one picture at a time is in memory.
+
+    Args:
+        folder: holds every picture and preview.
+        order: what was ordered; `order.check` has passed.
+        meta: the meaning of the depth.
+        ranges: of the colours, see `write_previews`; stand in the videos' comments.
+        notify: takes a line for the user.
+
+    Raises:
+        UserError: a video cannot be written.
+    """
+    settings = order.settings.video
+    if settings is None:
+        return
+    names = [order.names[index] for index in playing_order(len(order.names), settings.direction)]
+    groups = [order.settings.outputs] if settings.layout == "side-by-side" else [(o,) for o in order.settings.outputs]
+    for form in (FORMATS[name] for name in settings.formats):
+        for outputs in groups:
+
+            def pictures(outputs: Sequence[str] = outputs) -> Iterator[np.ndarray]:
+                for name in names:
+                    yield beside([read_image(_picture(folder, output, name))[..., :3] for output in outputs])
+
+            path = folder / f"{'+'.join(outputs)}{form.suffix}"
+            notify(f"encodes {path.name}, {len(names)} frames")
+            gif = form.encoder == "gif"
+            plays = (0 if gif else 1) if settings.plays is None else settings.plays
+            comment = json.dumps(_comment(order, meta, outputs, ranges), ensure_ascii=False)
+            write_video(path, pictures, form=form, fps=settings.fps, crf=settings.crf, plays=plays, comment=comment)
+
+
+def value_range(maps: Callable[[], Iterator[np.ndarray]], output: str) -> tuple[float, float]:
+    """The range of colours of a clip: the 1st to the 99th percentile; from 0 for what is not a distance.
+
+    (0, 1) where no pixel has a value.
+    """
+    found = quantiles(maps, RANGE_SHARES)
+    if not found:
+        return 0.0, 1.0
+    lo, hi = found
+    return (lo if output == "depth" else 0.0), hi
+
+
+def playing_order(count: int, direction: str) -> list[int]:
+    """Indices of the frames as they are shown; see `VideoSettings`."""
+    forward = list(range(count))
+    match direction:
+        case "reverse":
+            return forward[::-1]
+        case "ping-pong":
+            return forward + forward[-2:0:-1]
+    return forward
+
+
+def _comment(
+    order: Order, meta: DepthMeta, outputs: Sequence[str], ranges: dict[str, tuple[float, float]]
+) -> dict[str, Any]:
+    """What a video's container says about it."""
+    told: dict[str, Any] = {"nerfcli": __version__, "outputs": list(outputs), **order.provenance}
+    if any(output in MEASURED for output in outputs):
+        told |= meta.to_json()
+        told |= {"ranges": {output: ranges[output] for output in outputs if output in MEASURED}}
+        told |= {"colour_map": order.settings.colour_map}
+    return told
+
+
+def _picture(folder: Path, output: str, name: str) -> Path:
+    return folder / output / f"{name}.png"
+
+
+def _texts(meta: DepthMeta) -> dict[str, str]:
+    """The meaning for programs under one key, and its parts for people."""
+    parts = {name: str(value) for name, value in asdict(meta).items() if not isinstance(value, dict) and value}
+    return parts | {KEY: meta.to_text()}

@@ -1,0 +1,170 @@
+"""Frames over processes: each renders a frame at a time; one that dies is told, and its frame is rendered again."""
+
+import multiprocessing
+import signal
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import wait
+from multiprocessing.context import SpawnProcess
+from typing import Any
+
+import torch
+
+from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.export.one_frame import render_frame
+from nerfcli.export.order import Order
+from nerfcli.export.unfinished import Unfinished
+from nerfcli.render.model import Model
+
+# A frame at which processes died this often is not tried once more.
+_MOST_DEATHS = 2
+
+
+@dataclass
+class _Worker:
+    process: SpawnProcess
+    connection: Any  # a Connection; on Windows a PipeConnection
+    index: int = -1
+
+
+def render_in_processes(
+    model: Model,
+    order: Order,
+    indices: Sequence[int],
+    *,
+    unfinished: Unfinished,
+    jobs: int,
+    threads: int,
+    on_rays: Callable[[int], None],
+    notify: Callable[[str], None],
+) -> None:
+    """Render frames of an order in several processes; see `render_frame`. None of them outlives the call.
+
+    Args:
+        model: the trained model.
+        order: what is to be rendered.
+        indices: of the frames.
+        unfinished: where the frames of the order gather.
+        jobs: number of processes.
+        threads: of all processes together; each has one at least.
+        on_rays: called with the number of rays of each frame that is done.
+        notify: takes a line for the user.
+
+    Raises:
+        UserError: a file cannot be written, or memory runs out.
+        RuntimeError: what else went wrong in a process, with its traceback.
+    """
+    context = multiprocessing.get_context("spawn")  # torch's and numba's threads do not survive a fork
+    left, deaths, workers = deque(indices), Counter[int](), list[_Worker]()
+
+    def start() -> None:
+        ours, theirs = context.Pipe()
+        share = max(1, threads // jobs)
+        process = context.Process(target=_serve, args=(theirs, model, order, unfinished, share), daemon=True)
+        with _without_interrupts():
+            process.start()
+        theirs.close()
+        workers.append(_Worker(process, ours))
+        give(workers[-1])
+
+    def give(worker: _Worker) -> None:
+        worker.index = left.popleft()
+        with suppress(BrokenPipeError):  # it died meanwhile: waiting for it tells
+            worker.connection.send(worker.index)
+
+    try:
+        for _ in range(jobs):
+            start()
+        while workers:
+            ready = wait([worker.connection for worker in workers])
+            for worker in [worker for worker in workers if worker.connection in ready]:
+                try:
+                    failure = worker.connection.recv()
+                except EOFError:
+                    workers.remove(worker)
+                    deaths[worker.index] += 1
+                    _tell_death(worker, order, notify, last=deaths[worker.index] == _MOST_DEATHS)
+                    left.appendleft(worker.index)
+                    start()
+                    continue
+                if failure is not None:
+                    raise failure.error()
+                camera = order.frames[worker.index].camera
+                on_rays(camera.width * camera.height)
+                if left:
+                    give(worker)
+                else:
+                    workers.remove(worker)
+                    worker.connection.close()
+                    worker.process.join()
+    finally:
+        for worker in workers:
+            worker.process.terminate()
+        for worker in workers:
+            worker.process.join()
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """What a process reports instead of None; exceptions themselves do not survive the way."""
+
+    text: str
+    hint: str | None = None
+    exit_code: int = 0
+
+    def error(self) -> Exception:
+        if self.hint is None:
+            return RuntimeError(f"a process of --jobs failed:\n{self.text}")
+        return UserError(self.text, self.hint, self.exit_code)
+
+
+def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, threads: int) -> None:
+    """The life of a process: render the frames whose numbers come, until the other end closes."""
+    torch.set_num_threads(threads)
+    while True:
+        try:
+            index = connection.recv()
+        except EOFError:
+            return
+        try:
+            render_frame(model, order, index, unfinished=unfinished, on_rays=lambda rays: None)
+            report = None
+        except UserError as error:
+            report = _Failure(error.message, error.hint, error.exit_code)
+        except Exception:
+            report = _Failure(traceback.format_exc())
+        try:
+            connection.send(report)
+        except BrokenPipeError:  # nobody is there any more
+            return
+
+
+def _tell_death(worker: _Worker, order: Order, notify: Callable[[str], None], *, last: bool) -> None:
+    worker.process.join()
+    code, name = worker.process.exitcode or 0, order.names[worker.index]
+    how = f"was ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with status {code}"
+    if not last:
+        notify(f"a process of --jobs {how} while it rendered {name}; another one renders it again")
+        return
+    raise UserError(
+        f"processes of --jobs die while they render {name}: the last one {how}",
+        "if memory ran out, take fewer --jobs or smaller pictures; frames that are complete are kept",
+        OUT_OF_MEMORY,
+    )
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A process that is started here never hears Ctrl-C: the one that started it ends it."""
+    try:
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except ValueError:  # not in the main thread, which alone may do this
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,81 @@
+"""The folder of an order that is not complete yet: it stays when the command ends early, and the next one goes on.
+
+    .NAME.unfinished-DIGEST/           beside the folder NAME that it will become; DIGEST tells orders apart
+        rgb/...  depth/...             files, each atomic
+        .frames/order.json             what was ordered, for people
+        .frames/done/NAME.json         one for each complete frame, written last: its files with their sizes, facts
+
+A frame counts when its note is there and its files have the sizes that stand in it. Several commands may fill one
+folder, on one machine or on many that share a disk.
+"""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerfcli.atomic import cannot_write, replace_folder, write_json
+from nerfcli.export.order import Order
+
+_NOTES = ".frames"
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """The place where the frames of an order gather."""
+
+    folder: Path
+
+    def note(self, name: str, files: Sequence[Path], *, facts: dict[str, Any]) -> None:
+        """Note that a frame is complete.
+
+        Args:
+            name: of the frame's files, without suffix.
+            files: all of them, as they stand in the folder.
+            facts: what is known about the picture besides, plain values for render.json.
+        """
+        sizes = {str(path.relative_to(self.folder)): path.stat().st_size for path in files}
+        write_json(self._path(name), {"bytes": sizes, "facts": facts})
+
+    def has(self, name: str) -> bool:
+        """Whether a frame is complete."""
+        try:
+            note = json.loads(self._path(name).read_text(encoding="utf-8"))
+            return all((self.folder / file).stat().st_size == size for file, size in note["bytes"].items())
+        except FileNotFoundError:
+            return False
+
+    def facts(self, name: str) -> dict[str, Any]:
+        """What `note` was told about a frame."""
+        return json.loads(self._path(name).read_text(encoding="utf-8"))["facts"]
+
+    def finish(self, folder: Path) -> None:
+        """Put the folder in its place; one that stands there is replaced in this step.
+
+        Raises:
+            UserError: it cannot be moved.
+        """
+        for leftover in self.folder.rglob(".*.partial-*"):  # of commands that were killed while they wrote
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+        replace_folder(self.folder, folder)
+        shutil.rmtree(folder / _NOTES)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / _NOTES / "done" / f"{name}.json"
+
+
+def unfinished_of(order: Order, folder: Path) -> Unfinished:
+    """The unfinished folder of an order that shall become `folder`; it is made if need be.
+
+    Raises:
+        UserError: it cannot be made.
+    """
+    unfinished = folder.with_name(f".{folder.name}.unfinished-{order.digest}")
+    try:
+        (unfinished / _NOTES).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    write_json(unfinished / _NOTES / "order.json", order.of_pictures())
+    return Unfinished(unfinished)
