@@ -23,6 +23,7 @@ from nerfcli.cameras.formats.transforms import read_transforms
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
 from nerfcli.media.images import image_size, list_images, read_exif
+from nerfcli.media.masks import find_mask
 
 SCENE_FILE = "scene.json"
 SCENE_VERSION = 1
@@ -116,7 +117,7 @@ def save(
         image_folder: the photos; stored relative to the scene folder, so that the two can move together.
         provenance: plain values: versions, command, settings.
         unit: "arbitrary" or "metre"; unit_source says how a metre is known.
-        masks: a folder with a mask for each photo that has one, under the photo's name or with .png after it.
+        masks: a folder with a mask for each photo that has one, named as `media.masks.find_mask` says.
 
     Raises:
         UserError: the model is not readable or scene.json cannot be written.
@@ -218,7 +219,7 @@ def _load_own(root: Path) -> Scene:
     frames = capture.frames
     if content.get("masks") is not None:
         masks = Path(os.path.normpath(root.resolve() / _text(content, "masks", path)))
-        frames = tuple(replace(frame, mask=_mask_of(frame.name, masks)) for frame in frames)
+        frames = tuple(replace(frame, mask=find_mask(frame.name, masks)) for frame in frames)
     return Scene(
         root=root,
         kind="nerfcli",
@@ -243,12 +244,6 @@ def _listed_test_names(content: dict[str, Any], path: Path) -> frozenset[str]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise UserError(f"{path}: split.test is no list of image names", 'expected "split": {"test": ["a.jpg", ...]}')
     return frozenset(names)
-
-
-def _mask_of(name: str, masks: Path) -> Path | None:
-    """The mask of a photo: masks/photo.jpg.png as COLMAP names it, masks/photo.png, or masks/photo.jpg."""
-    candidates = (masks / f"{name}.png", (masks / name).with_suffix(".png"), masks / name)
-    return next((mask for mask in candidates if mask.is_file()), None)
 
 
 def _measure(path: Path) -> tuple[int, int, int]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.clips import Frames, photos_of, without_suffix
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Seed, Threads, thread_count
 from nerfcli.errors import UserError
@@ -18,8 +19,12 @@ NAMES_SHOWN = 8
 
 @command
 def poses(
-    photos: Annotated[str, typer.Argument(help="A folder of photos, or - for folders on standard input.")],
+    photos: Annotated[str, typer.Argument(help="A folder of photos or a video, or - for such on standard input.")],
     output: Output = None,
+    frames: Frames = None,
+    masks: Annotated[
+        Path | None, typer.Option(help="A folder of masks named after the photos; black is not used.")
+    ] = None,
     max_size: Annotated[int, typer.Option(help="Longer side for feature extraction, pixels.", min=100)] = 1600,
     max_features: Annotated[int, typer.Option(help="SIFT features per photo.", min=100)] = 4096,
     camera_model: Annotated[str, typer.Option(help="auto, or a COLMAP model such as SIMPLE_RADIAL, OPENCV.")] = "auto",
@@ -33,12 +38,15 @@ def poses(
     """Estimate camera poses and intrinsics (structure from motion with pycolmap).
 
     Writes PHOTOS-scene/ with a COLMAP model, scene.json and poses_report.json. The photos are neither copied nor
-    changed. Photos that do not register are listed with the reason.
+    changed. Photos that do not register are listed with the reason. Of a video, the sharpest frames are written to
+    VIDEO-frames/ first; where the camera stands still it gives none.
 
     \b
     Examples:
       nerfcli poses photos/kitchen
       nerfcli poses photos/kitchen -o kitchen --max-size 1000 --max-features 2048
+      nerfcli poses kitchen.mp4 --frames 200
+      nerfcli poses statue/ --masks statue-masks/
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
     from nerfcli.poses.settings import CAMERA_MODELS, PoseSettings
@@ -53,10 +61,12 @@ def poses(
         threads=thread_count(threads),
         camera_model=camera_model,
         min_registered=min_registered,
+        masks=str(masks.resolve()) if masks else None,
     )
 
-    def work(folder: Path, one_of_many: bool) -> None:
-        scene = result_path(folder, suffix="-scene", output=output, one_of_many=one_of_many)
+    def work(source: Path, one_of_many: bool) -> None:
+        scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
+        folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
         estimate_scene(folder, scene, settings=settings, overwrite=overwrite, console=console)
         console.result(scene)
 

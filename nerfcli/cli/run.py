@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.clips import Frames, photos_of, without_suffix
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Device,
@@ -25,8 +26,9 @@ from nerfcli.cli.options import (
 
 @command
 def run(
-    photos: Annotated[str, typer.Argument(help="A folder of photos, or - for folders on standard input.")],
+    photos: Annotated[str, typer.Argument(help="A folder of photos or a video, or - for such on standard input.")],
     output: Output = None,
+    frames: Frames = None,
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
     downscale: Downscale = "auto",
     count: Annotated[int, typer.Option(help="Views of the orbit video.", min=2)] = 60,
@@ -49,6 +51,7 @@ def run(
     Examples:
       nerfcli run photos/kitchen
       nerfcli run photos/kitchen -o kitchen --budget 5m
+      nerfcli run kitchen.mp4
     """
     from nerfcli.cli.evaluate import evaluate_run
     from nerfcli.cli.poses import estimate_scene
@@ -72,11 +75,12 @@ def run(
     )
     depth = DepthRequest(convention="conditional", axis="z")
 
-    def work(folder: Path, one_of_many: bool) -> None:
-        scene = result_path(folder, suffix="-scene", output=output, one_of_many=one_of_many)
+    def work(source: Path, one_of_many: bool) -> None:
+        scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
         field = result_path(scene, suffix="-run", output=None, one_of_many=False)
         if output is not None:
             scene, field = scene / "scene", scene / "run"
+        folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
         estimate_scene(folder, scene, settings=pose_settings, overwrite=overwrite, console=console)
         resume = not overwrite and was_interrupted(scene, field, train_settings)
         train_scene(scene, field, settings=train_settings, resume=resume, overwrite=overwrite, console=console)

@@ -117,6 +117,18 @@ def read_image(path: Path) -> np.ndarray:
         return np.array(srgb)
 
 
+def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Pixels that are stored with an EXIF orientation (1...8), turned and mirrored as it says.
+
+    Args:
+        pixels: uint8 (height, width), or with 3 or 4 channels.
+        orientation: of the file that they belong to.
+    """
+    _check_pixels(pixels)
+    transpose = _UPRIGHT_FROM_STORED.get(orientation)
+    return pixels if transpose is None else np.array(Image.fromarray(pixels).transpose(transpose))
+
+
 def read_downscaled(path: Path, factor: float) -> np.ndarray:
     """`read_image`, then `downscale`; the pixels at full size are freed before it returns.
 

@@ -3,12 +3,13 @@
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from itertools import repeat
 from pathlib import Path
 
 import pycolmap
 
 from nerfcli.poses.database import clear_matches, forget_features, keep_geometries, register_photos
-from nerfcli.poses.job import Job, Report
+from nerfcli.poses.job import Job, LaidOutMask, Report
 from nerfcli.poses.stages import read_stage, stage_key, write_stage
 
 # A photo with this share of the features that were asked for is rich enough; measured poses are no better with more.
@@ -23,7 +24,8 @@ _MATCHES_VERSION = "ratio 0.8, cross-checked"
 def feature_keys(job: Job) -> dict[str, str]:
     """Per photo (by image id, as JSON wants its keys), a hash of all that its features depend on."""
     settings = (_FEATURES_VERSION, job.max_image_size, job.max_features, pycolmap.__version__)
-    return {str(i): stage_key(key, *settings) for i, key in zip(job.image_ids, job.keys, strict=True)}
+    contents = [(key, mask.key) for key, mask in zip(job.keys, job.masks or repeat(LaidOutMask()), strict=False)]
+    return {str(i): stage_key(*content, *settings) for i, content in zip(job.image_ids, contents, strict=True)}
 
 
 def extract(job: Job, report: Report) -> None:
@@ -112,6 +114,8 @@ def _extract_octaves(job: Job, numbers: Iterable[int], *, first_octave: int, rep
     options.use_gpu = False
     options.sift.max_num_features = job.max_features
     options.sift.first_octave = first_octave
+    reader = pycolmap.ImageReaderOptions()
+    reader.mask_path = str(job.mask_folder) if job.masks else ""
     with closing(pycolmap.Database.open(str(job.database))) as database:
         ids = dict(zip(job.image_ids, job.files, strict=True))
         members = [job.files[number] for number in numbers]
@@ -127,6 +131,7 @@ def _extract_octaves(job: Job, numbers: Iterable[int], *, first_octave: int, rep
                     str(job.database),
                     str(job.photos),
                     image_names=members,
+                    reader_options=reader,
                     extraction_options=options,
                     device=pycolmap.Device.cpu,
                 )

@@ -20,6 +20,14 @@ class CameraGroup:
 
 
 @dataclass(frozen=True)
+class LaidOutMask:
+    """Of one photo: a hash of which pixels are used, "" without a mask, and their share."""
+
+    key: str = ""
+    used_share: float = 1.0
+
+
+@dataclass(frozen=True)
 class Job:
     """Structure from motion of photos 0, 1, 2...
 
@@ -27,7 +35,8 @@ class Job:
     as long as the folder is there. originals: the user's folder, and names: the photos' names there. keys: of their
     content. pairs: which to compare. neighbours: how many more each is compared with, those that look most alike; once
     they are found, pairs has them too. rung: "" or the name of an attempt with other features, which has its own
-    database and stages: `replace(job, rung="full-size", max_image_size=...)`. The rest is as in `PoseSettings`.
+    database and stages: `replace(job, rung="full-size", max_image_size=...)`. masks: one per photo, or none at all for
+    a capture without masks; their pictures are in mask_folder. The rest is as in `PoseSettings`.
     """
 
     folder: str
@@ -42,12 +51,18 @@ class Job:
     max_features: int
     seed: int
     threads: int
+    masks: tuple[LaidOutMask, ...] = ()
     rung: str = ""
 
     @property
     def photos(self) -> Path:
         """The upright photos under their numbered names."""
         return Path(self.folder) / "photos"
+
+    @property
+    def mask_folder(self) -> Path:
+        """The masks, under the names of the photos' files with .png after them."""
+        return Path(self.folder) / "masks"
 
     @property
     def database(self) -> Path:
@@ -77,4 +92,5 @@ def read_job(path: Path) -> Job:
     content["pairs"] = tuple((i, j) for i, j in content["pairs"])
     for name in ("files", "names", "keys"):
         content[name] = tuple(content[name])
+    content["masks"] = tuple(LaidOutMask(**mask) for mask in content["masks"])
     return Job(**content)

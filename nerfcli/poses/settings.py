@@ -32,7 +32,7 @@ class PoseSettings:
     max_image_size: longer side of the pictures that features are sought in, pixels. max_features: per photo.
     threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
     min_registered: the share of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a text
-    file with two names per line, these pairs are compared and no others.
+    file with two names per line, these pairs are compared and no others. masks: a folder of masks, see `media.masks`.
     """
 
     max_image_size: int = QUALITIES["default"][0]
@@ -43,6 +43,7 @@ class PoseSettings:
     min_registered: float = 0.5
     pairing: str = "auto"
     pairs_file: str | None = None
+    masks: str | None = None
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from nerfcli.errors import UserError
 from nerfcli.media.images import list_images
 from nerfcli.poses.job import CameraGroup, Job, write_job
 from nerfcli.poses.layout import lay_out
+from nerfcli.poses.masks import lay_out_masks
 from nerfcli.poses.pairs import Pairing, choose_pairs
 from nerfcli.poses.photos import Photo, Photos, camera_groups, find_photos
 from nerfcli.poses.plan import Plan, make_plan
@@ -79,7 +80,8 @@ def estimate_poses(
         def describe() -> None:
             write_json(scene_dir / "poses_report.json", report.to_json())
             provenance = {"command": "poses", "settings": asdict(settings), "versions": report.versions}
-            scene.save(scene_dir, image_folder=photos_dir, provenance=provenance, unit="arbitrary")
+            masks = Path(settings.masks) if settings.masks else None
+            scene.save(scene_dir, image_folder=photos_dir, provenance=provenance, unit="arbitrary", masks=masks)
 
         publish(scene_dir, describe)
     for size in report.models[1:]:
@@ -136,9 +138,11 @@ def _prepare(
     if len(groups) > 1:
         notify(f"{len(groups)} cameras, by EXIF and size: {', '.join(_described(group) for group in groups)}")
     laid_out = lay_out(photos, work)
+    files = tuple(photo.file for photo in laid_out)
+    masks = Path(settings.masks) if settings.masks else None
     return Job(
         folder=str(work.absolute()),
-        files=tuple(photo.file for photo in laid_out),
+        files=files,
         originals=str(photos.folder.absolute()),
         names=photos.names,
         keys=tuple(photo.key for photo in laid_out),
@@ -149,6 +153,7 @@ def _prepare(
         max_features=settings.max_features,
         seed=settings.seed,
         threads=settings.threads,
+        masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),
     )
 
 

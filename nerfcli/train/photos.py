@@ -14,6 +14,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.media.images import downscale, read_image
+from nerfcli.media.masks import read_mask
 
 
 @dataclass(frozen=True)
@@ -53,14 +54,8 @@ def _load_photo(frame: Frame, factor: int) -> Photo:
         )
     used = None
     if frame.mask is not None:
-        mask = read_image(frame.mask)
-        if mask.shape[:2] != (height, width):
-            raise UserError(
-                f"{frame.mask} is {mask.shape[1]}x{mask.shape[0]}, its photo is {width}x{height}",
-                "a mask has the size of its photo; pixels that are black in it are ignored",
-            )
         # A pixel of the small picture counts only where all that it averages counts.
-        used = downscale(mask[..., :3], factor).min(-1) == 255
+        used = downscale(read_mask(frame.mask, frame.image), factor) == 255
     return Photo(replace(frame, camera=downscaled_camera(frame.camera, factor)), downscale(pixels, factor), used)
 
 

@@ -1,0 +1,59 @@
+"""Masks: which pixels of a photo may be used. What is white is used, what is black is not.
+
+A mask is a picture in any format, named after its photo. It has the size of the photo, either upright or as the file
+stores it: tools that ignore the EXIF orientation make the latter, and it is then turned as the photo is.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.errors import UserError
+from nerfcli.media.images import IMAGE_SUFFIXES, read_exif, read_image, upright
+
+# Compression of these formats leaves traces around an edge, in the black and in the white.
+_LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg", ".webp"})
+_MIDDLE = 128
+_HINT = "a mask has the size of its photo; pixels that are black in it are ignored"
+
+
+def find_mask(name: str, masks: Path) -> Path | None:
+    """The mask of the photo `name` in the folder `masks`, None if it has none.
+
+    photo.jpg.png, as COLMAP names it, goes before photo.png, and other formats come last; so does the photo's own name,
+    photo.jpg.
+    """
+    whole, stem = masks / name, (masks / name).with_suffix("")
+    suffixes = (".png", *sorted(IMAGE_SUFFIXES - {".png"}))
+    candidates = [
+        whole.with_name(whole.name + ".png"),
+        stem.with_name(stem.name + ".png"),
+        whole,
+        *(base.with_name(base.name + suffix) for base in (whole, stem) for suffix in suffixes),
+    ]
+    return next((mask for mask in candidates if mask.is_file()), None)
+
+
+def read_mask(path: Path, photo: Path) -> np.ndarray:
+    """How much of each pixel of a photo may be used.
+
+    Args:
+        path: the mask. If its largest level is 1, that is white.
+        photo: its photo.
+
+    Returns:
+        uint8 (height, width), upright: 0 where the photo is not to be used, 255 where it is, between them on edges.
+
+    Raises:
+        UserError: one of the two cannot be read, or their sizes do not fit.
+    """
+    levels = read_image(path)[..., :3].max(axis=-1)
+    exif = read_exif(photo)
+    size, wanted = (levels.shape[1], levels.shape[0]), (exif.width, exif.height)
+    if size != wanted and exif.orientation >= 5 and size == wanted[::-1]:
+        levels = upright(levels, exif.orientation)
+    elif size != wanted:
+        raise UserError(f"{path} is {size[0]}x{size[1]}, its photo is {wanted[0]}x{wanted[1]}", _HINT)
+    if path.suffix.lower() in _LOSSY_SUFFIXES:
+        return np.where(levels >= _MIDDLE, np.uint8(255), np.uint8(0))
+    return levels * np.uint8(255) if levels.max() == 1 else levels

@@ -1,0 +1,182 @@
+"""nerfcli.media.masks and poses.masks: found by name, turned like the photo, obeyed by feature extraction."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from nerfcli.errors import UserError
+from nerfcli.media.images import read_image, write_png
+from nerfcli.media.masks import find_mask, read_mask
+from nerfcli.poses.features import extract, feature_keys
+from nerfcli.poses.job import CameraGroup, Job, LaidOutMask, read_job, write_job
+from nerfcli.poses.masks import lay_out_masks
+from nerfcli.poses.photos import Photo, Photos, find_photos
+
+WIDTH, HEIGHT = 120, 80
+
+
+def write_photo(path: Path, *, orientation: int = 1, size: tuple[int, int] = (WIDTH, HEIGHT), seed: int = 0) -> Path:
+    """Noise, stored with an EXIF orientation."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    noise = np.random.default_rng(seed).integers(0, 255, (*size[::-1], 3), dtype=np.uint8)
+    path.parent.mkdir(exist_ok=True)
+    Image.fromarray(noise).resize(size, Image.Resampling.BICUBIC).save(path, exif=exif)
+    return path
+
+
+@pytest.fixture
+def photos(tmp_path) -> Photos:
+    for index in range(4):
+        write_photo(tmp_path / "photos" / f"p {index}.png", seed=index)
+    return find_photos(tmp_path / "photos")
+
+
+@pytest.fixture
+def masks(tmp_path) -> Path:
+    (tmp_path / "masks").mkdir()
+    return tmp_path / "masks"
+
+
+def laid_out(photos: Photos, masks: Path, folder: Path) -> tuple[tuple[LaidOutMask, ...], list[str]]:
+    notes: list[str] = []
+    files = [f"{number:05d}.png" for number in range(len(photos.names))]
+    return lay_out_masks(photos, files, masks, folder=folder, notify=notes.append), notes
+
+
+@pytest.mark.parametrize(
+    ("there", "found"),
+    [
+        (["a.b.jpg.png", "a.b.png", "a.b.jpg"], "a.b.jpg.png"),
+        (["a.b.png", "a.b.jpg"], "a.b.png"),
+        (["a.b.jpg", "a.b.tif"], "a.b.jpg"),
+        (["a.b.jpg.tif"], "a.b.jpg.tif"),
+        (["a.b.webp"], "a.b.webp"),
+        (["a.png", "a.b.c.png", "a.b.txt"], None),
+    ],
+)
+def test_a_mask_is_named_after_its_photo(masks, there, found):
+    for name in there:
+        (masks / name).touch()
+    assert find_mask("a.b.jpg", masks) == (masks / found if found else None)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_mask_as_the_photo_is_stored_turns_with_it(tmp_path, orientation):
+    """Evidence: the photo itself, thresholded as stored, and as Pillow's transposition turns it."""
+    photo = write_photo(tmp_path / "p.png", orientation=orientation)
+    stored = np.asarray(Image.open(photo).convert("L")) > 127
+    write_png(tmp_path / "upright.png", (read_image(photo).mean(-1) > 99).astype(np.uint8) * 255)
+    np.testing.assert_array_equal(read_mask(tmp_path / "upright.png", photo) > 0, read_image(photo).mean(-1) > 99)
+    if orientation >= 5:  # 2 to 4 keep the size, so that only the upright mask can be meant
+        write_png(tmp_path / "stored.png", stored.astype(np.uint8) * 255)
+        upright = np.asarray(Image.fromarray(read_image(photo)).convert("L")) > 127
+        np.testing.assert_array_equal(read_mask(tmp_path / "stored.png", photo) > 0, upright)
+
+
+def test_levels_of_a_mask(tmp_path):
+    """White may be 255 or 1; grey edges stay; what JPEG leaves around an edge does not."""
+    photo = write_photo(tmp_path / "p.png")
+    half = np.zeros((HEIGHT, WIDTH), np.uint8)
+    half[:, WIDTH // 2 :] = 1
+    write_png(tmp_path / "one.png", half)
+    np.testing.assert_array_equal(read_mask(tmp_path / "one.png", photo), 255 * half)
+    half[:, WIDTH // 2] = 40
+    write_png(tmp_path / "grey.png", half)
+    np.testing.assert_array_equal(read_mask(tmp_path / "grey.png", photo), half)
+    edges = np.zeros((HEIGHT, WIDTH), np.uint8)
+    edges[:, 53:] = 255
+    Image.fromarray(edges).save(tmp_path / "lossy.jpg", quality=30)
+    assert len(np.unique(read_image(tmp_path / "lossy.jpg"))) > 2
+    np.testing.assert_array_equal(read_mask(tmp_path / "lossy.jpg", photo), edges)
+
+
+def test_masks_that_do_not_fit_are_named(photos, masks, tmp_path):
+    write_png(masks / "p 0.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    write_png(masks / "p 1.png", np.full((HEIGHT, WIDTH - 1), 255, np.uint8))
+    write_png(masks / "p 3.png", np.full((WIDTH, HEIGHT), 255, np.uint8))  # the photo is stored upright: not turned
+    with pytest.raises(UserError, match=r"2 masks do not fit: .*p 1\.png is 119x80, its photo is 120x80; .*p 3\.png"):
+        laid_out(photos, masks, tmp_path / "work")
+
+
+def test_photos_without_a_mask_are_named(photos, masks, tmp_path):
+    write_png(masks / "p 1.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    write_png(masks / "p 2.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    result, notes = laid_out(photos, masks, tmp_path / "work")
+    assert notes == [
+        "2 of 4 photos have no mask and are used whole: p 0.png, p 3.png",
+        "1 masks are black all over, so that nothing of the photo is used: p 2.png",
+    ]
+    assert [mask.used_share for mask in result] == [1, 1, 0, 1]
+    assert [bool(mask.key) for mask in result] == [False, True, True, False]
+    assert sorted(path.name for path in (tmp_path / "work").iterdir()) == [f"{n:05d}.png.png" for n in range(4)]
+    white = [read_image(tmp_path / "work" / f"{number:05d}.png.png").min() for number in range(4)]
+    assert white == [255, 255, 0, 255]
+
+
+def test_a_folder_without_masks_is_told(photos, masks, tmp_path):
+    with pytest.raises(UserError, match="has a mask in") as error:
+        laid_out(photos, masks, tmp_path / "work")
+    assert "p 0.png.png or p 0.png" in error.value.hint
+    with pytest.raises(UserError, match="there is no folder of masks"):
+        laid_out(photos, tmp_path / "absent", tmp_path / "work")
+    with pytest.raises(UserError, match="holds the photos themselves"):
+        laid_out(photos, photos.folder, tmp_path / "work")
+
+
+def job_for(photos: Photos, masks: tuple[LaidOutMask, ...], folder: Path) -> Job:
+    files = tuple(f"{number:05d}.png" for number in range(len(photos.names)))
+    (folder / "photos").mkdir(parents=True)
+    for name, file in zip(photos.names, files, strict=True):
+        (folder / "photos" / file).symlink_to(photos.folder / name)
+    first: Photo = photos.photos[0]
+    return Job(
+        folder=str(folder),
+        files=files,
+        originals=str(photos.folder),
+        names=photos.names,
+        keys=files,
+        groups=(CameraGroup(tuple(range(len(files))), "SIMPLE_RADIAL", first.width, first.height),),
+        pairs=(),
+        neighbours=0,
+        max_image_size=1600,
+        max_features=1000,
+        seed=0,
+        threads=1,
+        masks=masks,
+    )
+
+
+def test_features_lie_where_the_mask_is_white(photos, masks, tmp_path):
+    """pycolmap's own keypoints: none in the black half, some in the white one; a photo without mask has both."""
+    half = np.zeros((HEIGHT, WIDTH), np.uint8)
+    half[:, WIDTH // 2 :] = 255
+    write_png(masks / "p 0.png", half)
+    work = tmp_path / "scene" / "work"
+    job = job_for(photos, laid_out(photos, masks, work / "masks")[0], work)
+    write_job(tmp_path / "job.json", job)
+    assert read_job(tmp_path / "job.json") == job
+    extract(job, lambda stage, done, total: None)
+    with pycolmap.Database.open(str(job.database)) as database:
+        masked, free = (database.read_keypoints(image_id)[:, 0] for image_id in (1, 2))
+    assert len(masked) > 10
+    assert masked.min() >= WIDTH / 2
+    assert free.min() < WIDTH / 2 < free.max()
+
+
+def test_another_mask_means_other_features(photos, masks, tmp_path):
+    """So that they are found anew, and only of the photo whose mask has changed."""
+    keys = []
+    for level in (255, 0):
+        for index in range(2):
+            mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+            mask[0] = level if index else 255
+            write_png(masks / f"p {index}.png", mask)
+        work = tmp_path / f"scene {level}" / "work"
+        keys.append(feature_keys(job_for(photos, laid_out(photos, masks, work / "masks")[0], work)))
+    assert [keys[0][i] == keys[1][i] for i in "1234"] == [True, False, True, True]
+    assert json.loads(json.dumps(keys[0])) == keys[0]
