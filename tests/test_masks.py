@@ -1,6 +1,7 @@
 """nerfcli.media.masks and poses.masks: found by name, turned like the photo, obeyed by feature extraction."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -166,6 +167,25 @@ def test_features_lie_where_the_mask_is_white(photos, masks, tmp_path):
     assert len(masked) > 10
     assert masked.min() >= WIDTH / 2
     assert free.min() < WIDTH / 2 < free.max()
+
+
+def test_a_small_part_gets_as_many_features_as_a_whole_photo_would(masks, tmp_path):
+    """A quarter of the picture is used: it has as many features, within a half, as the whole of the same picture."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    for index in range(4):
+        Image.fromarray(noise).resize((640, 480), Image.Resampling.BICUBIC).save(photos / f"p {index}.png")
+    quarter = np.zeros((480, 640), np.uint8)
+    quarter[:, 480:] = 255
+    write_png(masks / "p 0.png", quarter)
+    work = tmp_path / "scene" / "work"
+    found = find_photos(photos)
+    job = replace(job_for(found, laid_out(found, masks, work / "masks")[0], work), max_features=300)
+    extract(job, lambda stage, done, total: None)
+    with pycolmap.Database.open(str(job.database)) as database:
+        masked, whole = (database.num_keypoints_for_image(image_id) for image_id in (1, 2))
+    assert masked > 0.5 * whole
 
 
 def test_another_mask_means_other_features(photos, masks, tmp_path):

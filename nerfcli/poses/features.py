@@ -1,5 +1,6 @@
 """Features and matches: what pycolmap writes into its database, going on from what is there."""
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -14,6 +15,8 @@ from nerfcli.poses.stages import read_stage, stage_key, write_stage
 
 # A photo with this share of the features that were asked for is rich enough; measured poses are no better with more.
 _RICH_SHARE = 0.5
+# A mask that leaves less than an eighth of a picture gets no more: fine features at noise level help nobody.
+_MOST_FEATURES_FOR_MASK = 8
 # Matches are written, and so progress is seen and kept, after each block.
 _PAIRS_PER_BLOCK = 128
 # To be changed with anything here that changes the features of the same photo, or the matches of the same features.
@@ -112,13 +115,11 @@ def _extract_octaves(job: Job, numbers: Iterable[int], *, first_octave: int, rep
     options.max_image_size = job.max_image_size
     options.num_threads = job.threads
     options.use_gpu = False
-    options.sift.max_num_features = job.max_features
     options.sift.first_octave = first_octave
     reader = pycolmap.ImageReaderOptions()
     reader.mask_path = str(job.mask_folder) if job.masks else ""
     with closing(pycolmap.Database.open(str(job.database))) as database:
         ids = dict(zip(job.image_ids, job.files, strict=True))
-        members = [job.files[number] for number in numbers]
         pending = set(ids)
 
         def done() -> int:
@@ -126,7 +127,8 @@ def _extract_octaves(job: Job, numbers: Iterable[int], *, first_octave: int, rep
             return len(ids) - len(pending)
 
         with _watched("extract", done, len(ids), report):
-            if members:
+            for limit, members in _by_limit(job, numbers).items():
+                options.sift.max_num_features = limit
                 pycolmap.extract_features(
                     str(job.database),
                     str(job.photos),
@@ -135,6 +137,20 @@ def _extract_octaves(job: Job, numbers: Iterable[int], *, first_octave: int, rep
                     extraction_options=options,
                     device=pycolmap.Device.cpu,
                 )
+
+
+def _by_limit(job: Job, numbers: Iterable[int]) -> dict[int, list[str]]:
+    """Files of photos by how many features to seek in the whole picture, so that what a mask leaves has enough.
+
+    pycolmap chooses features before it looks at the mask. The limit doubles each time the share of the
+    picture that is used halves.
+    """
+    limits: dict[int, list[str]] = {}
+    for number in numbers:
+        share = job.masks[number].used_share if job.masks else 1.0
+        factor = min(_MOST_FEATURES_FOR_MASK, 2 ** int(math.log2(1 / share))) if share > 0 else 1
+        limits.setdefault(job.max_features * factor, []).append(job.files[number])
+    return limits
 
 
 def _stage_file(job: Job, stage: str) -> Path:

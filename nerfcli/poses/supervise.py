@@ -50,7 +50,8 @@ def run_worker(
     stage = "starting"
     with log.open("wb") as stderr:
         worker = subprocess.Popen(
-            [sys.executable, "-m", "nerfcli.poses.worker", str(job_path)],
+            # -P: else a file numpy.py or a folder nerfcli where the user happens to be would be taken for ours.
+            [sys.executable, "-P", "-m", "nerfcli.poses.worker", str(job_path)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=stderr,
