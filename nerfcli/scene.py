@@ -7,8 +7,8 @@ one of its files: it is never rotated, moved or scaled here.
 import hashlib
 import math
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,18 @@ import numpy as np
 
 from nerfcli.atomic import write_json
 from nerfcli.cameras.formats.blender import read_blender
-from nerfcli.cameras.formats.colmap import is_model, read_colmap, read_model
-from nerfcli.cameras.formats.fields import read_json_object
+from nerfcli.cameras.formats.colmap import colmap_on_disk, is_model, read_colmap, read_model
+from nerfcli.cameras.formats.colmap_model import ColmapModel
 from nerfcli.cameras.formats.llff import IMAGE_FOLDERS, read_llff
+from nerfcli.cameras.formats.scene_json import SCENE_FILE, SCENE_VERSION, UNITS, UNUSED, read_description
 from nerfcli.cameras.formats.transforms import read_transforms
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Capture, Frame, Size
 from nerfcli.errors import UserError
 from nerfcli.media.images import image_size, list_images, read_exif
 from nerfcli.media.masks import find_mask
 
-SCENE_FILE = "scene.json"
-SCENE_VERSION = 1
 MODEL_FOLDER = "sparse/0"
-UNITS = ("arbitrary", "metre")
+
 
 # Every how many photos, in the order of their names, one is held out.
 HELD_OUT_EVERY = 8
@@ -49,6 +48,8 @@ class Scene:
         missing: names of images that the capture lists and that are not on disk.
         unit: of length: "arbitrary" or "metre".
         depth_bounds: (frames, 2) nearest and farthest z per frame, in scene units, where the format has them.
+        unit_source: how a metre is known; None where the unit is arbitrary, or nobody said.
+        rescaled: for how many photos the intrinsics were given for another size, see `Capture.rescaled`.
     """
 
     root: Path
@@ -59,6 +60,8 @@ class Scene:
     missing: tuple[str, ...]
     unit: str = "arbitrary"
     depth_bounds: np.ndarray | None = None
+    unit_source: str | None = None
+    rescaled: Mapping[tuple[Size, Size], int] = field(default_factory=dict)
 
     @property
     def train_frames(self) -> tuple[Frame, ...]:
@@ -90,8 +93,8 @@ def load(path: Path) -> Scene:
         return _load_own(path)
     for name in _MODEL_FOLDERS:
         if is_model(path / name):
-            model_dir = path / name
-            return _scene(path, read_colmap(model_dir, _image_folder(path, model_dir), _measure))
+            model = read_model(path / name)
+            return _scene(path, colmap_on_disk(model, _image_folder(path, path / name, model), _measure, path / name))
     if (path / "transforms.json").is_file():
         return _scene(path, read_transforms(path / "transforms.json", _measure))
     if (path / "transforms_train.json").is_file():
@@ -108,7 +111,9 @@ def save(
     provenance: dict[str, Any],
     unit: str = "arbitrary",
     unit_source: str | None = None,
-    masks: Path | None = None,
+    masks: Path | Mapping[str, Path] | None = None,
+    split: Mapping[str, str | None] | None = None,
+    depth_bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> None:
     """Write scene.json beside the COLMAP model in scene_dir/sparse/0, and fix the held-out split.
 
@@ -117,7 +122,11 @@ def save(
         image_folder: the photos; stored relative to the scene folder, so that the two can move together.
         provenance: plain values: versions, command, settings.
         unit: "arbitrary" or "metre"; unit_source says how a metre is known.
-        masks: a folder with a mask for each photo that has one, named as `media.masks.find_mask` says.
+    masks: a folder with a mask for each photo that has one, named as `media.masks.find_mask` says; or the mask of
+        each of these photos by its name.
+    split: by name, "train", "test", "val", or None for a photo that is not to be used; every 8th is held out if
+        this is not given.
+    depth_bounds: nearest and farthest z by name, in scene units, where they are known without points.
 
     Raises:
         UserError: the model is not readable or scene.json cannot be written.
@@ -126,12 +135,22 @@ def save(
         raise ValueError(f"unit must be one of {UNITS}, got {unit!r}")
     model = read_model(scene_dir / MODEL_FOLDER)
     points = model.points
+    if split is None:
+        parts = {"test": sorted(default_split([image.name for image in model.images]))}
+    else:
+        listed = {part: sorted(name for name, of in split.items() if of == part) for part in ("test", "val")}
+        unused = sorted(name for name, of in split.items() if of is None)
+        parts = {"test": listed["test"], **{k: v for k, v in (("val", listed["val"]), (UNUSED, unused)) if v}}
+    if isinstance(masks, Path):
+        mask_entry: Any = _relative(masks, scene_dir)
+    else:
+        mask_entry = {name: _relative(mask, scene_dir) for name, mask in (masks or {}).items()} or None
     content = {
         "version": SCENE_VERSION,
         "image_folder": _relative(image_folder, scene_dir),
         "model": MODEL_FOLDER,
-        "split": {"test": sorted(default_split([image.name for image in model.images]))},
-        "masks": None if masks is None else _relative(masks, scene_dir),
+        "split": parts,
+        "masks": mask_entry,
         "unit": unit,
         "unit_source": unit_source,
         "frame_from_world": None,
@@ -139,6 +158,7 @@ def save(
             "points_min": points.min(axis=0).tolist() if len(points) else None,
             "points_max": points.max(axis=0).tolist() if len(points) else None,
         },
+        **({"depth_bounds": {name: list(pair) for name, pair in depth_bounds.items()}} if depth_bounds else {}),
         "provenance": provenance,
     }
     write_json(scene_dir / SCENE_FILE, content)
@@ -192,58 +212,37 @@ def _scene(root: Path, capture: Capture) -> Scene:
         points=capture.points,
         missing=capture.missing,
         depth_bounds=bounds,
+        unit_source=capture.unit_source,
+        rescaled=capture.rescaled,
     )
 
 
 def _load_own(root: Path) -> Scene:
     """The scene that `save` described."""
-    path = root / SCENE_FILE
-    content = read_json_object(path)
-    if content.get("version") != SCENE_VERSION:
-        raise UserError(
-            f"{path}: version {content.get('version')!r} is not known, only {SCENE_VERSION}",
-            "update nerfcli, or find the poses again with nerfcli poses",
-        )
-    image_folder = _text(content, "image_folder", path)
-    model_dir = root / _text(content, "model", path)
-    unit = _text(content, "unit", path)
-    if unit not in UNITS:
-        raise UserError(f"{path}: unit is {unit!r}", f"expected {' or '.join(UNITS)}")
-    images = root.resolve() / image_folder
+    described = read_description(root)
+    images = described.image_folder
     if not images.is_dir():
         raise UserError(
-            f"{path}: the photos should be in {os.path.normpath(images)}, which is not there",
+            f"{described.path}: the photos should be in {images}, which is not there",
             "put the photos back, or set image_folder to where they are now",
         )
-    capture = read_colmap(model_dir, Path(os.path.normpath(images)), _measure_upright)
-    frames = capture.frames
-    if content.get("masks") is not None:
-        masks = Path(os.path.normpath(root.resolve() / _text(content, "masks", path)))
-        frames = tuple(replace(frame, mask=find_mask(frame.name, masks)) for frame in frames)
+    capture = read_colmap(described.model_dir, images, _measure_upright)
+    listed = described.listed
+    held_out = listed["test"] or listed["val"]
+    left_out = listed[UNUSED] | (listed["val"] if listed["test"] else frozenset())
+    frames = tuple(frame for frame in described.described(capture.frames, find_mask) if frame.name not in left_out)
     return Scene(
         root=root,
         kind="nerfcli",
         frames=frames,
-        test_names=_listed_test_names(content, path) & {frame.name for frame in frames},
+        test_names=held_out & {frame.name for frame in frames},
         points=capture.points,
         missing=capture.missing,
-        unit=unit,
+        unit=described.unit,
+        depth_bounds=described.bounds_of(frames),
+        unit_source=described.unit_source,
+        rescaled=capture.rescaled,
     )
-
-
-def _text(content: dict[str, Any], key: str, path: Path) -> str:
-    value = content.get(key)
-    if not isinstance(value, str) or not value:
-        raise UserError(f"{path}: {key} is {value!r}", "expected text; nerfcli poses writes this file")
-    return value
-
-
-def _listed_test_names(content: dict[str, Any], path: Path) -> frozenset[str]:
-    split = content.get("split")
-    names = split.get("test") if isinstance(split, dict) else None
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise UserError(f"{path}: split.test is no list of image names", 'expected "split": {"test": ["a.jpg", ...]}')
-    return frozenset(names)
 
 
 def _measure(path: Path) -> tuple[int, int, int]:
@@ -256,7 +255,7 @@ def _measure_upright(path: Path) -> tuple[int, int, int]:
     return (*image_size(path), 1)
 
 
-def _image_folder(root: Path, model_dir: Path) -> Path:
+def _image_folder(root: Path, model_dir: Path, model: ColmapModel) -> Path:
     """Where the photos of a COLMAP project are: the folder beside the model, or beside the folders that it stands in,
     that holds most of the names; these may begin with the name of such a folder themselves."""
     homes = list(dict.fromkeys([root, model_dir, *model_dir.resolve().parents[:3]]))
@@ -266,7 +265,7 @@ def _image_folder(root: Path, model_dir: Path) -> Path:
             f"{root} holds a COLMAP model, but no photos: there is no folder images/",
             "put the photos that the model was made from into images/ beside it",
         )
-    names = [image.name for image in read_model(model_dir).images]
+    names = [image.name for image in model.images]
     return max((*folders, *homes), key=lambda folder: sum((folder / name).is_file() for name in names))
 
 

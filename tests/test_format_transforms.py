@@ -173,6 +173,32 @@ def test_a_listed_cloud_must_be_there(tmp_path):
         parse_transforms(write_json(path, **shared, ftheta_p0=0.1))
 
 
+def test_training_gets_the_points_beside_the_file(tmp_path):
+    capture = with_photos(ring(CAMERAS["PINHOLE"]), tmp_path / "images")
+    for frame in capture.frames:
+        assert frame.image is not None
+        frame.image.parent.mkdir(parents=True, exist_ok=True)
+        frame.image.touch()
+    write_transforms(capture, tmp_path / "transforms.json")
+    read = read_transforms(tmp_path / "transforms.json", lambda _: (640, 480, 1))
+    np.testing.assert_array_equal(read.points, capture.points)
+    np.testing.assert_array_equal(read.colours, capture.colours)
+
+
+def test_images_of_blender_files_in_another_folder(tmp_path):
+    capture = with_photos(pinhole_ring(), tmp_path / "images")
+    named = (replace(f, name=f"r_{i}.png", image=tmp_path / f"train/r_{i}.png") for i, f in enumerate(capture.frames))
+    write_blender(replace(capture, frames=tuple(named)), tmp_path)
+    with pytest.raises(UserError, match="not there to be measured"):
+        parse_blender(tmp_path, measure)
+    (tmp_path / "elsewhere").mkdir()
+    for index in range(len(capture.frames)):
+        (tmp_path / "elsewhere" / f"r_{index}.png").touch()
+    parsed = parse_blender(tmp_path, measure, images=tmp_path / "elsewhere")
+    assert [f.image for f in parsed.frames] == [tmp_path / "elsewhere" / f"r_{i}.png" for i in range(6)]
+    assert parsed.frames[0].camera.width == 64
+
+
 def test_a_written_file_serves_for_training_and_as_a_camera_path(tmp_path):
     capture = with_photos(ring(CAMERAS["OPENCV"]), tmp_path)
     write_transforms(capture, tmp_path / "transforms.json")

@@ -53,6 +53,7 @@ def test_a_capture_in_metres_is_scaled_and_says_so():
         "residual_unit": "percent",
         "rms_residual": pytest.approx(np.sqrt(12.5)),
         "source": "2 known distances",
+        "details": "",
     }
 
 
@@ -250,6 +251,9 @@ def test_gps_gives_the_scale_and_the_directions(seed):
     assert np.degrees(turn) < 2.0
     assert 3.0 < fit.noise < 8.0  # 3 m in each of three coordinates: 5.2
     assert fit.estimate.residual_unit == "metre"
+    assert fit.estimate.details.startswith(f"the photos are spread over {fit.spread:.3g} m, and GPS is off by")
+    assert "far off: " in fit.estimate.details
+    assert "005.jpg" in fit.estimate.details
     assert max(fit.estimate.residuals, key=lambda r: r[1])[0] == "005.jpg"
 
 
@@ -429,17 +433,22 @@ def test_scale_from_aruco_markers(tmp_path):
     assert [name for name, _ in scale_from_markers(frames, 0.05, dictionary="DICT_4X4_50").residuals] == ["marker 17"]
 
 
-def test_scale_from_a_charuco_board(tmp_path):
+@pytest.mark.parametrize(("rows", "legacy"), [(5, False), (4, False), (4, True)])
+def test_scale_from_a_charuco_board(rows, legacy, tmp_path):
+    """With an even number of rows, boards of OpenCV before 4.6 begin with a white square."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
-    picture = cv2.aruco.CharucoBoard((6, 5), 0.03, 0.022, dictionary).generateImage((600, 500), marginSize=0)
-    board = CharucoBoard(6, 5, 0.03, 0.022, "DICT_5X5_100")
+    printed = cv2.aruco.CharucoBoard((6, rows), 0.03, 0.022, dictionary)
+    printed.setLegacyPattern(legacy)
+    picture = printed.generateImage((600, 100 * rows), marginSize=0)
+    assert (picture[5, 5] == 255) == legacy
+    board = CharucoBoard(6, rows, 0.03, 0.022, "DICT_5X5_100", legacy=legacy)
     frames = photos_of(
         tmp_path, cv2.copyMakeBorder(picture, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255), per_unit=50
     )
     estimate = scale_from_charuco(frames, board)
     truth = 0.03 / 2  # squares of 100 pixels at 50 per unit
     assert estimate.metres_per_unit == pytest.approx(truth, rel=0.002)
-    assert len(estimate.residuals) == 4 * 4 + 5 * 3
+    assert len(estimate.residuals) == 4 * (rows - 1) + 5 * (rows - 2)
     assert estimate.rms_residual < 0.5
 
 

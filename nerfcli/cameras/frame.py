@@ -1,11 +1,15 @@
 """What a capture consists of: frames (camera, pose, picture) and what the file that lists them knows besides."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
+
+# Width and height in pixels.
+Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -14,7 +18,7 @@ class Frame:
 
     Args:
         name: unique in its capture, with forward slashes; the image's path as its capture lists it.
-        camera: refers to the picture as it is shown, EXIF orientation applied.
+        camera: refers to the picture as it is shown, EXIF orientation applied; see `Capture.pixels` for the exception.
         world_from_cam: (4, 4) rigid, OpenCV axes, float64.
         image: the picture's file; None for the frames of a camera path.
         mask: the mask's file: black where the picture is not to be used.
@@ -62,6 +66,11 @@ class Capture:
         colours: (N, 3) uint8 sRGB of the points, or None.
         observations: where the points were seen, or None.
         unit: of length: "arbitrary" or "metre".
+        unit_source: how a metre is known, for people; None where nobody said.
+        pixels: which pixels of a photo with an EXIF orientation its camera refers to: "stored", as nearly all programs
+            read them, or "upright", as it is shown.
+        rescaled: for how many photos the intrinsics were given for another size: counts by that size and the photo's,
+            each (width, height).
     """
 
     frames: tuple[Frame, ...]
@@ -72,3 +81,6 @@ class Capture:
     colours: np.ndarray | None = None
     observations: Observations | None = None
     unit: str = "arbitrary"
+    unit_source: str | None = None
+    pixels: str = "stored"
+    rescaled: Mapping[tuple[Size, Size], int] = field(default_factory=dict)

@@ -5,12 +5,14 @@ COLMAP and the programs built on it read pixels as they are stored and ignore th
 about its optical axis.
 """
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.frame import Size
 from nerfcli.errors import UserError
 
 # Tells of an image file: width and height as it is shown, EXIF orientation applied, and that orientation (1 if none).
@@ -52,20 +54,31 @@ def fit_to_picture(
     Raises:
         UserError: neither shape fits, or the EXIF orientation mirrors the picture; both sizes are named.
     """
+    orientation, size = turn_to_upright(camera, path=path, measure=measure)
+    try:
+        resized = camera.resized(*size)
+    except UserError as error:
+        raise UserError(f"{path}: {error.message}", error.hint) from error
+    return turned(resized, world_from_cam, orientation=orientation)
+
+
+def turn_to_upright(camera: Camera, *, path: Path, measure: Measure) -> tuple[int, tuple[int, int]]:
+    """The EXIF orientation by which a camera's picture is to be turned upright, 1 if it is so already, and the size of
+    the picture on disk that the camera is for, which may be a resized one of the camera's.
+
+    Raises:
+        UserError: the EXIF orientation mirrors the picture.
+    """
     width, height, orientation = measure(path)
     if orientation not in _TURNS:
         raise UserError(
             f"{path}: EXIF orientation {orientation} mirrors the photo, which no camera can do",
             "write the photo upright without the tag and find the poses again",
         )
-    stored = stored_size(path, measure)
+    stored = (height, width) if orientation >= 5 else (width, height)
     if stored != (width, height) and _shape_error(camera, stored) > _shape_error(camera, (width, height)):
-        orientation, stored = 1, (width, height)
-    try:
-        resized = camera.resized(*stored)
-    except UserError as error:
-        raise UserError(f"{path}: {error.message}", error.hint) from error
-    return turned(resized, world_from_cam, orientation=orientation)
+        return 1, (width, height)
+    return orientation, stored
 
 
 def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> tuple[Camera, np.ndarray]:
@@ -101,6 +114,41 @@ def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> t
     stored_from_upright = np.eye(4)
     stored_from_upright[:2, :2] = turn.T
     return upright, world_from_cam @ stored_from_upright
+
+
+def turned_pixels(pixels: np.ndarray, sizes: np.ndarray, *, orientation: int) -> np.ndarray:
+    """Positions (N, 2) in upright pictures, given those in the stored ones, which have sizes (N, 2): width, height."""
+    middles = sizes / 2
+    return (pixels - middles) @ _TURNS[orientation].T + (middles[:, ::-1] if orientation in (6, 8) else middles)
+
+
+def turn_back(orientation: int) -> int:
+    """The EXIF orientation that undoes another one."""
+    return {6: 8, 8: 6}.get(orientation, orientation)
+
+
+def rescaling(calibrated: Camera, fitted: Camera) -> tuple[Size, Size] | None:
+    """The size that a calibration was for and that of the picture that it was fitted to, both upright; None where they
+    are the same."""
+    size, other = (fitted.width, fitted.height), (calibrated.width, calibrated.height)
+    if size in (other, other[::-1]):
+        return None
+    lying = (other[0] < other[1]) != (size[0] < size[1])
+    return ((other[1], other[0]) if lying else other), size
+
+
+def counted(sizes: Iterable[tuple[Size, Size] | None]) -> dict[tuple[Size, Size], int]:
+    """How often each pair of sizes comes up that `rescaling` gave."""
+    return dict(Counter(pair for pair in sizes if pair is not None))
+
+
+def rescaling_told(rescaled: Mapping[tuple[Size, Size], int]) -> list[str]:
+    """What `Capture.rescaled` holds, a sentence for each pair of sizes."""
+    return [
+        f"{count} photo{'s are' if count > 1 else ' is'} {width}x{height}, "
+        f"and the intrinsics are given for {of_width}x{of_height}: rescaled"
+        for ((of_width, of_height), (width, height)), count in rescaled.items()
+    ]
 
 
 def _shape_error(camera: Camera, size: tuple[int, int]) -> float:

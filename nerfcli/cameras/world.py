@@ -32,6 +32,7 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
         points=new_from_world.apply(capture.points),
         depth_bounds=None if bounds is None else new_from_world.scale * bounds,
         unit=capture.unit if new_from_world.scale == 1 else "arbitrary",
+        unit_source=capture.unit_source if new_from_world.scale == 1 else None,
     )
 
 

@@ -14,7 +14,19 @@ if TYPE_CHECKING:
     from nerfcli.convert.conversion import Conversion
     from nerfcli.convert.detect import Answer, Detection, Question
 
-FORMATS_WRITTEN = ("colmap", "colmap-text", "transforms", "blender", "llff", "opensfm", "tum", "kitti", "npz", "ply")
+FORMATS_WRITTEN = (
+    "nerfcli",
+    "colmap",
+    "colmap-text",
+    "transforms",
+    "blender",
+    "llff",
+    "opensfm",
+    "tum",
+    "kitti",
+    "npz",
+    "ply",
+)
 # Names of files that say nothing of the capture.
 COMMON_STEMS = ("transforms", "reconstruction", "bundle", "poses_bounds", "scene", "cameras", "images")
 # Hypotheses of a question in the table of --detect.
@@ -66,7 +78,14 @@ def convert(
         str | None,
         typer.Option(
             help="To metres by ArUco markers in the photos, DICT_4X4_50:0.05 (their side), or a ChArUco board, "
-            "DICT_5X5_100:7x5:0.04:0.03 (squares, sides of square and marker)."
+            "DICT_5X5_100:7x5:0.04:0.03 (squares, sides of square and marker; :legacy after it for OpenCV < 4.6)."
+        ),
+    ] = None,
+    pixels: Annotated[
+        str | None,
+        typer.Option(
+            help="Which pixels of photos with an EXIF orientation the cameras in OUT refer to: stored, as COLMAP, "
+            "nerfstudio and most programs read them, or upright.  [default: upright for nerfcli, else stored]"
         ),
     ] = None,
     allow_loss: Annotated[
@@ -88,7 +107,8 @@ def convert(
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
                       reality-capture, bundler, tum, kitti, npz, camera-path (of nerfstudio's viewer); recognised by
                       their files
-    Formats written:  colmap, colmap-text, transforms, blender, llff, opensfm, tum, kitti, npz (all of it), ply (points)
+    Formats written:  nerfcli (a scene folder as poses writes it), colmap, colmap-text, transforms, blender, llff,
+                      opensfm, tum, kitti, npz (all of it), ply (points)
 
     \b
     Inside, camera axes are OpenCV's (x right, y down, z forward) and the first pixel's centre is (0.5, 0.5).
@@ -104,6 +124,7 @@ def convert(
       nerfcli convert poses.txt capture.npz --to npz --intrinsics cameras.txt
       nerfcli convert transforms.json opencv.json --to transforms --axes opencv --pixel-center 0
       nerfcli convert scene/ metric.npz --to npz --world-up z --origin focus --distance "a.jpg b.jpg 1.25"
+      nerfcli convert colmap-project metric-scene --to nerfcli --distance "a.jpg b.jpg 1.25"
       nerfcli convert strange/ --detect
       nerfcli convert strange/ mended.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
@@ -128,7 +149,10 @@ def convert(
             raise typer.BadParameter("say where the result goes", param_hint="OUT")
         lengths = {"scale": scale, "markers": markers, "distances": tuple(distance or ())}
         world = {"up": world_up, "origin": origin, **lengths}
+        if pixels not in (None, "stored", "upright"):
+            raise typer.BadParameter(f"{pixels!r}; choose stored or upright", param_hint="--pixels")
         wanted = {
+            "pixels": pixels,
             "axes": axes,
             "pixel_centre": _pixel_centre(pixel_center, "--pixel-center"),
             "allow_loss": allow_loss,
@@ -167,30 +191,37 @@ def convert_one(
     console: Console,
 ) -> None:
     """Convert one capture and tell what came of it."""
+    from nerfcli.cameras.orientation import rescaling_told
     from nerfcli.convert.conversion import Doubt, Wanted, convert, load
-    from nerfcli.convert.formats import Given, format_named
+    from nerfcli.convert.formats import Given, format_named, recording
     from nerfcli.convert.intrinsics import read_intrinsics
+    from nerfcli.convert.pixels import other_sizes
     from nerfcli.convert.world_frame import WorldFrame, in_world_frame
 
     given = Given(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
     form, found, capture = load(source, given, Doubt(**doubt))
     console.note(f"{found}: {form.name}, {_contents(capture)}")
+    for text in rescaling_told(other_sizes(capture)):
+        console.note(f"{text.removesuffix(': rescaled')}; {to} gets them as they are")
     capture, new_from_old, scale = in_world_frame(capture, WorldFrame(**world))
     if scale is not None:
         error = "" if scale.standard_error is None else f" +- {scale.standard_error:.2g}"
         unit = "%" if scale.residual_unit == "percent" else "m"
         console.note(
             f"a unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; "
-            f"residual {scale.rms_residual:.2g} {unit}"
+            f"residual {scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
         )
-    done = convert(capture, target, source_format=form.name, wanted=Wanted(format_named(to), **wanted))
+    frame = {"new_from_old": new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
+    wanted_form = recording(format_named(to), {"source": str(found), **frame})
+    done = convert(capture, target, source_format=form.name, wanted=Wanted(wanted_form, **wanted))
+    for text in done.notes:
+        console.note(text)
     for loss in done.losses:
         console.warn(f"{to} cannot hold {loss}")
     if done.loss_px > wanted["tolerance_px"]:
         console.warn(f"without the lost terms of lenses, pixels are off by up to {done.loss_px:.3g} px")
     _tell_verification(done, console)
-    record = _record(done, to) | {"new_from_old": new_from_old.to_json()}
-    console.result(done.path, record if scale is None else record | {"scale": scale.to_json()})
+    console.result(done.path, _record(done, to) | frame)
 
 
 def detect_one(
@@ -206,10 +237,12 @@ def detect_one(
     from nerfcli.convert.detect import detect
     from nerfcli.convert.formats import Given
     from nerfcli.convert.intrinsics import read_intrinsics
+    from nerfcli.convert.pixels import STORED, in_pixels
 
     given = Given(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
     form, found, capture = load(source, given, Doubt(**doubt))
     console.note(f"{found}: {form.name}, {_contents(capture)}")
+    capture = in_pixels(capture, STORED).capture
     with console.progress(f"detect {source.name}") as update:
         found_out = detect(capture, axes=form.axes, progress=update)
     if console.json_lines:
@@ -237,6 +270,7 @@ def _tell_verification(done: "Conversion", console: Console) -> None:
         f"{checked.num_points} points in {checked.num_views} images; largest residual {checked.max_px:.2g} px "
         f"(tolerance {checked.tolerance_px:.2g}), rotation {checked.max_deg:.2g} degrees, "
         f"centre {checked.max_centre_shift:.2g} of the scene's size"
+        + (f"; the same are {', '.join(checked.parts)}" if checked.parts else "")
     )
 
 
@@ -260,6 +294,7 @@ def _record(done: "Conversion", to: str) -> dict[str, Any]:
             "max_centre_shift": checked.max_centre_shift,
             "max_point_shift": checked.max_point_shift,
             "tolerance_px": checked.tolerance_px,
+            "same": list(checked.parts),
         },
     }
 

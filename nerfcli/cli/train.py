@@ -91,6 +91,7 @@ def train_scene(
         UserError: see `nerfcli.train.loop.train`; or a different run stands at `run`.
     """
     from nerfcli import scene as scenes
+    from nerfcli.cameras.orientation import rescaling_told
     from nerfcli.evaluate.protocol import METRICS
     from nerfcli.train.loop import Progress
     from nerfcli.train.loop import train as fit
@@ -101,6 +102,8 @@ def train_scene(
         listed = ", ".join(scene.missing[:NAMES_SHOWN])
         more = f" and {len(scene.missing) - NAMES_SHOWN} more" if len(scene.missing) > NAMES_SHOWN else ""
         console.warn(f"{len(scene.missing)} photos of {folder} are not there and are left out: {listed}{more}")
+    for text in rescaling_told(scene.rescaled):
+        console.note(text)
     trained = (run / FIELD).exists()
     if resume and not trained:
         raise UserError(f"nothing to resume in {run}", "leave --resume out to start, or give the run with -o")

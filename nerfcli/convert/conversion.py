@@ -12,8 +12,9 @@ import numpy as np
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import NAMED_AXES, Convention, expressed, opencv_from_axes, reinterpreted
 from nerfcli.convert.formats import Format, Given, recognise, with_photos
+from nerfcli.convert.pixels import STORED, Turned, in_pixels
 from nerfcli.convert.probes import probes_of, projected
-from nerfcli.convert.readback import READERS, Meant, read_ply_points
+from nerfcli.convert.readback import READERS, Meant, read_ply
 from nerfcli.convert.reduction import reduced
 from nerfcli.convert.verify import TOLERANCE_PX, Verification, listed_order, unreadable, verify, verify_points
 from nerfcli.errors import GATE_NOT_MET, UserError
@@ -43,6 +44,7 @@ class Wanted:
         overwrite: whether a result that is there may be replaced.
         verified: whether the file is read back and compared.
         tolerance_px: the largest residual that passes.
+        pixels: which pixels of EXIF-turned photos the cameras refer to; None for those that the format's readers see.
     """
 
     form: Format
@@ -52,6 +54,7 @@ class Wanted:
     overwrite: bool = False
     verified: bool = True
     tolerance_px: float = TOLERANCE_PX
+    pixels: str | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ class Conversion:
         losses: what of it the format cannot hold; left out.
         loss_px: how far the lost terms of lenses move a pixel at most.
         verification: of the written file; None if it was not asked for.
+        notes: what else the user should know.
     """
 
     path: Path
@@ -73,6 +77,7 @@ class Conversion:
     losses: tuple[str, ...]
     loss_px: float
     verification: Verification | None
+    notes: tuple[str, ...] = ()
 
 
 def load(source: Path, given: Given, doubt: Doubt) -> tuple[Format, Path, Capture]:
@@ -124,9 +129,13 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wante
         if not form.default_name or target.suffix == Path(form.default_name).suffix
         else target / form.default_name
     )
-    losses = form.losses(capture)
+    turned = in_pixels(capture, _pixels(form, wanted, capture))
+    capture = turned.capture
+    off = len(turned.masks_left_out)
+    turned_masks = (f"{off} masks of photos with an EXIF orientation, which lie as the other pixels",) if off else ()
+    losses = (*turned_masks, *form.losses(capture))
     # 2D features are what structure from motion works with; who asks for another format does not expect them there.
-    refused = form.losses(replace(capture, observations=None))
+    refused = (*turned_masks, *form.losses(replace(capture, observations=None)))
     if refused and not wanted.allow_loss:
         raise UserError(
             f"{form.name} cannot hold all of this capture; it would lose: {'; '.join(losses)}",
@@ -136,7 +145,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wante
     there = [file for file in files if file.exists()]
     if there and not wanted.overwrite:
         raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another place")
-    left = reduced(capture, form.name) if losses else capture
+    left = reduced(capture, form.name)
     verification = None
     with _kept_on_success(path, there, files):
         form.write(expressed(capture, convention, written_axes=form.axes), path)
@@ -144,7 +153,27 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wante
             verification = _verification(left, path, form, convention, wanted.tolerance_px)
             if not verification.holds:
                 raise _does_not_hold(path, verification)
-    return Conversion(path, source_format, capture, losses, _loss_px(capture, left), verification)
+    notes = _orientation_notes(turned)
+    return Conversion(path, source_format, capture, losses, _loss_px(capture, left), verification, notes)
+
+
+def _pixels(form: Format, wanted: Wanted, capture: Capture) -> str:
+    """The pixels that the cameras of the written file shall refer to."""
+    if form.name == "nerfcli" and wanted.pixels == STORED:
+        raise UserError("the cameras of nerfcli's scenes refer to upright photos", "leave --pixels out", exit_code=2)
+    return wanted.pixels or form.pixels or capture.pixels
+
+
+def _orientation_notes(turned: Turned) -> tuple[str, ...]:
+    notes = []
+    if turned.num_turned:
+        stored = "as stored, which most programs read" if turned.capture.pixels == STORED else "upright"
+        notes.append(f"{turned.num_turned} photos have an EXIF orientation: their cameras refer to the pixels {stored}")
+    if turned.num_unknown:
+        notes.append(
+            f"{turned.num_unknown} photos are not there: if they have an EXIF orientation, their cameras do not fit"
+        )
+    return tuple(notes)
 
 
 def _convention(form: Format, wanted: Wanted) -> Convention:
@@ -170,7 +199,7 @@ def _convention(form: Format, wanted: Wanted) -> Convention:
 
 def _verification(left: Capture, path: Path, form: Format, convention: Convention, tolerance_px: float) -> Verification:
     if form.name == "ply":
-        return verify_points(left, read_ply_points(path), tolerance_px=tolerance_px)
+        return verify_points(left, *read_ply(path), tolerance_px=tolerance_px)
     listed = listed_order(left, form.name)
     sizes = tuple((left.frames[index].camera.width, left.frames[index].camera.height) for index in listed)
     letters = NAMED_AXES.get(convention.axes, convention.axes)
@@ -215,7 +244,8 @@ def _kept_on_success(path: Path, there: list[Path], files: list[Path]) -> Iterat
 
     Folders that were made on the way are removed with it.
     """
-    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
+    folders = {folder for file in files for folder in file.parents} | {path, *path.parents}
+    missing = sorted((folder for folder in folders if not folder.exists()), key=lambda folder: -len(folder.parts))
     place = path.with_name(f".{path.name}.aside-{os.getpid()}")  # not the name that atomic_folder takes
     aside = {file: place / file.name for file in there}
     if there:

@@ -73,6 +73,9 @@ def find_camera_path(path: Path) -> Path | None:
     found = find_json(path, opening="{", name="camera_path.json")
     if found is None or path.is_dir():
         return found
+    # Looked for as text first, so that a large transforms.json is not parsed twice.
+    if b'"camera_path"' not in found.read_bytes():
+        return None
     return found if is_camera_path(read_json_object(found)) else None
 
 

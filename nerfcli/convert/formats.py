@@ -1,10 +1,10 @@
 """The formats of captures in one table: how each is recognised, parsed, written, and what it cannot hold."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from nerfcli import scene
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.archive import losses_npz, parse_npz, write_npz
 from nerfcli.cameras.formats.blender import losses_blender, parse_blender, write_blender
@@ -17,12 +17,12 @@ from nerfcli.cameras.formats.colmap_write import (
     write_colmap_binary,
     write_colmap_text,
 )
-from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.llff import IMAGE_FOLDERS, losses_llff, parse_llff, write_llff
 from nerfcli.cameras.formats.metashape import parse_metashape
 from nerfcli.cameras.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
 from nerfcli.cameras.formats.ply import losses_ply, write_ply
 from nerfcli.cameras.formats.reality_capture import parse_reality_capture
+from nerfcli.cameras.formats.scene_json import SCENE_FILE, read_description
 from nerfcli.cameras.formats.trajectories import (
     losses_kitti,
     losses_tum,
@@ -48,8 +48,11 @@ from nerfcli.convert.finding import (
     find_model,
     find_scene,
 )
+from nerfcli.convert.pixels import STORED, UPRIGHT, measure
+from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, write_scene
 from nerfcli.errors import UserError
-from nerfcli.media.images import list_images, read_exif
+from nerfcli.media.images import list_images
+from nerfcli.media.masks import find_mask
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ class Format:
     Args:
         name: as the user says it.
         title: what it is.
-        looked_for: the files by which a folder is recognised.
+        looked_for: what it is recognised by, as short as can be, for people.
         find: where in a path, a file or a folder, such a capture stands; None where there is none.
         parse: reads what `find` found; None for formats that are only written.
         axes: the camera axes of its poses, as three letters or a name.
@@ -80,6 +83,7 @@ class Format:
         open_centre: whether principal points with other pixel centres are found in such files.
         default_name: the file that it writes if a folder is named; "" for formats that fill a folder.
         files: the names of all files that it may write, where "*" stands for that file's name without its suffix.
+        pixels: which pixels of EXIF-turned photos its cameras refer to, see `Capture`; None where the file says it.
         write, losses: None for formats that are only read.
     """
 
@@ -93,6 +97,7 @@ class Format:
     open_centre: bool = False
     default_name: str = ""
     files: tuple[str, ...] = ()
+    pixels: str | None = STORED
     write: Callable[[Capture, Path], None] | None = None
     losses: Callable[[Capture], tuple[str, ...]] | None = None
 
@@ -109,7 +114,7 @@ def recognise(path: Path) -> tuple[Format, Path]:
         found = form.find(path)
         if found is not None and form.parse is not None:
             return form, found
-    looked_for = "; ".join(f"{form.name}: {form.looked_for}" for form in FORMATS if form.parse is not None)
+    looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.parse is not None))
     raise UserError(f"{path} holds no capture in a known format", f"looked for {looked_for}")
 
 
@@ -127,6 +132,13 @@ def format_named(name: str) -> Format:
     )
 
 
+def recording(form: Format, provenance: Mapping[str, Any]) -> Format:
+    """The format, whose files tell where they come from if they have a place for it, as scene.json has."""
+    if form.write is not write_scene:
+        return form
+    return replace(form, write=lambda capture, folder: write_scene(capture, folder, provenance=provenance))
+
+
 def with_photos(capture: Capture, folder: Path) -> Capture:
     """The capture with its photos looked up in another folder: under their names there, or under their file names."""
     frames = []
@@ -136,26 +148,18 @@ def with_photos(capture: Capture, folder: Path) -> Capture:
     return replace(capture, frames=tuple(frames))
 
 
-def measure(path: Path) -> tuple[int, int, int]:
-    """Width and height of a photo as it is shown, and its EXIF orientation."""
-    exif = read_exif(path)
-    return exif.width, exif.height, exif.orientation
-
-
 def _parse_scene(path: Path, given: Given) -> Capture:
-    loaded = scene.load(path)  # which checks scene.json
-    content = read_json_object(path / scene.SCENE_FILE)
-    capture = parse_colmap(path / content["model"], (path / content["image_folder"]).resolve())
-    test_names, present = set(content["split"]["test"]), {frame.name: frame for frame in loaded.frames}
-    frames = tuple(
-        replace(
-            frame,
-            split="test" if frame.name in test_names else "train",
-            mask=present[frame.name].mask if frame.name in present else None,
-        )
-        for frame in capture.frames
+    described = read_description(path)
+    capture = parse_colmap(described.model_dir, given.images or described.image_folder)
+    frames = described.described(capture.frames, find_mask)
+    return replace(
+        capture,
+        frames=frames,
+        unit=described.unit,
+        unit_source=described.unit_source,
+        depth_bounds=described.bounds_of(frames),
+        pixels=UPRIGHT,
     )
-    return replace(capture, frames=frames, unit=loaded.unit)
 
 
 def _parse_model(path: Path, given: Given) -> Capture:
@@ -172,11 +176,21 @@ def _parse_model(path: Path, given: Given) -> Capture:
 
 
 FORMATS = (
-    Format("nerfcli", "a scene of nerfcli poses (read)", scene.SCENE_FILE, find_scene, _parse_scene),
+    Format(
+        "nerfcli",
+        "a scene as nerfcli poses writes it: a COLMAP model in sparse/0, and scene.json",
+        SCENE_FILE,
+        find_scene,
+        _parse_scene,
+        pixels=UPRIGHT,
+        files=SCENE_FILES,
+        write=write_scene,
+        losses=losses_scene,
+    ),
     Format(
         "colmap",
         "a COLMAP model, binary; read also as text",
-        "cameras, images and points3D, .bin or .txt, in it or in sparse/0",
+        "sparse/0/cameras.bin or .txt",
         find_model,
         _parse_model,
         files=MODEL_FILES,
@@ -186,7 +200,7 @@ FORMATS = (
     Format(
         "colmap-text",
         "a COLMAP model as text",
-        "as colmap",
+        "sparse/0/cameras.bin or .txt",
         find_model,
         _parse_model,
         files=MODEL_FILES,
@@ -196,7 +210,7 @@ FORMATS = (
     Format(
         "camera-path",
         "a camera path of nerfstudio's viewer (read)",
-        "a file .json with a camera_path, or camera_path.json",
+        "camera_path.json",
         find_camera_path,
         lambda path, given: parse_camera_path(path),
         axes="opengl",
@@ -221,7 +235,7 @@ FORMATS = (
         "transforms_{train,val,test}.json of NeRF's Blender scenes",
         "transforms_train.json",
         find_blender,
-        lambda path, given: parse_blender(path, measure),
+        lambda path, given: parse_blender(path, measure, images=given.images),
         axes="opengl",
         open_axes=True,
         files=("transforms_train.json", "transforms_val.json", "transforms_test.json"),
@@ -254,21 +268,21 @@ FORMATS = (
     Format(
         "metashape",
         "cameras of Agisoft Metashape as XML (read)",
-        "a file .xml, or cameras.xml",
+        ".xml",
         by_suffix(".xml", "cameras.xml"),
         lambda path, given: parse_metashape(path),
     ),
     Format(
         "reality-capture",
         "cameras of RealityScan or RealityCapture as CSV (read)",
-        "a file .csv",
+        ".csv",
         by_suffix(".csv"),
         lambda path, given: parse_reality_capture(path, measure, images=given.images),
     ),
     Format(
         "bundler",
         "bundle.out of Bundler (read)",
-        "a file .out, or bundle.out",
+        "bundle.out",
         by_suffix(".out", "bundle.out", "bundle/bundle.out"),
         lambda path, given: parse_bundler(path, measure, images=given.images),
         axes="opengl",
@@ -276,7 +290,7 @@ FORMATS = (
     Format(
         "tum",
         "a trajectory of the TUM RGB-D benchmark",
-        "a file .txt with 8 numbers a line",
+        ".txt with 8 or 12 numbers a line",
         lambda path: find_lines(path, columns=8),
         lambda path, given: parse_tum(path, given.camera),
         open_axes=True,
@@ -288,7 +302,7 @@ FORMATS = (
     Format(
         "kitti",
         "a trajectory of the KITTI odometry benchmark",
-        "a file .txt with 12 numbers a line",
+        ".txt with 8 or 12 numbers a line",
         lambda path: find_lines(path, columns=12),
         lambda path, given: parse_kitti(path, given.camera),
         open_axes=True,
@@ -300,13 +314,14 @@ FORMATS = (
     Format(
         "npz",
         "everything, as arrays of NumPy",
-        "a file .npz, or capture.npz",
+        ".npz",
         by_suffix(".npz", "capture.npz"),
         lambda path, given: parse_npz(path),
         open_axes=True,
         open_centre=True,
         default_name="capture.npz",
         files=("*.npz",),
+        pixels=None,
         write=write_npz,
         losses=losses_npz,
     ),

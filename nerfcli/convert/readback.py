@@ -7,6 +7,8 @@ reads only what nerfcli writes, so it is short and checks nothing: whatever is w
 
 import json
 import math
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,24 @@ class UnreadableError(Exception):
 
 
 @dataclass(frozen=True)
+class Beside:
+    """What a file may say beside cameras, poses and points; None where its format does not.
+
+    Args:
+        images, masks: of each view, as paths; "" for none.
+        splits: of each view: "train", "val", "test", or "" for none.
+        depth_bounds: (views, 2).
+        unit: "arbitrary" or "metre".
+    """
+
+    images: tuple[str, ...] | None = None
+    masks: tuple[str, ...] | None = None
+    splits: tuple[str, ...] | None = None
+    depth_bounds: np.ndarray | None = None
+    unit: str | None = None
+
+
+@dataclass(frozen=True)
 class ReadBack:
     """The views in a file.
 
@@ -32,6 +52,10 @@ class ReadBack:
         centres: (views, 3) camera centres in the world.
         lenses: one per view; None where the format has no intrinsics.
         points: (N, 3), or None where the format has no points.
+        colours: (N, 3), 0...255; None where the format has none.
+        features: gives of a view the positions (F, 2) and points (F,), -1: none, of its features; None where the
+            format has no observations.
+        beside: what else the file says of its views and of the whole, under the names of `Beside`.
     """
 
     labels: tuple[str, ...] | None
@@ -39,6 +63,9 @@ class ReadBack:
     centres: np.ndarray
     lenses: tuple[Lens, ...] | None
     points: np.ndarray | None
+    colours: np.ndarray | None = None
+    features: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None
+    beside: Beside = Beside()
 
 
 @dataclass(frozen=True)
@@ -59,6 +86,8 @@ def read_colmap(path: Path, meant: Meant) -> ReadBack:
         for camera_id, camera in model.cameras.items()
     }
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    point_ids = sorted(model.points3D)
+    places = {point_id: place for place, point_id in enumerate(point_ids)}
     poses = np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4)
     rotations = poses[:, :, :3]
     return ReadBack(
@@ -66,25 +95,63 @@ def read_colmap(path: Path, meant: Meant) -> ReadBack:
         cam_from_world=rotations,
         centres=-np.einsum("nji,nj->ni", rotations, poses[:, :, 3]),
         lenses=tuple(lenses[image.camera_id] for image in images),
-        points=np.array([model.points3D[index].xyz for index in sorted(model.points3D)]).reshape(-1, 3),
+        points=np.array([model.points3D[index].xyz for index in point_ids]).reshape(-1, 3),
+        colours=np.array([model.points3D[index].color for index in point_ids]).reshape(-1, 3),
+        features=lambda view: _features(images[view], places),
     )
+
+
+def read_scene(path: Path, meant: Meant) -> ReadBack:
+    """A scene of nerfcli: its model by pycolmap, scene.json by the json module."""
+    content = json.loads((path / "scene.json").read_text(encoding="utf-8"))
+    back = read_colmap(path / content["model"], meant)
+    names = back.labels or ()
+    masks, bounds, root = content["masks"] or {}, content.get("depth_bounds"), os.path.realpath(path)
+    parts = {name: part for part in ("test", "val", "unused") for name in content["split"].get(part, [])}
+    splits = tuple(parts.get(name, "train").replace("unused", "") for name in names)
+    beside = Beside(
+        images=tuple(os.path.join(root, content["image_folder"], name) for name in names),
+        masks=tuple(os.path.join(root, masks[name]) if name in masks else "" for name in names),
+        splits=splits,
+        depth_bounds=None if bounds is None else np.array([bounds[name] for name in names]),
+        unit=content["unit"],
+    )
+    return replace(back, beside=beside)
+
+
+def _features(image: Any, places: dict[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (F, 2) of an image's features, and where their points stand in the list of points (F,), -1: none."""
+    features = list(image.points2D)
+    points = [places[feature.point3D_id] if feature.has_point3D() else -1 for feature in features]
+    return np.array([feature.xy for feature in features]).reshape(-1, 2), np.array(points, dtype=np.int64)
 
 
 def read_transforms(path: Path, meant: Meant) -> ReadBack:
     """transforms.json, by the json module, and the PLY file of points that it names."""
     content = json.loads(path.read_text(encoding="utf-8"))
     cloud = content.get("ply_file_path")
-    points = np.zeros((0, 3)) if cloud is None else read_ply_points(path.parent / cloud)
-    return replace(_from_transforms([content], meant), points=points)
+    points, colours = (np.zeros((0, 3)), None) if cloud is None else read_ply(path.parent / cloud)
+    parts = {name: part for part in ("train", "val", "test") for name in content.get(f"{part}_filenames", [])}
+    records = content["frames"]
+    beside = Beside(
+        images=tuple(os.path.join(path.parent, record["file_path"]) for record in records),
+        masks=tuple(
+            os.path.join(path.parent, record["mask_path"]) if "mask_path" in record else "" for record in records
+        ),
+        splits=tuple(parts.get(record["file_path"], "") for record in records),
+    )
+    return replace(_from_transforms([content], meant), points=points, colours=colours, beside=beside)
 
 
 def read_blender(path: Path, meant: Meant) -> ReadBack:
     """transforms_train.json, transforms_val.json and transforms_test.json of a folder: only the angle of view."""
     files = [path / f"transforms_{split}.json" for split in ("train", "val", "test")]
     contents = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
+    named = [file.stem.removeprefix("transforms_") for file in files if file.exists()]
+    splits = [split for split, content in zip(named, contents, strict=True) for _ in content["frames"]]
     for content in contents:
         content["frames"] = [{**record, "angle": content["camera_angle_x"]} for record in content["frames"]]
-    return _from_transforms(contents, meant)
+    return replace(_from_transforms(contents, meant), beside=Beside(splits=tuple(splits)))
 
 
 def read_llff(path: Path, meant: Meant) -> ReadBack:
@@ -95,7 +162,7 @@ def read_llff(path: Path, meant: Meant) -> ReadBack:
     lenses = []
     for height, width, focal in matrices[:, :, 4]:
         lenses.append(Lens("SIMPLE_PINHOLE", int(width), int(height), (focal, width / 2, height / 2)))
-    return ReadBack(None, rotations, centres, tuple(lenses), None)
+    return ReadBack(None, rotations, centres, tuple(lenses), None, beside=Beside(depth_bounds=rows[:, 15:]))
 
 
 def read_tum(path: Path, meant: Meant) -> ReadBack:
@@ -125,6 +192,7 @@ def read_opensfm(path: Path, meant: Meant) -> ReadBack:
         centres=-np.einsum("nji,nj->ni", rotations, translations),
         lenses=tuple(lenses[shot["camera"]] for shot in shots.values()),
         points=np.array([point["coordinates"] for point in content["points"].values()]).reshape(-1, 3),
+        colours=np.array([point["color"] for point in content["points"].values()]).reshape(-1, 3),
     )
 
 
@@ -146,18 +214,40 @@ def read_npz(path: Path, meant: Meant) -> ReadBack:
             centres=centres,
             lenses=tuple(lenses[index] for index in arrays["camera_index"]),
             points=arrays["points"],
+            colours=arrays.get("colours"),
+            features=_features_of_arrays(arrays, 0.5 - meant.pixel_centre),
+            beside=Beside(
+                images=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["images"].tolist()),
+                masks=tuple(os.path.join(path.parent, text) if text else "" for text in arrays["masks"].tolist()),
+                splits=tuple(arrays["splits"].tolist()),
+                depth_bounds=arrays.get("depth_bounds"),
+                unit=str(arrays["unit"]),
+            ),
         )
 
 
-def read_ply_points(path: Path) -> np.ndarray:
-    """The vertices (N, 3) of a binary PLY file whose first three properties are doubles."""
+def _features_of_arrays(arrays: Any, shift: float) -> Callable[[int], tuple[np.ndarray, np.ndarray]] | None:
+    """The features of each view of an .npz file."""
+    if "observation_pixels" not in arrays:
+        return None
+    frames, pixels, points = (arrays[f"observation_{name}"] for name in ("frames", "pixels", "points"))
+    order = np.argsort(frames, kind="stable")
+    cuts = np.searchsorted(frames[order], np.arange(1, len(arrays["names"])))
+    rows = np.split(order, cuts)
+    return lambda view: (pixels[rows[view]] + shift, points[rows[view]])
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """The vertices (N, 3) of a binary PLY file whose first three properties are doubles, and the colours (N, 3) that
+    follow as bytes, if they do."""
     header, _, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii").splitlines()
     count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
     sizes = {"double": 8, "float64": 8, "float": 4, "uchar": 1, "uint8": 1}
     stride = sum(sizes[line.split()[1]] for line in lines if line.startswith("property"))
     rows = np.frombuffer(body, dtype=np.uint8, count=count * stride).reshape(count, stride)
-    return np.ascontiguousarray(rows[:, :24]).view("<f8").reshape(count, 3)
+    points = np.ascontiguousarray(rows[:, :24]).view("<f8").reshape(count, 3)
+    return points, rows[:, 24:27] if stride == 27 else None
 
 
 def _opensfm_lens(record: dict[str, Any]) -> Lens:
@@ -229,6 +319,7 @@ def _pointing(poses: np.ndarray, axes: str, along: str, against: str) -> np.ndar
 
 
 READERS = {
+    "nerfcli": read_scene,
     "colmap": read_colmap,
     "colmap-text": read_colmap,
     "transforms": read_transforms,

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.frame import Capture
+from nerfcli.convert.scene_folder import named_for_scene
 
 # Models that transforms.json holds whole.
 _HELD = (
@@ -20,8 +21,44 @@ _HELD = (
 )
 
 
+# What each format holds beside cameras, poses and points.
+_PARTS = {
+    "nerfcli": ("masks", "split", "colours", "observations", "depth bounds", "unit"),
+    "npz": ("masks", "split", "colours", "observations", "depth bounds", "unit"),
+    "colmap": ("colours", "observations"),
+    "colmap-text": ("colours", "observations"),
+    "transforms": ("masks", "split", "colours"),
+    "blender": ("split",),
+    "llff": ("depth bounds",),
+    "opensfm": ("colours",),
+    "ply": ("colours",),
+}
+
+
 def reduced(capture: Capture, format_name: str) -> Capture:
-    """The capture with the cameras and names that a format can hold."""
+    """The capture with the cameras, names and other parts that a format can hold."""
+    return _with_parts(_with_words(capture, format_name), _PARTS.get(format_name, ()))
+
+
+def _with_parts(capture: Capture, held: Collection[str]) -> Capture:
+    frames = tuple(
+        replace(f, mask=f.mask if "masks" in held else None, split=f.split if "split" in held else None)
+        for f in capture.frames
+    )
+    return replace(
+        capture,
+        frames=frames,
+        colours=capture.colours if "colours" in held else None,
+        observations=capture.observations if "observations" in held else None,
+        depth_bounds=capture.depth_bounds if "depth bounds" in held else None,
+        unit=capture.unit if "unit" in held else "arbitrary",
+    )
+
+
+def _with_words(capture: Capture, format_name: str) -> Capture:
+    """The capture with the cameras and names that a format has words for."""
+    if format_name == "nerfcli":
+        return named_for_scene(capture)
     if format_name == "colmap-text":
         return replace(capture, frames=tuple(replace(f, name=f.name.split(" ")[0]) for f in capture.frames))
     if format_name == "blender":
@@ -46,7 +83,7 @@ def _with_one_angle(capture: Capture) -> Capture:
     for frame in capture.frames:
         width, height = frame.camera.width, frame.camera.height
         focal_px = width / 2 / math.tan(shared[frame.split or "train"] / 2)
-        frames.append(replace(frame, camera=Camera.pinhole(width, height, focal_px)))
+        frames.append(replace(frame, camera=Camera.pinhole(width, height, focal_px), split=frame.split or "train"))
     return replace(capture, frames=tuple(frames))
 
 

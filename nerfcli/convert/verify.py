@@ -14,6 +14,7 @@ from nerfcli.convert import lenses
 from nerfcli.convert.axes import poses_of
 from nerfcli.convert.probes import Probes, distinct, probes_of, rows_of_each
 from nerfcli.convert.readback import ReadBack, UnreadableError
+from nerfcli.convert.verify_parts import compared_parts
 
 TOLERANCE_PX = 1e-6
 
@@ -36,6 +37,7 @@ class Verification:
         tolerance_rad: the same as an angle at the longest focal length; what rotations may differ by, and positions in
             sizes of the scene.
         fault: what is wrong with the file beside numbers, such as a view that is not there; "" if nothing.
+        parts: what else was compared and is the same, such as "colours of 40 points".
     """
 
     max_px: float
@@ -49,6 +51,7 @@ class Verification:
     tolerance_px: float
     tolerance_rad: float
     fault: str = ""
+    parts: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -85,6 +88,7 @@ def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px
             raise UnreadableError(f"it holds {len(back.points)} points instead of {len(points)}")
     except UnreadableError as error:
         return replace(empty, fault=str(error))
+    fault, parts = compared_parts(capture, back, order, tolerance_px=tolerance_px)
     residual = np.linalg.norm(_projected(capture, probes, back, order) - probes.pixels, axis=1)
     residual = np.where(np.isfinite(residual), residual, np.inf)
     worst = int(residual.argmax()) if len(residual) else -1
@@ -100,6 +104,8 @@ def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px
         max_centre_shift=float(shifts.max() / size),
         max_point_shift=float(point_shifts.max(initial=0.0) / size),
         worst=capture.frames[probes.frame_index[worst]].name if worst >= 0 else "",
+        fault=fault,
+        parts=parts,
     )
 
 
@@ -109,11 +115,15 @@ def unreadable(capture: Capture, fault: str, *, tolerance_px: float = TOLERANCE_
     return Verification(np.inf, np.inf, np.inf, np.inf, "", 0, 0, 0, tolerance_px, tolerance_rad, fault)
 
 
-def verify_points(capture: Capture, points: np.ndarray, *, tolerance_px: float = TOLERANCE_PX) -> Verification:
-    """Compare the points alone, for a format that holds nothing else: they must be the same to the last bit."""
+def verify_points(
+    capture: Capture, points: np.ndarray, colours: np.ndarray | None, *, tolerance_px: float = TOLERANCE_PX
+) -> Verification:
+    """Compare points and colours alone, for a format that holds nothing else: they must be the same to the last bit."""
     same = points.shape == capture.points.shape
     shift = float(np.abs(points - capture.points).max(initial=0.0) / _size(capture)) if same else np.inf
     fault = "" if shift == 0 else f"its points are off by {shift:.3g} of the scene"
+    if not fault and capture.colours is not None:
+        fault = "" if colours is not None and np.array_equal(capture.colours, colours) else "its colours differ"
     told = unreadable(capture, fault, tolerance_px=tolerance_px)
     return replace(
         told, max_px=0.0, max_deg=0.0, max_centre_shift=0.0, max_point_shift=shift, num_points=len(capture.points)

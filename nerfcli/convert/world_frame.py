@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.orientation import fit_to_picture
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.cameras.world import moved_to_origin, transformed, turned_up
-from nerfcli.convert.formats import measure
+from nerfcli.convert.pixels import measure_of, upright
 from nerfcli.errors import UserError
 from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
 from nerfcli.scale.distances import known_distance, scale_from_distances
@@ -28,7 +27,8 @@ class WorldFrame:
         origin: centre-of-cameras, focus, or a place "x,y,z" of the old frame.
         scale: a number that lengths are multiplied by, or "gps" for metres by the positions in the photos' EXIF.
         markers: ArUco markers in the photos, "DICTIONARY:SIDE", or a ChArUco board,
-            "DICTIONARY:COLUMNSxROWS:SQUARE:MARKER", with sides in metres: lengths become metres.
+            "DICTIONARY:COLUMNSxROWS:SQUARE:MARKER", with sides in metres: lengths become metres. ":legacy" after it is
+            for boards with an even number of rows that were made with OpenCV before 4.6.
         distances: known ones, "A B METRES" with names of images or points x,y,z: lengths become metres.
     """
 
@@ -58,7 +58,15 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Simil
     if factor != 1:
         change = Similarity(factor, np.eye(3), np.zeros(3)).compose(change)
     moved = transformed(capture, change)
-    return (moved if estimate is None else replace(moved, unit="metre")), change, estimate
+    if estimate is not None:
+        moved = replace(moved, unit="metre", unit_source=_source(estimate))
+    return moved, change, estimate
+
+
+def _source(estimate: ScaleEstimate) -> str:
+    """How the metre is known, for people."""
+    relative = None if estimate.standard_error is None else estimate.standard_error / estimate.metres_per_unit
+    return estimate.source if relative is None else f"{estimate.source}, +- {100 * relative:.2g} %"
 
 
 def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
@@ -69,17 +77,10 @@ def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
         return scale_from_distances([known_distance(text, capture.frames) for text in wanted.distances])
     frames = [frame for frame in capture.frames if frame.image is not None and frame.image.is_file()]
     if wanted.markers is not None:
-        return _scale_from_markers([_upright(frame) for frame in frames], wanted.markers)
+        return _scale_from_markers([upright(frame, measure_of(capture)) for frame in frames], wanted.markers)
     if wanted.scale == GPS:
         return scale_from_gps(frames, gps_positions(frames)).estimate
     return None
-
-
-def _upright(frame: Frame) -> Frame:
-    """The frame of the photo as it is shown, of one whose camera refers to the pixels as they are stored."""
-    assert frame.image is not None
-    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measure=measure)
-    return replace(frame, camera=camera, world_from_cam=pose)
 
 
 def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:
@@ -87,9 +88,12 @@ def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:
     try:
         if len(numbers) == 1:
             return scale_from_markers(frames, float(numbers[0]), dictionary=dictionary)
-        size, square, marker = numbers
+        size, square, marker, *more = numbers
+        if more not in ([], ["legacy"]):
+            raise ValueError(more)
         columns, rows = (int(part) for part in size.split("x"))
-        return scale_from_charuco(frames, CharucoBoard(columns, rows, float(square), float(marker), dictionary))
+        board = CharucoBoard(columns, rows, float(square), float(marker), dictionary, legacy=bool(more))
+        return scale_from_charuco(frames, board)
     except ValueError as error:
         raise UserError(
             f"--markers is {text!r}",

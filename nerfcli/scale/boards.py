@@ -26,6 +26,7 @@ class CharucoBoard:
         columns, rows: squares across and down.
         square, marker: length of their sides in metres.
         dictionary: OpenCV's name, such as DICT_5X5_100.
+        legacy: whether the first square is white where the number of rows is even, as OpenCV before 4.6 made boards.
     """
 
     columns: int
@@ -33,6 +34,7 @@ class CharucoBoard:
     square: float
     marker: float
     dictionary: str
+    legacy: bool = False
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 2:
@@ -95,7 +97,9 @@ def scale_from_charuco(frames: Sequence[Frame], board: CharucoBoard) -> ScaleEst
             "give the dictionary that the board was made with",
         )
     size = (board.columns, board.rows)
-    detector = cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary))
+    printed = cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary)
+    printed.setLegacyPattern(board.legacy)
+    detector = cv2.aruco.CharucoDetector(printed)
     sightings: dict[Hashable, list[tuple[int, np.ndarray]]] = {}
     for index, grey in _photos(frames):
         corners, numbers, _, _ = detector.detectBoard(grey)

@@ -20,6 +20,7 @@ class ScaleEstimate:
         residuals: what is left of each measurement, by its name, in `residual_unit`.
         residual_unit: "percent" of a known length (measured minus known), or "metre".
         source: what it comes from, for people.
+        details: what else is to be known of it, for people; "" if nothing.
     """
 
     metres_per_unit: float
@@ -27,6 +28,7 @@ class ScaleEstimate:
     residuals: tuple[tuple[str, float], ...]
     residual_unit: str
     source: str
+    details: str = ""
 
     @property
     def similarity(self) -> Similarity:
@@ -39,7 +41,7 @@ class ScaleEstimate:
         return float(np.sqrt(np.mean([value**2 for _, value in self.residuals])))
 
     def to_json(self) -> dict[str, Any]:
-        """{"metres_per_unit", "standard_error", "residuals", "residual_unit", "rms_residual", "source"}."""
+        """{"metres_per_unit", "standard_error", "residuals", "residual_unit", "rms_residual", "source", "details"}."""
         return {
             "metres_per_unit": self.metres_per_unit,
             "standard_error": self.standard_error,
@@ -47,6 +49,7 @@ class ScaleEstimate:
             "residual_unit": self.residual_unit,
             "rms_residual": self.rms_residual,
             "source": self.source,
+            "details": self.details,
         }
 
 

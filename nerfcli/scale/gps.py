@@ -151,14 +151,16 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
         )
     scale = fit.b_from_a.scale
     residuals = np.linalg.norm(fit.b_from_a.apply(x) - y, axis=1)
+    left_out = tuple(frame.name for frame, kept in zip(used, keep, strict=True) if not kept)
+    off = f"; left out, being far off: {', '.join(left_out)}" if left_out else ""
     estimate = ScaleEstimate(
         metres_per_unit=scale,
         standard_error=max(_jackknife(x[keep], y[keep]), scale * sigma / (np.sqrt(keep.sum()) * spread)),
         residuals=tuple((frame.name, float(r)) for frame, r in zip(used, residuals, strict=True)),
         residual_unit="metre",
         source=f"GPS of {int(keep.sum())} photos (EXIF)",
+        details=f"the photos are spread over {spread:.3g} m, and GPS is off by {noise:.2g} m{off}",
     )
-    left_out = tuple(frame.name for frame, kept in zip(used, keep, strict=True) if not kept)
     directions = fit.b_from_a if _spans_a_plane(scale * x[keep], sigma) else None
     return GpsFit(estimate, directions, reference, left_out, spread, noise)
 

@@ -112,7 +112,7 @@ def train(
     background = ALPHA_BACKGROUND if pool.has_alpha else OPAQUE_BACKGROUND
 
     def model() -> Model:
-        return Model(fitting.field, fitting.occupied, marching, background, similarity, scene.unit)
+        return Model(fitting.field, fitting.occupied, marching, background, similarity, scene.unit, scene.unit_source)
 
     def checkpoint() -> None:
         save_model(run / FIELD, model())

@@ -32,6 +32,7 @@ def describe_run(scene: Scene, settings: TrainSettings, factor: int) -> dict[str
         "scene": str(scene.root),
         "scene_kind": scene.kind,
         "unit": scene.unit,
+        "unit_source": scene.unit_source,
         "scene_fingerprint": fingerprint(scene),
         "split_sha256": hashlib.sha256("\n".join(sorted(scene.test_names)).encode()).hexdigest(),
         "missing_photos": list(scene.missing),

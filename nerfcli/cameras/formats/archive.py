@@ -2,6 +2,8 @@
 
 version                 1
 kind, unit              text
+unit_source             text, empty where nobody said how a metre is known; may be missing, as pixels may
+pixels                  text: "stored" or "upright", see `Capture`
 names                   (F,) text
 images, masks           (F,) text: paths relative to the file's folder; empty where a frame has none
 splits                  (F,) text: "train", "val", "test" or empty
@@ -64,6 +66,8 @@ def write_npz(capture: Capture, path: Path) -> None:
         "version": np.array(ARCHIVE_VERSION),
         "kind": np.array(capture.kind),
         "unit": np.array(capture.unit),
+        "unit_source": np.array(capture.unit_source or ""),
+        "pixels": np.array(capture.pixels),
         "names": np.array([frame.name for frame in capture.frames], dtype=np.str_),
         "images": np.array([_relative(frame.image, path.parent) for frame in capture.frames], dtype=np.str_),
         "masks": np.array([_relative(frame.mask, path.parent) for frame in capture.frames], dtype=np.str_),
@@ -139,6 +143,8 @@ def parse_npz(path: Path) -> Capture:
         colours=_colours(arrays, len(points)),
         observations=_observations(arrays, count, num_points=len(points)),
         unit=unit,
+        unit_source=(arrays.text("unit_source") or None) if "unit_source" in arrays else None,
+        pixels=_pixels(arrays),
     )
 
 
@@ -186,7 +192,7 @@ class _Arrays:
         try:
             texts = array.tolist()
             "".join(texts).encode("utf-8")
-        except ValueError as error:
+        except (ValueError, SystemError) as error:  # NumPy raises the second where a character is beyond Unicode's
             raise self.damaged(name, "characters that are none") from error
         return texts
 
@@ -195,7 +201,10 @@ class _Arrays:
         array = self._array(name)
         if array.dtype.kind != "U" or array.shape != ():
             raise self.damaged(name, f"{array.shape} values of type {array.dtype}, expected one text")
-        return str(array)
+        try:
+            return str(array.item())
+        except (ValueError, SystemError) as error:
+            raise self.damaged(name, "characters that are none") from error
 
     def _array(self, name: str) -> np.ndarray:
         if name not in self._bytes:
@@ -220,6 +229,13 @@ def _cameras(arrays: _Arrays) -> list[Camera]:
             raise UserError(f"{where}: a parameter is NaN", _HINT)
         cameras.append(stated_camera(model, width, height, tuple(row[:length].tolist()), where=where))
     return cameras
+
+
+def _pixels(arrays: _Arrays) -> str:
+    pixels = arrays.text("pixels") if "pixels" in arrays else "stored"
+    if pixels not in ("stored", "upright"):
+        raise arrays.damaged("pixels", f"{pixels!r}, expected stored or upright")
+    return pixels
 
 
 def _colours(arrays: _Arrays, num_points: int) -> np.ndarray | None:
@@ -260,7 +276,7 @@ def _relative(path: Path | None, folder: Path) -> str:
     if path is None:
         return ""
     try:
-        return Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix()
+        return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
     except ValueError:
         return path.absolute().as_posix()
 

@@ -20,13 +20,14 @@ from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts, lost_to_pinhole
 from nerfcli.cameras.formats.transforms import (
     SPLITS,
+    Found,
     capture_on_disk,
     frames_on_disk,
     listed_frames,
     refuse_twins,
     relative_path,
 )
-from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame import Capture, Frame, Size
 from nerfcli.cameras.orientation import Measure
 from nerfcli.errors import UserError
 
@@ -39,23 +40,26 @@ def read_blender(folder: Path, measure: Measure) -> Capture:
     """
     frames: list[Frame] = []
     missing: list[str] = []
+    rescaled: Counter[tuple[Size, Size]] = Counter()
     for split in ("train", "test"):
         path = _file(folder, split)
         if split == "test" and not path.exists():
             continue
-        found, absent = frames_on_disk(path, read_json_object(path), measure)
-        frames += [replace(frame, split=split) for frame in found]
-        missing += absent
-    return capture_on_disk(_file(folder, "train"), frames, missing, kind="blender")
+        found = frames_on_disk(path, read_json_object(path), measure)
+        frames += [replace(frame, split=split) for frame in found.frames]
+        missing += found.missing
+        rescaled.update(found.rescaled)
+    return capture_on_disk(_file(folder, "train"), Found(frames, missing, dict(rescaled)), kind="blender")
 
 
-def parse_blender(folder: Path, measure: Measure) -> Capture:
+def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
     """All that the files of a Blender capture say: the views of all three splits that there are.
 
     Args:
         folder: holds at least one of the three files.
         measure: tells an image's upright size and EXIF orientation: the files do not. An image that is not on disk has
             the size of the other ones in its file.
+        images: where the images are, if not where the files say: under the paths that they list, or their last parts.
 
     Raises:
         UserError: a file is malformed or lists no image that is on disk, or there is no file.
@@ -64,7 +68,7 @@ def parse_blender(folder: Path, measure: Measure) -> Capture:
     for split in SPLITS:
         path = _file(folder, split)
         if path.exists():
-            listed = listed_frames(path, read_json_object(path), measure, suffix=".png")
+            listed = listed_frames(path, read_json_object(path), measure, suffix=".png", images=images)
             frames += [replace(frame, split=split) for frame in listed]
     if not frames:
         raise UserError(f"{_file(folder, 'train')}: No such file", "give a folder of transforms_{train,val,test}.json")

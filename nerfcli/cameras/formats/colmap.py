@@ -16,7 +16,7 @@ from typing import TypeVar
 from nerfcli.cameras.formats import colmap_binary, colmap_text
 from nerfcli.cameras.formats.colmap_model import ColmapModel, capture_of
 from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.orientation import Measure, fit_to_picture
+from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling
 from nerfcli.errors import UserError
 
 FILES = ("cameras", "images", "points3D")
@@ -40,16 +40,20 @@ def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
     Raises:
         UserError: a file of the model is missing or damaged, or no image is on disk.
     """
-    model = read_model(model_dir)
-    frames, missing = [], []
+    return colmap_on_disk(read_model(model_dir), image_dir, measure, model_dir)
+
+
+def colmap_on_disk(model: ColmapModel, image_dir: Path, measure: Measure, model_dir: Path) -> Capture:
+    """`read_colmap` of a model that was read from `model_dir` before."""
+    frames, missing, rescaled = [], [], []
     for image in model.images:
         path = image_dir / image.name
         if not path.is_file():
             missing.append(image.name)
             continue
-        camera, world_from_cam = fit_to_picture(
-            model.cameras[image.camera_id], image.world_from_cam, path=path, measure=measure
-        )
+        calibrated = model.cameras[image.camera_id]
+        camera, world_from_cam = fit_to_picture(calibrated, image.world_from_cam, path=path, measure=measure)
+        rescaled.append(rescaling(calibrated, camera))
         frames.append(Frame(image.name, camera, world_from_cam, image=path))
     if not frames:
         raise UserError(
@@ -57,7 +61,9 @@ def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
             + (f", such as {missing[0]}" if missing else ""),
             "put the photos there, under the names that the model lists",
         )
-    return Capture(tuple(frames), model.points, tuple(missing), None, "colmap")
+    return Capture(
+        tuple(frames), model.points, tuple(missing), None, "colmap", pixels="upright", rescaled=counted(rescaled)
+    )
 
 
 def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:

@@ -20,7 +20,7 @@ from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts, lost_to_
 from nerfcli.cameras.formats.npy import array_from_npy
 from nerfcli.cameras.formats.poses import rigid_poses
 from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.orientation import Measure, fit_to_picture
+from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling
 from nerfcli.errors import UserError
 
 FILE = "poses_bounds.npy"
@@ -44,11 +44,13 @@ def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list
     path = folder / FILE
     rows = _read_rows(path)
     images = _images_of_rows(folder, len(rows), list_images)
-    frames = []
-    for image, (camera, world_from_cam) in zip(images, _views(path, rows), strict=True):
-        camera, world_from_cam = fit_to_picture(camera, world_from_cam, path=image, measure=measure)
+    frames, rescaled = [], []
+    for image, (calibrated, world_from_cam) in zip(images, _views(path, rows), strict=True):
+        camera, world_from_cam = fit_to_picture(calibrated, world_from_cam, path=image, measure=measure)
+        rescaled.append(rescaling(calibrated, camera))
         frames.append(Frame(_name(image), camera, world_from_cam, image=image))
-    return Capture(tuple(frames), np.zeros((0, 3)), (), rows[:, 15:].copy(), "llff")
+    bounds = rows[:, 15:].copy()
+    return Capture(tuple(frames), np.zeros((0, 3)), (), bounds, "llff", pixels="upright", rescaled=counted(rescaled))
 
 
 def parse_llff(folder: Path, list_images: Callable[[Path], list[Path]]) -> Capture:

@@ -7,7 +7,7 @@ Sources: docs.nerf.studio "Data conventions"; instant-ngp docs/nerf_dataset_tips
 import os
 from collections import Counter
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -27,8 +27,8 @@ from nerfcli.cameras.formats.transforms_cameras import (
     lost_to_transforms,
     record_of_camera,
 )
-from nerfcli.cameras.frame import Capture, Frame
-from nerfcli.cameras.orientation import Measure, fit_to_picture, stored_size
+from nerfcli.cameras.frame import Capture, Frame, Size
+from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling, stored_size
 from nerfcli.errors import UserError
 
 SPLITS = ("train", "val", "test")
@@ -51,10 +51,12 @@ def read_transforms(path: Path, measure: Measure) -> Capture:
         UserError: the file is malformed (file and field are named), or none of its images is on disk.
     """
     content = read_json_object(path)
-    frames, missing = frames_on_disk(path, content, measure)
+    found = frames_on_disk(path, content, measure)
     splits = _listed_splits(path, content)
-    frames = [replace(frame, split=splits.get(frame.name)) for frame in frames]
-    return capture_on_disk(path, frames, missing, kind="transforms")
+    frames = [replace(frame, split=splits.get(frame.name)) for frame in found.frames]
+    capture = capture_on_disk(path, replace(found, frames=frames), kind="transforms")
+    points, colours = _points_beside(path, content)
+    return replace(capture, points=points, colours=colours)
 
 
 def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
@@ -76,15 +78,7 @@ def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
     splits = _listed_splits(path, content)
     frames = [replace(frame, split=splits.get(frame.name)) for frame in frames]
     refuse_twins(path, frames)
-    points, colours = np.zeros((0, 3)), None
-    cloud = content.get("ply_file_path")
-    if cloud is not None:
-        if not isinstance(cloud, str) or not cloud:
-            raise malformed(str(path), f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
-        try:
-            points, colours = read_ply_points(path.parent / cloud.replace("\\", "/"))
-        except UserError as error:
-            raise malformed(f"{path}: ply_file_path", error.message, error.hint) from error
+    points, colours = _points_beside(path, content)
     return Capture(tuple(frames), points, (), None, "transforms", colours=colours)
 
 
@@ -159,9 +153,19 @@ def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
     return records
 
 
-def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> tuple[list[Frame], list[str]]:
-    """The frames of a file whose image is on disk, fitted to it, and the names of the other ones."""
-    frames, missing = [], []
+@dataclass(frozen=True)
+class Found:
+    """The frames of a file whose image is on disk, fitted to it, the names of the other ones, and for how many the
+    intrinsics were given for another size (see `Capture.rescaled`)."""
+
+    frames: list[Frame]
+    missing: list[str]
+    rescaled: dict[tuple[Size, Size], int]
+
+
+def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> Found:
+    """The frames of a file whose image is on disk."""
+    frames, missing, rescaled = [], [], []
     records = records_of(path, content)
     poses = _poses(path, records)
     for index, (record, world_from_cam) in enumerate(zip(records, poses, strict=True)):
@@ -172,26 +176,42 @@ def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> tup
             missing.append(_name_of(listed, where))
             continue
         merged = {**content, **record}
-        camera = camera_of_record(merged, given_size(merged, where) or stored_size(image, measure), where)
-        camera, world_from_cam = fit_to_picture(camera, world_from_cam, path=image, measure=measure)
+        calibrated = camera_of_record(merged, given_size(merged, where) or stored_size(image, measure), where)
+        camera, world_from_cam = fit_to_picture(calibrated, world_from_cam, path=image, measure=measure)
+        rescaled.append(rescaling(calibrated, camera))
         mask = _find_mask(path.parent, record.get("mask_path"), where)
         name = _name_of(listed, where, suffix=image.suffix)
         frames.append(Frame(name, camera, world_from_cam, image=image, mask=mask))
-    return frames, missing
+    return Found(frames, missing, counted(rescaled))
 
 
-def capture_on_disk(path: Path, frames: list[Frame], missing: list[str], *, kind: str) -> Capture:
+def capture_on_disk(path: Path, found: Found, *, kind: str) -> Capture:
     """The capture of `frames_on_disk`, if there are any and no two have the same name."""
-    if not frames:
+    if not found.frames:
         raise UserError(
-            f"{path}: none of the {len(missing)} images that it lists is on disk, such as {missing[0]}",
+            f"{path}: none of the {len(found.missing)} images that it lists is on disk, such as {found.missing[0]}",
             "put the images where file_path says, relative to this file",
         )
-    refuse_twins(path, frames)
-    return Capture(tuple(frames), np.zeros((0, 3)), tuple(missing), None, kind)
+    refuse_twins(path, found.frames)
+    return Capture(
+        tuple(found.frames),
+        np.zeros((0, 3)),
+        tuple(found.missing),
+        None,
+        kind,
+        pixels="upright",
+        rescaled=found.rescaled,
+    )
 
 
-def listed_frames(path: Path, content: dict[str, Any], measure: Measure | None, *, suffix: str = "") -> list[Frame]:
+def listed_frames(
+    path: Path,
+    content: dict[str, Any],
+    measure: Measure | None,
+    *,
+    suffix: str = "",
+    images: Path | None = None,
+) -> list[Frame]:
     """All frames of a file as it states them; frames of equal intrinsics share one camera.
 
     Args:
@@ -200,26 +220,30 @@ def listed_frames(path: Path, content: dict[str, Any], measure: Measure | None, 
         measure: tells an image's size where the file does not. Where an image is not on disk either, it has the size
             of the other images if that is one.
         suffix: what the format appends to a file_path without a suffix, where no such image is on disk.
+        images: a folder where images are looked for first: under the paths that the file lists, or their last parts.
     """
     records = records_of(path, content)
     poses = _poses(path, records)
     merged = [{**content, **record} for record in records]
     wheres = [f"{path}: frames[{index}]" for index in range(len(records))]
-    images, names = [], []
+    places, names = [], []
     for index, (record, where) in enumerate(zip(records, wheres, strict=True)):
         # The views of a camera path have no photo.
         listed = _listed_path({"file_path": f"frame_{index:04d}", **record}, where)
         plain = listed.replace("\\", "/")
+        given = None
+        if images is not None:
+            given = _find_image(images, plain) or _find_image(images, PurePosixPath(plain).name)
         ending = ""
         if not PurePosixPath(plain).suffix:
-            found = _find_image(path.parent, listed)
+            found = given or _find_image(path.parent, listed)
             ending = suffix if found is None else found.suffix
         names.append(_name_of(listed, where, suffix=ending))
-        images.append(path.parent / (plain if plain.endswith(ending) else plain + ending))
-    sizes = _sizes(merged, images, wheres, measure=measure)
+        places.append(given or path.parent / (plain if plain.endswith(ending) else plain + ending))
+    sizes = _sizes(merged, places, wheres, measure=measure)
     cameras: dict[Camera, Camera] = {}
     frames = []
-    for record, where, size, name, image, pose in zip(merged, wheres, sizes, names, images, poses, strict=True):
+    for record, where, size, name, image, pose in zip(merged, wheres, sizes, names, places, poses, strict=True):
         camera = camera_of_record(record, size, where)
         mask = record.get("mask_path")
         if mask is not None and (not isinstance(mask, str) or not mask):
@@ -236,7 +260,7 @@ def relative_path(frame: Frame, folder: Path) -> str:
 
 def _seen_from(folder: Path, path: Path) -> str:
     try:
-        return Path(os.path.relpath(path.absolute(), folder.absolute())).as_posix()
+        return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
     except ValueError:  # on another drive
         return path.absolute().as_posix()
 
@@ -325,6 +349,19 @@ def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
     if matrix.shape not in ((4, 4), (3, 4)):
         raise malformed(where, f"transform_matrix has shape {matrix.shape}", "expected 4 rows of 4 numbers")
     return matrix
+
+
+def _points_beside(path: Path, content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points (N, 3) and colours (N, 3) of the PLY file that ply_file_path names; none where it is not given."""
+    cloud = content.get("ply_file_path")
+    if cloud is None:
+        return np.zeros((0, 3)), None
+    if not isinstance(cloud, str) or not cloud:
+        raise malformed(str(path), f"ply_file_path is {cloud!r:.80}", "expected the path of a PLY file as text")
+    try:
+        return read_ply_points(path.parent / cloud.replace("\\", "/"))
+    except UserError as error:
+        raise malformed(f"{path}: ply_file_path", error.message, error.hint) from error
 
 
 def _listed_splits(path: Path, content: dict[str, Any]) -> dict[str, str]:

@@ -1,0 +1,165 @@
+"""Which pixels of photos with an EXIF orientation the cameras of a capture refer to, and turning them to the others.
+
+COLMAP, nerfstudio, instant-ngp and OpenSfM read pixels as they are stored. nerfcli shows photos upright, and its own
+scenes have cameras for that.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Capture, Frame, Observations, Size
+from nerfcli.cameras.orientation import (
+    Measure,
+    counted,
+    fit_to_picture,
+    rescaling,
+    turn_back,
+    turn_to_upright,
+    turned,
+    turned_pixels,
+)
+from nerfcli.errors import UserError
+from nerfcli.media.images import image_size, read_exif
+
+STORED, UPRIGHT = "stored", "upright"
+
+# Photos whose size is looked at for a note, and no more: reading 10,000 headers takes longer than a conversion.
+_MOST_MEASURED = 200
+
+
+@dataclass(frozen=True)
+class Turned:
+    """A capture whose cameras refer to the pixels that were asked for.
+
+    Args:
+        capture: the capture.
+        num_turned: how many cameras were turned with their photos' EXIF orientation.
+        num_unknown: how many photos are not on disk, so that nothing is known of their orientation.
+        masks_left_out: names of frames whose mask does not lie as the turned camera does.
+    """
+
+    capture: Capture
+    num_turned: int = 0
+    num_unknown: int = 0
+    masks_left_out: tuple[str, ...] = ()
+
+
+def measure(path: Path) -> tuple[int, int, int]:
+    """Width and height of a photo as it is shown, and its EXIF orientation."""
+    exif = read_exif(path)
+    return exif.width, exif.height, exif.orientation
+
+
+def measure_upright(path: Path) -> tuple[int, int, int]:
+    """The same for cameras of upright photos: nothing is left to turn."""
+    return (*image_size(path), 1)
+
+
+def measure_of(capture: Capture) -> Measure:
+    """Measures photos as the cameras of a capture need it, to be fitted to the upright photos."""
+    return measure_upright if capture.pixels == UPRIGHT else measure
+
+
+def in_pixels(capture: Capture, pixels: str) -> Turned:
+    """The capture with cameras, poses and observations for stored or upright pixels, at the cameras' own size.
+
+    Frames without a photo on disk are left as they are, and told.
+
+    Raises:
+        UserError: a photo that cannot be read, that is mirrored by its orientation, or that has another shape than its
+            camera.
+    """
+    if capture.pixels == pixels:
+        return Turned(capture)
+    frames, masks_left_out, num_unknown = list(capture.frames), [], 0
+    turns = np.ones(len(frames), dtype=np.int64)
+    for index, frame in enumerate(capture.frames):
+        if frame.image is None or not frame.image.is_file():
+            num_unknown += 1
+            continue
+        orientation = _turn(frame, pixels)
+        if orientation == 1:
+            continue
+        turns[index] = orientation
+        camera, pose = turned(frame.camera, frame.world_from_cam, orientation=orientation)
+        mask = frame.mask
+        if mask is not None and not _fits(mask, camera, frame.camera, pixels):
+            masks_left_out.append(frame.name)
+            mask = None
+        frames[index] = replace(frame, camera=camera, world_from_cam=pose, mask=mask)
+    turned_capture = replace(
+        capture, frames=tuple(frames), observations=_turned_observations(capture, turns), pixels=pixels
+    )
+    return Turned(turned_capture, int((turns != 1).sum()), num_unknown, tuple(masks_left_out))
+
+
+def upright(frame: Frame, measure: Measure) -> Frame:
+    """The frame of the photo on disk as it is shown, of one whose photo may be of another size or lie."""
+    assert frame.image is not None
+    camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measure=measure)
+    return replace(frame, camera=camera, world_from_cam=pose)
+
+
+def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
+    """For how many of the photos on disk the intrinsics are for another size, as `Capture.rescaled`.
+
+    At most 200 photos, spread over the capture, are looked at; those that do not fit their camera are passed over.
+    """
+    chosen = np.unique(np.linspace(0, len(capture.frames) - 1, _MOST_MEASURED).round().astype(int))
+    sizes = []
+    for frame in (capture.frames[index] for index in chosen):
+        if frame.image is None or not frame.image.is_file():
+            continue
+        try:
+            sizes.append(rescaling(frame.camera, upright(frame, measure_of(capture)).camera))
+        except UserError:  # --detect and the commands that use the photos say what is wrong with them
+            continue
+    return counted(sizes)
+
+
+def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | None:
+    """The observations of a capture after the pictures of its frames were turned by orientations (frames,)."""
+    seen = capture.observations
+    if seen is None:
+        return None
+    pixels = seen.pixels.copy()
+    sizes = np.array([(frame.camera.width, frame.camera.height) for frame in capture.frames])
+    for orientation in set(turns.tolist()) - {1}:
+        rows = turns[seen.frame_index] == orientation
+        pixels[rows] = turned_pixels(pixels[rows], sizes[seen.frame_index[rows]], orientation=orientation)
+    return replace(seen, pixels=pixels)
+
+
+def _turn(frame: Frame, pixels: str) -> int:
+    """The EXIF orientation that turns the pixels of a frame's camera into the wanted ones."""
+    assert frame.image is not None
+    width, height, written = measure(frame.image)
+    orientation, size = turn_to_upright(frame.camera, path=frame.image, measure=lambda _: (width, height, written))
+    if pixels == STORED:
+        orientation, size = turn_back(written), (width, height)
+    try:
+        frame.camera.resized(*size)
+    except UserError as error:
+        raise UserError(f"{frame.image}: {error.message}", error.hint) from error
+    return orientation
+
+
+def _fits(mask: Path, camera: Camera, before: Camera, pixels: str) -> bool:
+    """Whether a mask serves after a camera was turned: it lies as the turned picture does, or it lies as the one before
+    where that can be told by its shape, since nerfcli then turns it (`media.masks.read_mask`)."""
+    return _lies_as(mask, camera, before) or (pixels == UPRIGHT and _lies_as(mask, before, camera))
+
+
+def _lies_as(mask: Path, camera: Camera, before: Camera) -> bool:
+    """Whether a mask has the shape of a camera's picture and not that of the one before it was turned."""
+    if not mask.is_file():
+        return False
+    width, height = image_size(mask)
+
+    def off(of: Camera) -> float:
+        return abs(width * of.height - height * of.width)
+
+    return off(camera) < off(before)

@@ -1,0 +1,109 @@
+"""Writing a capture as a scene of nerfcli's own: sparse/0 and scene.json, as `nerfcli poses` leaves them."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from nerfcli import __version__, scene
+from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.frame import Capture
+from nerfcli.errors import UserError
+
+SCENE_FILES = (scene.SCENE_FILE, *(f"{scene.MODEL_FOLDER}/{name}.bin" for name in ("cameras", "images", "points3D")))
+
+
+def losses_scene(capture: Capture) -> tuple[str, ...]:
+    """What of a capture a scene cannot hold.
+
+    The names of photos lead to them from one folder; where they do not, photos get other names. Photos that the capture
+    lists and that have no file are told when the scene is loaded.
+    """
+    _, names = _named(capture)
+    renamed = sum(frame.name != name for frame, name in zip(capture.frames, names, strict=True))
+    return (f"the names of {renamed} photos, which become their paths below one folder",) if renamed else ()
+
+
+def named_for_scene(capture: Capture) -> Capture:
+    """The capture with the names that its photos get in a scene, and the split that a scene has."""
+    _, names = _named(capture)
+    split = _split(dict(zip(names, (frame.split for frame in capture.frames), strict=True)))
+    frames = tuple(
+        replace(frame, name=name, split=split[name]) for frame, name in zip(capture.frames, names, strict=True)
+    )
+    return replace(capture, frames=frames)
+
+
+def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any] | None = None) -> None:
+    """Write a capture, whose cameras are for upright photos, as a scene into a folder.
+
+    Masks are listed one by one. A split that the capture has is kept; else every 8th photo is held out.
+
+    Args:
+        capture: to be written.
+        folder: of the scene.
+        provenance: goes into scene.json, besides the command and the version.
+
+    Raises:
+        UserError: a frame without a photo, no photo on disk, or a folder that cannot be written.
+    """
+    image_folder, _ = _named(capture)
+    if not any(frame.image is not None and frame.image.is_file() for frame in capture.frames):
+        raise UserError(
+            f"none of the {len(capture.frames)} photos is on disk, such as {capture.frames[0].image}",
+            "a scene refers to its photos; say with --images where they are",
+        )
+    capture = named_for_scene(capture)
+    write_colmap_binary(capture, folder / scene.MODEL_FOLDER)
+    bounds = None
+    if capture.depth_bounds is not None:
+        pairs = capture.depth_bounds.tolist()
+        bounds = {frame.name: (near, far) for frame, (near, far) in zip(capture.frames, pairs, strict=True)}
+    scene.save(
+        folder,
+        image_folder=image_folder,
+        provenance={"command": "convert", "from": capture.kind, "nerfcli": __version__, **(provenance or {})},
+        unit=capture.unit,
+        unit_source=capture.unit_source,
+        masks={frame.name: frame.mask for frame in capture.frames if frame.mask is not None},
+        split={frame.name: frame.split for frame in capture.frames},
+        depth_bounds=bounds,
+    )
+
+
+def _split(splits: dict[str, str | None]) -> dict[str, str | None]:
+    """The split of each name: the capture's own where it holds some out, else every 8th name's."""
+    if "test" in splits.values() or "val" in splits.values():
+        return splits
+    held_out = scene.default_split(splits)
+    return {name: "test" if name in held_out else "train" for name in splits}
+
+
+def _named(capture: Capture) -> tuple[Path, list[str]]:
+    """The folder that photos are in or below, and the name of each as seen from there.
+
+    It is the folder from which the frames' own names lead to the photos, where there is one.
+
+    Raises:
+        UserError: a frame without a photo, or photos that no folder has in common.
+    """
+    images = []
+    for frame in capture.frames:
+        if frame.image is None:
+            raise UserError(
+                f"{frame.name} has no photo, and a scene consists of photos",
+                "say with --images where the photos are; views without photos can go to another format",
+            )
+        images.append(os.path.abspath(frame.image))
+    names = [frame.name for frame in capture.frames]
+    first = names[0].split("/")
+    if images[0].replace(os.sep, "/").endswith("/" + names[0]):
+        root = Path(images[0]).parents[len(first) - 1]
+        if all(os.path.normpath(root / name) == image for name, image in zip(names, images, strict=True)):
+            return root, names
+    try:
+        root = Path(os.path.commonpath([os.path.dirname(image) for image in images]))
+    except ValueError as error:  # on several drives
+        raise UserError("the photos are on several drives", "put them into one folder") from error
+    return root, [Path(image).relative_to(root).as_posix() for image in images]

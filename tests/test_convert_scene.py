@@ -1,0 +1,374 @@
+"""Converting to scenes of nerfcli's own: the unit, the split, masks and EXIF-turned photos reach training."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from test_cli import error_of, listing, nerfcli
+from test_convert import LIMIT_PX, farthest_px, npz_of
+from test_scale import photos_of, sheet_of_markers
+from views import BROWN, PINHOLE, PRISM, SQUARE, capture_of
+
+from nerfcli import scene as scenes
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.transforms import write_transforms
+from nerfcli.cameras.frame import Capture
+from nerfcli.convert.conversion import Doubt, Wanted, convert, load
+from nerfcli.convert.formats import Given, format_named
+from nerfcli.convert.pixels import in_pixels
+from nerfcli.convert.scene_folder import write_scene
+from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
+from nerfcli.media.images import read_image
+
+USAGE = 2
+# Upright from stored, with OpenCV: what EXIF 2.32 says of tag 0x0112.
+TURNS = {1: None, 3: cv2.ROTATE_180, 6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
+
+
+def photographed(capture: Capture, folder: Path, orientations: dict[int, int] | None = None) -> Capture:
+    """The capture with photos on disk, some with an EXIF orientation; the cameras are for the pixels as stored."""
+    frames = []
+    for index, frame in enumerate(capture.frames):
+        exif = Image.Exif()
+        exif[0x0112] = (orientations or {}).get(index, 1)
+        path = folder / frame.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (frame.camera.width, frame.camera.height)).save(path, exif=exif)
+        frames.append(replace(frame, image=path))
+    return replace(capture, frames=tuple(frames))
+
+
+def masked(capture: Capture, folder: Path, *indices: int) -> Capture:
+    folder.mkdir(parents=True)
+    frames = list(capture.frames)
+    for index in indices:
+        camera = frames[index].camera
+        mask = folder / f"mask of {index}.png"
+        Image.new("L", (camera.width, camera.height), 255).save(mask)
+        frames[index] = replace(frames[index], mask=mask)
+    return replace(capture, frames=tuple(frames))
+
+
+def split_into(capture: Capture, *splits: str | None) -> Capture:
+    return replace(
+        capture, frames=tuple(replace(f, split=split) for f, split in zip(capture.frames, splits, strict=True))
+    )
+
+
+def seen_upright(capture: Capture, index: int, orientation: int) -> np.ndarray:
+    """Where the stored photo of a frame shows the points, found in the photo that OpenCV turned upright."""
+    frame = capture.frames[index]
+    pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points))
+    assert valid.all()
+    turned = []
+    for x, y in pixels:
+        # Four weighted pixels whose centre of mass is (x, y), turned with the picture.
+        stored = np.zeros((frame.camera.height, frame.camera.width), np.float64)
+        column, row = int(x - 0.5), int(y - 0.5)
+        u, v = x - 0.5 - column, y - 0.5 - row
+        stored[row : row + 2, column : column + 2] = np.outer([1 - v, v], [1 - u, u])
+        upright = stored if TURNS[orientation] is None else cv2.rotate(stored, TURNS[orientation])
+        rows, columns = np.nonzero(upright)
+        weights = upright[rows, columns]
+        turned.append(((columns + 0.5) @ weights, (rows + 0.5) @ weights))
+    return np.array(turned)
+
+
+def test_a_known_distance_reaches_training_as_metres(tmp_path):
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "photos")
+    first, second = capture.frames[:2]
+    source = npz_of(tmp_path, capture)
+    known = f'"{first.name}" "{second.name}" 2.5'
+    before = listing(tmp_path)
+    result = nerfcli("convert", source, tmp_path / "my scene", "--to", "nerfcli", "--distance", known, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert {name: data for name, data in listing(tmp_path).items() if "my scene" not in name} == before
+    scene = scenes.load(tmp_path / "my scene")
+    assert (scene.kind, scene.unit, scene.unit_source) == ("nerfcli", "metre", "1 known distance")
+    assert scene.test_names == {first.name}
+    assert scene.frames[0].image == tmp_path / "photos" / first.name
+    assert np.linalg.norm(scene.frames[0].centre - scene.frames[1].centre) == pytest.approx(2.5, rel=1e-12)
+    content = json.loads((tmp_path / "my scene" / "scene.json").read_text())
+    assert content["image_folder"] == "../photos"
+    scale = content["provenance"]["new_from_old"]["scale"]
+    np.testing.assert_allclose(scene.points, scale * capture.points, rtol=0, atol=1e-12)
+    assert "the unit (metre)" in json.loads(result.stdout)["verification"]["same"]
+    assert json.loads(nerfcli("info", tmp_path / "my scene", "--json").stdout)["unit"] == "metre"
+    # And from there to every format that knows units, and back with the source.
+    assert nerfcli("convert", tmp_path / "my scene", tmp_path / "again.npz", "--to", "npz").exit_code == 0
+    again = load(tmp_path / "again.npz", Given(), Doubt())[2]
+    assert (again.unit, again.unit_source, again.pixels) == ("metre", "1 known distance", "upright")
+
+
+@pytest.mark.parametrize("camera", [BROWN, PRISM], ids=lambda camera: camera.model)
+def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
+    """Projections into the stored pictures, which OpenCV turns, against the cameras that training loads."""
+    orientations = {0: 6, 1: 3, 2: 8}
+    capture = photographed(capture_of([camera], num_points=12), tmp_path / "images", orientations)
+    assert nerfcli("convert", npz_of(tmp_path, capture), tmp_path / "sparse/0", "--to", "colmap").exit_code == 0
+    result = nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
+    assert result.exit_code == 0, result.stderr
+    assert "3 photos have an EXIF orientation: their cameras refer to the pixels upright" in result.stderr
+    scene = scenes.load(tmp_path / "scene")
+    _, _, parsed = load(tmp_path / "scene", Given(), Doubt())
+    assert parsed.observations is not None
+    for index, frame in enumerate(scene.frames):
+        assert frame.image is not None
+        assert read_image(frame.image).shape[:2] == (frame.camera.height, frame.camera.width)
+        pixels, _ = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), capture.points))
+        expected = seen_upright(capture, index, orientations.get(index, 1))
+        np.testing.assert_allclose(pixels, expected, rtol=0, atol=1e-8)
+        rows = parsed.observations.frame_index == index
+        seen = parsed.observations.point_index[rows]
+        np.testing.assert_allclose(parsed.observations.pixels[rows], expected[seen], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("form", "place"),
+    [
+        ("colmap", "sparse/0"),
+        ("colmap-text", "sparse/0"),
+        ("transforms", "transforms.json"),
+        ("npz", "out.npz"),
+        ("opensfm", "reconstruction.json"),
+    ],
+)
+def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, place, tmp_path):
+    """From stored to upright and back nothing moves, and what training reads of the result is what was trained on."""
+    capture = capture_of([BROWN])
+    named = tuple(replace(f, name=f.name.replace(" ", "_")) for f in capture.frames)
+    capture = photographed(replace(capture, frames=named, colours=None), tmp_path / "images", {0: 6, 1: 3, 2: 8})
+    upright = in_pixels(capture, "upright").capture
+    write_scene(upright, tmp_path / "scene")
+    options = ("--pixels", "stored", "--allow-loss")
+    result = nerfcli("convert", tmp_path / "scene", tmp_path / place, "--to", form, *options)
+    assert result.exit_code == 0, result.stderr
+    assert "3 photos have an EXIF orientation: their cameras refer to the pixels as stored" in result.stderr
+    assert farthest_px(capture, load(tmp_path / place, Given(), Doubt())[2]) < LIMIT_PX
+    if form in ("colmap", "colmap-text", "transforms"):
+        trained = scenes.load(tmp_path)
+        assert trained.kind == form.removesuffix("-text")
+        assert farthest_px(upright, replace(upright, frames=trained.frames)) < LIMIT_PX
+
+
+def test_which_pixels_can_be_chosen(tmp_path):
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6})
+    write_scene(in_pixels(capture, "upright").capture, tmp_path / "scene")
+    out = tmp_path / "out.npz"
+    assert nerfcli("convert", tmp_path / "scene", out, "--to", "npz").exit_code == 0
+    assert load(out, Given(), Doubt())[2].pixels == "upright"  # it can say so
+    options = ("--to", "colmap", "--pixels", "upright", "--allow-loss")
+    assert nerfcli("convert", tmp_path / "scene", tmp_path / "out", *options).exit_code == 0
+    assert load(tmp_path / "out", Given(), Doubt())[2].frames[0].camera.width == PINHOLE.height
+    assert nerfcli("convert", out, tmp_path / "2", "--to", "nerfcli", "--pixels", "stored").exit_code == USAGE
+    assert nerfcli("convert", out, tmp_path / "2", "--to", "nerfcli", "--pixels", "lying").exit_code == USAGE
+
+
+def test_markers_are_sought_in_photos_as_the_scene_shows_them(tmp_path):
+    """Half a turn is what a camera's shape does not tell: a scene's cameras must not be turned once more."""
+    frames = photos_of(tmp_path, sheet_of_markers([3, 17], 120), per_unit=120 / 0.7)
+    for frame in frames:
+        assert frame.image is not None
+        pixels = read_image(frame.image)
+        exif = Image.Exif()
+        exif[0x0112] = 3
+        Image.fromarray(pixels[::-1, ::-1]).save(frame.image, exif=exif)
+    capture = Capture(tuple(frames), np.zeros((0, 3)), (), None, "npz", pixels="upright")
+    write_scene(capture, tmp_path / "scene")
+    options = ("--to", "npz", "--markers", "DICT_4X4_50:0.05", "--json")
+    result = nerfcli("convert", tmp_path / "scene", tmp_path / "out.npz", *options)
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["new_from_old"]["scale"] == pytest.approx(0.05 / 0.7, rel=1e-4)
+
+
+# What stands beside the cameras
+
+
+@pytest.mark.parametrize(
+    ("splits", "test", "train"),
+    [
+        ((None,) * 6, (0,), (1, 2, 3, 4, 5)),
+        (("train", "test", "train", "test", "train", "train"), (1, 3), (0, 2, 4, 5)),
+        (("train", "test", "val", "val", "train", None), (1,), (0, 4)),
+        (("train", "val", "train", "val", "train", None), (1, 3), (0, 2, 4)),
+    ],
+)
+def test_a_split_is_kept_and_else_every_eighth_photo_is_held_out(splits, test, train, tmp_path):
+    capture = split_into(photographed(capture_of([PINHOLE]), tmp_path / "images"), *splits)
+    result = nerfcli("convert", npz_of(tmp_path, capture), tmp_path / "scene", "--to", "nerfcli")
+    assert result.exit_code == 0, result.stderr
+    scene = scenes.load(tmp_path / "scene")
+    names = [frame.name for frame in capture.frames]
+    assert [frame.name for frame in scene.test_frames] == [names[i] for i in test]
+    assert [frame.name for frame in scene.train_frames] == [names[i] for i in train]
+    _, _, again = load(tmp_path / "scene", Given(), Doubt())
+    expected = splits if any(splits) else tuple("test" if i in test else "train" for i in range(6))
+    assert tuple(frame.split for frame in again.frames) == expected
+
+
+def test_masks_and_depth_bounds_of_any_layout_are_kept(tmp_path):
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
+    capture = masked(capture, tmp_path / "some" / "masks", 1, 4)
+    bounds = np.array([(1.0 + index, 9.0) for index in range(6)])
+    source = npz_of(tmp_path, replace(capture, depth_bounds=bounds))
+    result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
+    assert result.exit_code == 0, result.stderr
+    assert "2 masks" in result.stderr
+    scene = scenes.load(tmp_path / "scene")
+    assert [f.mask for f in scene.frames] == [f.mask for f in capture.frames]
+    np.testing.assert_array_equal(scene.depth_bounds, bounds)
+    assert capture.frames[4].mask is not None
+    capture.frames[4].mask.unlink()
+    with pytest.raises(UserError, match=r"the mask of photo 04\.png, is not there"):
+        scenes.load(tmp_path / "scene")
+
+
+def test_a_mask_that_lies_otherwise_is_a_loss(tmp_path):
+    """Training turns masks of the stored pixels where their shape tells how they lie; of half a turn it does not."""
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6, 1: 3})
+    source = npz_of(tmp_path, masked(capture, tmp_path / "masks", 0, 1, 2))
+    refused = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
+    assert refused.exit_code == BAD_INPUT
+    assert "1 masks of photos with an EXIF orientation" in error_of(refused)[0]
+    assert nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--allow-loss").exit_code == 0
+    frames = scenes.load(tmp_path / "scene").frames
+    assert [frame.mask is not None for frame in frames] == [True, False, True, False, False, False]
+
+
+def test_photos_in_several_folders_get_their_paths_for_names(tmp_path):
+    capture = capture_of([PINHOLE])
+    frames = photographed(capture, tmp_path / "a").frames[:3] + photographed(capture, tmp_path / "b").frames[3:]
+    source = npz_of(tmp_path, replace(capture, frames=frames))
+    refused = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
+    assert "the names of 6 photos, which become their paths below one folder" in error_of(refused)[0]
+    result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--allow-loss")
+    assert result.exit_code == 0, result.stderr
+    assert [frame.name for frame in scenes.load(tmp_path / "scene").frames][2:4] == ["a/photo 02.png", "b/photo 03.png"]
+
+
+def test_views_without_photos_make_no_scene(tmp_path):
+    capture = capture_of([PINHOLE])
+    before = {*listing(tmp_path), "in.npz"}
+    source = npz_of(tmp_path, capture)
+    result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
+    assert "photo 00.png has no photo" in error_of(result)[0]
+    gone = replace(capture, frames=tuple(replace(f, image=tmp_path / "gone" / f.name) for f in capture.frames))
+    source = npz_of(tmp_path, gone)
+    result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
+    assert result.exit_code == BAD_INPUT
+    assert "none of the 6 photos is on disk" in error_of(result)[0]
+    assert set(listing(tmp_path)) == before
+    assert not (tmp_path / "scene").exists()
+
+
+def test_a_scene_is_replaced_only_when_asked_and_after_a_fault_stands_again(tmp_path, monkeypatch):
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "images")
+    source = npz_of(tmp_path, capture)
+    assert nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli").exit_code == 0
+    before = listing(tmp_path)
+    again = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--scale", "2")
+    assert again.exit_code == BAD_INPUT
+    assert "scene.json exists" in error_of(again)[0]
+    wrong = scenes.save
+    monkeypatch.setattr(
+        scenes,
+        "save",
+        lambda folder, **options: wrong(folder, **{**options, "unit": "metre", "unit_source": "a guess"}),
+    )
+    fault = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--overwrite")
+    assert fault.exit_code == GATE_NOT_MET
+    assert "its unit is metre, not arbitrary" in error_of(fault)[0]
+    assert listing(tmp_path) == before
+    elsewhere = nerfcli("convert", source, tmp_path / "other" / "scene", "--to", "nerfcli")
+    assert elsewhere.exit_code == GATE_NOT_MET
+    assert not (tmp_path / "other").exists()
+    monkeypatch.undo()
+    # A scene can be given its scale in place.
+    known = ("--distance", '"photo 00.png" "photo 01.png" 1.5')
+    place = tmp_path / "scene"
+    assert nerfcli("convert", place, place, "--to", "nerfcli", "--overwrite", *known).exit_code == 0
+    assert scenes.load(place).unit == "metre"
+
+
+# Faults in what is not geometry
+
+
+@pytest.mark.parametrize(
+    ("form", "fault", "told"),
+    [
+        ("colmap", {"colours": "other"}, "points have another colour"),
+        ("transforms", {"colours": "other"}, "points have another colour"),
+        ("ply", {"colours": "other"}, "its colours differ"),
+        ("colmap", {"observations": "moved"}, "the observations of photo 00.png differ"),
+        ("npz", {"observations": "other"}, "the observations of photo 00.png differ"),
+        ("nerfcli", {"observations": "none"}, "the observations of photo 00.png differ"),
+        ("transforms", {"masks": "none"}, "photo 01.png has a mask in one and none in the other"),
+        ("npz", {"masks": "other"}, "the mask of photo 01.png would be"),
+        ("transforms", {"splits": "other"}, "photo 00.png is of test and became train"),
+        ("nerfcli", {"splits": "other"}, "photo 00.png is of test and became train"),
+        ("llff", {"bounds": "other"}, "its depth bounds differ"),
+        ("npz", {"unit": "other"}, "its unit is arbitrary, not metre"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and " " not in value else "",
+)
+def test_what_stands_beside_the_cameras_is_compared(form, fault, told, tmp_path):
+    capture = masked(photographed(capture_of([SQUARE]), tmp_path / "images"), tmp_path / "masks", 1)
+    capture = split_into(capture, "test", *["train"] * 5)
+    bounds = np.array([(1.0, 9.0)] * 6)
+    capture = replace(capture, depth_bounds=bounds, unit="metre")
+    assert capture.colours is not None
+    assert capture.observations is not None
+    seen = capture.observations
+    other_mask = replace(capture.frames[1], mask=tmp_path / "masks" / "of another.png")
+    wrong = {
+        "colours": {"other": {"colours": capture.colours[::-1]}},
+        "observations": {
+            "moved": {"observations": replace(seen, pixels=seen.pixels + 1e-3)},
+            "other": {"observations": replace(seen, point_index=seen.point_index[::-1])},
+            "none": {"observations": None},
+        },
+        "masks": {
+            "none": {"frames": tuple(replace(f, mask=None) for f in capture.frames)},
+            "other": {"frames": (capture.frames[0], other_mask, *capture.frames[2:])},
+        },
+        "splits": {"other": {"frames": split_into(capture, "train", "test", *["train"] * 4).frames}},
+        "bounds": {"other": {"depth_bounds": 2 * bounds}},
+        "unit": {"other": {"unit": "arbitrary"}},
+    }
+    ((part, kind),) = fault.items()
+    right = format_named(form)
+    write = right.write
+    assert write is not None
+    spoiled = replace(right, write=lambda c, path: write(replace(c, **wrong[part][kind]), path))
+    with pytest.raises(UserError, match=told) as caught:
+        convert(capture, tmp_path / "out", source_format="made", wanted=Wanted(spoiled, allow_loss=True))
+    assert caught.value.exit_code == GATE_NOT_MET
+    done = convert(capture, tmp_path / "out", source_format="made", wanted=Wanted(right, allow_loss=True))
+    assert done.verification is not None
+    assert done.verification.holds
+
+
+# Intrinsics for another size
+
+
+@pytest.mark.parametrize("command", ["info", "convert", "train"])
+def test_intrinsics_for_another_size_are_told_once(command, tmp_path):
+    capture = photographed(capture_of([PINHOLE]), tmp_path / "images", {0: 6})
+    double = Camera("PINHOLE", 1280, 960, tuple(2 * value for value in PINHOLE.params))
+    frames = tuple(replace(frame, camera=double) for frame in capture.frames)
+    write_transforms(
+        replace(capture, frames=frames, points=np.zeros((0, 3)), colours=None), tmp_path / "transforms.json"
+    )
+    if command == "info":
+        said = " ".join(json.loads(nerfcli("info", tmp_path, "--json").stdout)["rescaled"])
+    elif command == "train":
+        said = nerfcli("train", tmp_path, "--resume", "-o", tmp_path / "run").stderr  # it ends for want of a run
+    else:
+        said = nerfcli("convert", tmp_path, tmp_path / "out", "--to", "colmap").stderr
+    assert said.count("5 photos are 640x480, and the intrinsics are given for 1280x960") == 1
+    assert said.count("1 photo is 480x640, and the intrinsics are given for 960x1280") == 1
