@@ -68,10 +68,15 @@ def register_photos(job: Job) -> None:
 
 
 def camera_of_group(group: CameraGroup, job: Job) -> pycolmap.Camera:
-    """Camera model of a group, and its focal length if EXIF tells it.
+    """Camera model of a group, and its intrinsics if they are given, or the focal length if EXIF tells it.
 
     EXIF is read from the original: an upright copy has none. Lying or upright, the focal length in pixels is the same.
     """
+    if group.params is not None:
+        camera = pycolmap.Camera.create_from_model_name(1, group.model, 1.0, group.width, group.height)
+        camera.params = list(group.params)
+        camera.has_prior_focal_length = True
+        return camera
     focal_px = 1.2 * max(group.width, group.height)
     known = False
     try:

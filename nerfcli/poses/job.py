@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 # Told (stage, done, total) as the work goes on.
 Report = Callable[[str, int, int], None]
@@ -11,12 +12,19 @@ Report = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """Photos (by number) that share one camera: its COLMAP model and the upright size."""
+    """Photos (by number) that share one camera: its COLMAP model and the upright size.
+
+    choose: whether the model is only where to start, and a better one may be chosen. params: what is known of the
+    intrinsics, in COLMAP's order. fixed: whether they stay as they are.
+    """
 
     photos: tuple[int, ...]
     model: str
     width: int
     height: int
+    choose: bool = False
+    params: tuple[float, ...] | None = None
+    fixed: bool = False
 
 
 @dataclass(frozen=True)
@@ -88,9 +96,15 @@ def write_job(path: Path, job: Job) -> None:
 def read_job(path: Path) -> Job:
     """A job that `write_job` wrote."""
     content = json.loads(path.read_text(encoding="utf-8"))
-    content["groups"] = tuple(CameraGroup(**group | {"photos": tuple(group["photos"])}) for group in content["groups"])
+    content["groups"] = tuple(_group(group) for group in content["groups"])
     content["pairs"] = tuple((i, j) for i, j in content["pairs"])
     for name in ("files", "names", "keys"):
         content[name] = tuple(content[name])
     content["masks"] = tuple(LaidOutMask(**mask) for mask in content["masks"])
     return Job(**content)
+
+
+def _group(content: dict[str, Any]) -> CameraGroup:
+    params = content["params"]
+    lists = {"photos": tuple(content["photos"]), "params": None if params is None else tuple(params)}
+    return CameraGroup(**content | lists)

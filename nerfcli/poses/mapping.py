@@ -1,80 +1,25 @@
-"""From matches to a model: incremental mapping with second chances, the principal point, COLMAP files."""
+"""From matches to a model: one run of the incremental mapper, and COLMAP files."""
 
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-from nerfcli.poses.database import evidence
-from nerfcli.poses.features import match
 from nerfcli.poses.job import Job, Report
-from nerfcli.poses.pairs import all_pairs
-from nerfcli.poses.reasons import FEW_FEATURES, FEW_MATCHES
-
-# Registered shares below which the mapper gets another chance; a photo or two missing is often the photo's own fault.
-_GOOD_SHARE = 0.9
-# A principal point farther than this from the centre, as a share of the size, is a fit to noise.
-_PRINCIPAL_POINT_RANGE = 0.05
-_PRINCIPAL_POINT_MIN_PHOTOS = 30
-# Two more unknowns among thousands of observations lower the error by less than this if they fit nothing but noise.
-_PRINCIPAL_POINT_GAIN = 0.001
+from nerfcli.poses.reasons import FEW_MATCHES
 
 
-def reconstruct(job: Job, report: Report) -> tuple[list[pycolmap.Reconstruction], list[dict[str, Any]]]:
-    """The models of the best attempt, largest first, and what each attempt gave.
+@dataclass(frozen=True)
+class Start:
+    """How the mapper begins and what it accepts: pycolmap's names and defaults; init_pair holds image ids."""
 
-    The first attempt has pycolmap's own thresholds. If it leaves out many photos that match some other one well, the
-    next one starts from a pair with a smaller baseline. If photos are still missing, and not all pairs were compared,
-    the rest is compared before the last attempt.
-    """
-    attempts: list[dict[str, Any]] = []
-    best: list[pycolmap.Reconstruction] = []
-
-    def attempt(what: str, **start: float) -> None:
-        nonlocal best
-        models = _map(job, report, attempt=len(attempts), **start)
-        attempts.append({"what": what, "models": [model.num_reg_images() for model in models]})
-        if models and (not best or models[0].num_reg_images() > best[0].num_reg_images()):
-            best = models
-
-    def enough(photos: list[dict[str, Any]]) -> bool:
-        return bool(best) and best[0].num_reg_images() >= _GOOD_SHARE * len(photos)
-
-    attempt("default thresholds")
-    found = evidence(job)
-    if not enough([photo for photo in found if photo["best_matches"] >= FEW_MATCHES]):
-        attempt("start from a smaller baseline", init_min_tri_angle=8.0, init_min_num_inliers=50)
-    compared = set(job.pairs)
-    rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
-    if rest and not enough([photo for photo in found if photo["features"] >= FEW_FEATURES]):
-        match(job, rest, report)
-        attempt("every pair compared")
-    return best, attempts
-
-
-def refine_principal_point(model: pycolmap.Reconstruction, threads: int) -> pycolmap.Reconstruction:
-    """The model after a bundle adjustment with free principal points, or as it was where that does not pay.
-
-    It pays if there are 30 photos or more, the mean reprojection error falls by a thousandth, and no principal point
-    is farther than a twentieth of the size from the centre.
-    """
-    if model.num_reg_images() < _PRINCIPAL_POINT_MIN_PHOTOS:
-        return model
-    refined = pycolmap.Reconstruction(model)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = True
-    options.print_summary = False
-    options.ceres.solver_options.num_threads = threads
-    pycolmap.bundle_adjustment(refined, options)
-    refined.update_point_3d_errors()
-    before, after = (m.compute_mean_reprojection_error() for m in (model, refined))
-    centred = all(
-        abs(camera.principal_point_x / camera.width - 0.5) < _PRINCIPAL_POINT_RANGE
-        and abs(camera.principal_point_y / camera.height - 0.5) < _PRINCIPAL_POINT_RANGE
-        for camera in refined.cameras.values()
-    )
-    return refined if centred and after < (1 - _PRINCIPAL_POINT_GAIN) * before else model
+    init_min_tri_angle: float = 16.0
+    init_min_num_inliers: int = 100
+    init_max_forward_motion: float = 0.95
+    filter_min_tri_angle: float = 1.5
+    init_pair: tuple[int, int] | None = None
 
 
 def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
@@ -112,10 +57,10 @@ def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
     model.write_binary(str(folder))
 
 
-def _map(
-    job: Job, report: Report, *, attempt: int, init_min_tri_angle: float = 16.0, init_min_num_inliers: float = 100
+def map_photos(
+    job: Job, report: Report, *, attempt: int, start: Start, base: pycolmap.Reconstruction | None = None
 ) -> list[pycolmap.Reconstruction]:
-    """One run of the incremental mapper; its models, largest first, errors filled in."""
+    """One run of the incremental mapper, from nothing or from a model; its models, largest first, errors filled in."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = job.threads
     seed = job.seed + attempt
@@ -124,11 +69,22 @@ def _map(
     options.triangulation.random_seed = seed
     # Small captures are no less whole; what is the largest is decided below.
     options.min_model_size = 3
-    options.mapper.init_min_tri_angle = init_min_tri_angle
-    options.mapper.init_min_num_inliers = int(init_min_num_inliers)
+    options.constant_cameras = {number for number, group in enumerate(job.groups, start=1) if group.fixed}
+    options.mapper.constant_cameras = options.constant_cameras
+    options.mapper.init_min_tri_angle = start.init_min_tri_angle
+    options.mapper.init_min_num_inliers = start.init_min_num_inliers
+    options.mapper.init_max_forward_motion = start.init_max_forward_motion
+    options.mapper.filter_min_tri_angle = start.filter_min_tri_angle
     options.mapper.abs_pose_min_num_inliers = FEW_MATCHES
-    output = Path(job.folder) / f"models_{attempt}"
+    if start.init_pair:
+        options.init_image_id1, options.init_image_id2 = start.init_pair
+    output = Path(job.folder) / f"{job.rung}models_{attempt}"
     output.mkdir(exist_ok=True)
+    base_folder = ""
+    if base is not None:
+        base_folder = str(output / "base")
+        (output / "base").mkdir(exist_ok=True)
+        base.write(base_folder)
     placed = 0
 
     def started() -> None:
@@ -146,6 +102,7 @@ def _map(
         str(job.photos),
         str(output),
         options=options,
+        input_path=base_folder,
         initial_image_pair_callback=started,
         next_image_callback=placed_one,
     )

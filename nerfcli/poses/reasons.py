@@ -40,6 +40,7 @@ _ADVICE = {
     "too few features": "take sharper photos of a textured scene",
     "matches no other photo well": "take photos with more overlap, two thirds from one to the next",
     "in another model": "take photos that join the parts of the scene",
+    "contradicts the rest": "take photos with more overlap around this one, or leave it away",
     "rejected by the mapper": "take photos with more overlap and while moving sideways, or allow more features",
 }
 

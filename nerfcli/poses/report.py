@@ -1,8 +1,9 @@
 """What became of each photo: the content of poses_report.json."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import nerfcli
@@ -11,22 +12,34 @@ from nerfcli.poses.photos import MIN_PHOTOS, Photos
 from nerfcli.poses.reasons import Evidence, dominant, reason
 from nerfcli.poses.settings import PoseSettings
 
+# Photos in other parts than the largest, as a share of all, from which on that is what is wrong with the capture.
+_MUCH_APART = 0.3
+
 
 @dataclass(frozen=True)
 class ImageReport:
-    """A photo, whether it was registered, and if not why."""
+    """A photo, whether it was registered, and if not why.
+
+    orientation: the EXIF orientation (1...8) that was applied before anything else; the camera is that of the upright
+    picture. pose_blur_px: how far a typical point moves in it by one standard deviation of its pose.
+    """
 
     name: str
     registered: bool
     reason: str | None
+    orientation: int | None = None
+    pose_blur_px: float | None = None
 
 
 @dataclass(frozen=True)
 class PosesReport:
     """What `poses_report.json` holds, under the same names.
 
+    verdict: whether the result is believed, why not, and all that was measured (see `acceptance`). pose_blur_px:
+    median, largest, and the photo that has it. lenses: the lens models that were tried for each camera, with held-out
+    errors. parts: sizes of the groups of photos that matches hold together.
     seconds: per stage, of the call that wrote the report; what an earlier one left is not in them. models: the sizes of
-    all models found, the kept one first. attempts: what each run of the mapper gave. matching: the rule for pairs, and
+    all models found, the kept one first. attempts: what each rung of the ladder gave. matching: the rule for pairs, and
     their number. points: how many the kept model has.
     """
 
@@ -35,7 +48,6 @@ class PosesReport:
     seconds: dict[str, float]
     images: tuple[ImageReport, ...]
     mean_reprojection_error_px: float
-    principal_point_refined: bool
     points: int
     cameras: tuple[dict[str, Any], ...]
     models: tuple[int, ...]
@@ -43,6 +55,10 @@ class PosesReport:
     matching: dict[str, Any]
     settings: PoseSettings
     versions: dict[str, str]
+    verdict: dict[str, Any]
+    pose_blur_px: dict[str, Any] | None
+    lenses: tuple[dict[str, Any], ...]
+    parts: tuple[int, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and dictionaries."""
@@ -55,20 +71,22 @@ def make_report(
     """Put what the worker found into words."""
     models: list[list[int]] = result["models"]
     images = {name: ImageReport(name, False, f"unreadable: {why}") for name, why in photos.unreadable.items()}
-    for number, name in enumerate(photos.names):
+    blur: dict[str, float] = result["pose_blur_px"]
+    for number, photo in enumerate(photos.photos):
+        name, orientation = photo.name, photo.exif.orientation
         if models and number in models[0]:
-            images[name] = ImageReport(name, True, None)
+            images[name] = ImageReport(name, True, None, orientation, blur.get(str(number)))
         else:
             elsewhere = max((len(model) for model in models[1:] if number in model), default=0)
             known = Evidence(**result["evidence"][number], other_model_size=elsewhere)
-            images[name] = ImageReport(name, False, reason(known))
+            why = result["left_out"].get(str(number)) or reason(known)
+            images[name] = ImageReport(name, False, why, orientation)
     return PosesReport(
         registered=len(models[0]) if models else 0,
         total=len(images),
         seconds=result["seconds"],
         images=tuple(images[name] for name in sorted(images)),
         mean_reprojection_error_px=result.get("mean_reprojection_error_px", 0.0),
-        principal_point_refined=result.get("principal_point_refined", False),
         points=result.get("points", 0),
         cameras=tuple(result.get("cameras", ())),
         models=tuple(len(model) for model in models),
@@ -76,19 +94,36 @@ def make_report(
         matching=matching,
         settings=settings,
         versions={"nerfcli": nerfcli.__version__, **result["versions"]},
+        verdict=result["verdict"],
+        pose_blur_px=_blur_summary(images.values()),
+        lenses=tuple(result.get("lenses", ())),
+        parts=tuple(result["parts"]),
     )
 
 
-def require_enough(report: PosesReport, photos_dir: Path) -> None:
-    """Refuse a result with too few photos.
+def _blur_summary(images: Iterable[ImageReport]) -> dict[str, Any] | None:
+    blurs = sorted((image.pose_blur_px, image.name) for image in images if image.pose_blur_px is not None)
+    if not blurs:
+        return None
+    return {"median": median(px for px, _ in blurs), "largest": blurs[-1][0], "photo": blurs[-1][1]}
 
-    Raises:
-        UserError: exit code 4, with the reason that most of the others share.
-    """
-    if report.registered >= max(MIN_PHOTOS, report.settings.min_registered * report.total):
-        return
+
+def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
+    """Why a result is refused, exit code 4: the evidence against it, or the reason that most missing photos share."""
+    failures = report.verdict["failures"]
+    enough = report.registered >= max(MIN_PHOTOS, report.settings.min_registered * report.total)
+    if failures and (enough or "baseline" in failures[0]["kind"]):
+        first = failures[0]
+        text = f"the poses of {photos_dir} are not to be trusted: {first['kind']}: {first['evidence']}"
+        return UserError(text, first["advice"], TOO_FEW_PHOTOS)
+    if enough:
+        return None
+    placed = f"only {report.registered} of {report.total} photos could be placed ({photos_dir})"
+    if sum(report.parts[1:]) > _MUCH_APART * report.total:
+        sizes = " + ".join(str(size) for size in report.parts)
+        text = f"{placed}: they fall into parts of {sizes} photos that share no matches (disconnected)"
+        return UserError(text, "take photos that join the parts, or give each part by itself", TOO_FEW_PHOTOS)
     reasons = [image.reason for image in report.images if image.reason]
     kind, advice = dominant(reasons)
     example = next(text for text in reasons if text.startswith(kind))
-    placed = f"only {report.registered} of {report.total} photos could be placed ({photos_dir})"
-    raise UserError(f"{placed}; most of the others: {example}", advice, TOO_FEW_PHOTOS)
+    return UserError(f"{placed}; most of the others: {example}", advice, TOO_FEW_PHOTOS)

@@ -16,22 +16,18 @@ from typing import Any
 from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.errors import UserError
-from nerfcli.media.images import list_images
+from nerfcli.media.images import Exif, list_images
+from nerfcli.poses.intrinsics import START_FISHEYE, START_MODEL
 from nerfcli.poses.job import CameraGroup, Job, write_job
 from nerfcli.poses.layout import lay_out
 from nerfcli.poses.masks import lay_out_masks
 from nerfcli.poses.pairs import Pairing, choose_pairs
-from nerfcli.poses.pairs_file import read_pairs
 from nerfcli.poses.photos import Photo, Photos, camera_groups, find_photos
 from nerfcli.poses.plan import Plan, make_plan
-from nerfcli.poses.report import PosesReport, make_report, require_enough
+from nerfcli.poses.report import PosesReport, make_report, refusal
 from nerfcli.poses.settings import Limits, PoseSettings, check_settings
-from nerfcli.poses.stages import file_key
 from nerfcli.poses.supervise import run_worker
 from nerfcli.poses.workspace import is_in_the_making, publish, workspace
-
-# From this many photos in a group on, OPENCV's eight intrinsics are well held; below, SIMPLE_RADIAL's four are.
-_OPENCV_FROM = 20
 
 
 def estimate_poses(
@@ -42,7 +38,6 @@ def estimate_poses(
     notify: Callable[[str], None],
     progress: Callable[[str, int, int], None],
     limits: Limits = Limits(),
-    planned: Callable[[Plan], None] = lambda plan: None,
 ) -> PosesReport:
     """Estimate where the photos of a folder were taken, and write a scene.
 
@@ -55,22 +50,22 @@ def estimate_poses(
         scene_dir: the folder to write.
         settings: see `PoseSettings`.
         notify: told what the user should know, one sentence at a time.
-        progress: told (stage, done, total); the stages are "read", "extract", "pair" where look-alikes are sought,
-            "match" and "map", in this order.
+        progress: told (stage, done, total); the stages are "read", "extract", "match", "map" and "check", in this
+            order.
         limits: see `Limits`.
-        planned: told the plan before the long work starts.
 
     Raises:
         ValueError: a setting is out of its range.
-        UserError: the photos are too few or cannot be read, too few of them could be placed (exit code 4), the
-            scene cannot be written, another process is at work on it, a limit was reached, or pycolmap died.
+        UserError: the photos are too few or cannot be read, too few of them could be placed or the evidence speaks
+            against the result (exit code 4), the scene cannot be written, another process is at work on it, a limit was
+            reached, or pycolmap died.
     """
     start = time.perf_counter()
     photos, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress)
     _check_destination(scene_dir, photos_dir)
     for name, why in photos.unreadable.items():
         notify(f"{name} is left out: {why}")
-    planned(plan)
+    notify(plan.describe())
     with workspace(scene_dir) as space:
         work = space.folder
         job = _prepare(photos, settings, pairing=pairing, work=work, notify=notify)
@@ -79,10 +74,11 @@ def estimate_poses(
         result = _read_json(work / "result.json")["content"]
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"]}
-        if settings.pairs_file is not None:
-            matching["pairs_file_key"] = file_key(Path(settings.pairs_file))
         report = make_report(photos, settings, result=result, matching=matching)
-        require_enough(report, photos_dir)
+        for rung in report.attempts if len(report.attempts) > 1 else ():
+            notify(f"{rung['what']}: {_sizes(rung['models'])} of {len(photos.names)} photos placed")
+        if error := refusal(report, photos_dir):
+            raise _refused(error, report, scene_dir)
 
         def describe() -> None:
             write_json(scene_dir / "poses_report.json", report.to_json())
@@ -91,6 +87,8 @@ def estimate_poses(
             scene.save(scene_dir, image_folder=photos_dir, provenance=provenance, unit="arbitrary", masks=masks)
 
         publish(scene_dir, describe)
+    if len(report.parts) > 1:
+        notify(f"the photos fall into parts that share no matches: {_sizes(report.parts)} photos")
     for size in report.models[1:]:
         notify(f"{size} photos form another model, which shares too little with the kept one of {report.models[0]}")
     return report
@@ -106,10 +104,7 @@ def plan_poses(
     """
     check_settings(settings)
     photos = find_photos(photos_dir, lambda done, total: progress("read", done, total))
-    if settings.pairs_file is None:
-        pairing = choose_pairs(photos.photos, rule=settings.pairing)
-    else:
-        pairing = read_pairs(Path(settings.pairs_file), photos)
+    pairing = choose_pairs(photos.names, rule=settings.pairing)
     threads = settings.threads if settings.threads > 0 else os.cpu_count() or 1
     return photos, pairing, make_plan(photos, pairing, settings, threads=threads)
 
@@ -120,7 +115,6 @@ def is_same_scene(scene_dir: Path, photos_dir: Path, settings: PoseSettings) -> 
         report = _read_json(scene_dir / "poses_report.json")
         made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
         names = [path.name for path in list_images(photos_dir)]
-        pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
     except (OSError, ValueError, KeyError, UserError):
         return False
     made_with = asdict(PoseSettings()) | report["settings"]  # a setting that it does not know yet had its default
@@ -128,14 +122,13 @@ def is_same_scene(scene_dir: Path, photos_dir: Path, settings: PoseSettings) -> 
     return (
         made.resolve() == photos_dir.resolve()
         and sorted(image["name"] for image in report["images"]) == sorted(names)
-        and report["matching"].get("pairs_file_key") == pairs_key
         and all(made_with[key] == value for key, value in wanted.items())
     )
 
 
-def auto_camera_model(photos: int) -> str:
-    """The COLMAP camera model that this many photos of one camera can hold."""
-    return "OPENCV" if photos >= _OPENCV_FROM else "SIMPLE_RADIAL"
+def start_model(exif: Exif) -> str:
+    """The COLMAP camera model that the mapper starts from: one distortion term, or a fisheye if the lens says so."""
+    return START_FISHEYE if "fisheye" in (exif.lens or "").lower() else START_MODEL
 
 
 def _prepare(
@@ -171,8 +164,14 @@ def _prepare(
 
 def _camera_group(members: Sequence[int], photos: Sequence[Photo], *, model: str) -> CameraGroup:
     first = photos[members[0]]
-    model = auto_camera_model(len(members)) if model == "auto" else model
-    return CameraGroup(photos=tuple(members), model=model, width=first.width, height=first.height)
+    choose = model == "auto"
+    return CameraGroup(
+        photos=tuple(members),
+        model=start_model(first.exif) if choose else model,
+        width=first.width,
+        height=first.height,
+        choose=choose,
+    )
 
 
 def _check_destination(scene_dir: Path, photos_dir: Path) -> None:
@@ -186,6 +185,18 @@ def _check_destination(scene_dir: Path, photos_dir: Path) -> None:
     ours = (scene_dir / scene.SCENE_FILE).is_file() or is_in_the_making(scene_dir)
     if scene_dir.is_dir() and any(scene_dir.iterdir()) and not ours:
         raise UserError(f"cannot write the scene {scene_dir}: the folder holds something that is no scene", hint)
+
+
+def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
+    """The error for a result that is not kept; its numbers stay for the user to read, but nothing of a scene."""
+    older = (scene_dir / scene.SCENE_FILE).is_file()
+    path = (scene_dir / "work" if older else scene_dir) / "poses_report.json"
+    write_json(path, report.to_json())
+    return UserError(error.message, f"{error.hint}; all numbers are in {path}", error.exit_code)
+
+
+def _sizes(models: Sequence[int]) -> str:
+    return " + ".join(str(size) for size in models) or "none"
 
 
 def _described(group: CameraGroup) -> str:

@@ -15,7 +15,12 @@ from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
 from nerfcli.poses.memory import resident_bytes
 from nerfcli.poses.settings import Limits
 
-_STAGES = {"extract": "finding features", "pair": "choosing pairs", "match": "matching photos", "map": "placing photos"}
+_STAGES = {
+    "extract": "finding features",
+    "match": "matching photos",
+    "map": "placing photos",
+    "check": "checking the poses",
+}
 _GO_ON = "what is complete is kept, and the same command goes on from there"
 _LESS_MEMORY = "use smaller photos (--max-size), fewer features (--max-features) or fewer threads (--threads)"
 # Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
@@ -139,7 +144,7 @@ def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:
             OUT_OF_MEMORY,
         )
     return UserError(
-        f"structure from motion was ended while {stage}: the {limits.seconds:.3g} s of --time-limit are over",
+        f"structure from motion was ended while {stage}: the {limits.seconds:.0f} s of --time-limit are over",
         f"allow more time or choose --quality fast; {_GO_ON}",
         GATE_NOT_MET,
     )

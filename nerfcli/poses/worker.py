@@ -24,15 +24,11 @@ import pycolmap
 
 import nerfcli
 from nerfcli.poses.database import discard_if_damaged, evidence, name_images
+from nerfcli.poses.examine import examine
 from nerfcli.poses.features import extract, match, start_matching
 from nerfcli.poses.job import Job, Report, read_job
-from nerfcli.poses.mapping import (
-    describe_cameras,
-    photo_numbers,
-    reconstruct,
-    refine_principal_point,
-    write_model,
-)
+from nerfcli.poses.ladder import climb
+from nerfcli.poses.mapping import describe_cameras, photo_numbers, write_model
 from nerfcli.poses.retrieval import with_neighbours
 from nerfcli.poses.stages import read_stage, stage_key, write_stage
 
@@ -57,7 +53,7 @@ def solve(job: Job, report: Report) -> None:
     with _timed(seconds, "extract"):
         extract(job, report)
     with _timed(seconds, "match"):
-        job = with_neighbours(job, report)
+        job = with_neighbours(job)
         start_matching(job, job.pairs)
         match(job, job.pairs, report)
     result, key = Path(job.folder) / RESULT, mapping_key(job)
@@ -78,18 +74,28 @@ def mapping_key(job: Job) -> str:
 def _map(job: Job, report: Report, *, seconds: dict[str, float]) -> dict[str, Any]:
     """Writes `sparse/0` if there is a model and returns what the report needs."""
     with _timed(seconds, "map"):
-        models, attempts = reconstruct(job, report)
-        best = refine_principal_point(models[0], job.threads) if models else None
-    result: dict[str, Any] = {"seconds": seconds, "attempts": attempts, "evidence": evidence(job)}
-    result["pairs"] = len(job.pairs)
-    result["versions"] = {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__}
-    result["models"] = [photo_numbers(model, job) for model in models]
-    if best is not None:
-        result["mean_reprojection_error_px"] = best.compute_mean_reprojection_error()
-        result["cameras"] = describe_cameras(best)
-        result["principal_point_refined"] = best is not models[0]
-        result["points"] = best.num_points3D()
-        write_model(best, job)
+        climbed = climb(job, report)
+    with _timed(seconds, "check"):
+        examined = examine(climbed.models, climbed.job, report)
+    model = examined.model
+    placed = [] if model is None else photo_numbers(model, job)
+    result: dict[str, Any] = {
+        "seconds": seconds,
+        "attempts": climbed.rungs,
+        "evidence": evidence(climbed.job),
+        "pairs": len(climbed.job.pairs),
+        "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
+        "models": [placed, *(photo_numbers(other, job) for other in climbed.models[1:])] if climbed.models else [],
+        "left_out": {str(number): reason for number, reason in examined.left_out.items()},
+        "pose_blur_px": {str(number): px for number, px in examined.blur_px.items()},
+        "verdict": examined.verdict.to_json(),
+        **examined.details,
+    }
+    if model is not None:
+        result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
+        result["cameras"] = describe_cameras(model)
+        result["points"] = model.num_points3D()
+        write_model(model, job)
     return result
 
 

@@ -93,9 +93,9 @@ def render_picture(
     columns: list[tuple[Tensor, ...]] = []
     block, tile = max(1, RAYS_PER_BLOCK // count), max(1, RAYS_PER_TILE // count)
     for first in range(0, width * height, block):
-        chosen = np.arange(first, min(first + block, width * height))
+        chosen = slice(first, min(first + block, width * height))
         rays = pixel_rays(frame, model.training_from_scene, pixels=chosen, places=places, device=model.device)
-        for begin in range(0, len(chosen), tile):
+        for begin in range(0, chosen.stop - chosen.start, tile):
             part = slice(begin * count, min((begin + tile) * count, len(rays.directions)))
             columns.append(_render_tile(model, rays, part, background=behind, depth=depth, quality=quality))
             if on_tile is not None:

@@ -1,0 +1,187 @@
+"""Poses against synthetic truth: features and matches of known cameras, from the mapper to the verdict.
+
+    python benchmarks/poses_synthetic.py
+    python benchmarks/poses_synthetic.py --seeds 3 -o poses_synthetic.csv
+
+A pair's error is the larger of the errors of its relative rotation and of its baseline's direction; a pair with a photo
+that was not placed has none small enough. AUC is the area under the share of pairs below an error, up to a bound, as a
+percentage of the largest possible. Captures that nobody can solve must be refused, with the reason.
+"""
+
+import csv
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pycolmap
+import synthetic_captures as synthetic
+import typer
+from rich.console import Console
+from rich.table import Table
+from synthetic_captures import FISHEYE, LONG, PHONE, WIDE, Noise, Scene, View
+
+from nerfcli.poses.examine import examine
+from nerfcli.poses.ladder import climb
+
+BOUNDS_DEG = (1, 3, 5, 10)
+USUAL = Noise()
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Views of a scene, how noisy their features are, which pairs are compared; refused: what must be said of it."""
+
+    views: list[View]
+    scene: Scene
+    noise: Noise = USUAL
+    pairs: Callable[[int, int], bool] = lambda i, j: True
+    refused: str | None = None
+
+
+@dataclass(frozen=True)
+class Result:
+    """A capture's row of the table."""
+
+    capture: str
+    seed: int
+    photos: int
+    placed: int
+    auc_1: float
+    auc_3: float
+    auc_5: float
+    auc_10: float
+    reprojection_px: float
+    lens: str
+    rungs: int
+    cpu_seconds: float
+    verdict: str
+
+
+def captures(seed: int) -> dict[str, Capture]:
+    """By name. Some can be solved, and some only recognised."""
+    ball = synthetic.boulder(1500, seed=seed)
+    far = (40.0, 0.0, 0.0)
+    apart = synthetic.together(ball, synthetic.boulder(1500, seed=seed + 1, centre=far))
+    rooms = synthetic.together(synthetic.boulder(800, seed=seed), synthetic.room(800, seed=seed + 1))
+    ring = synthetic.ring
+    return {
+        "plain": Capture(ring(16, [WIDE], seed=seed), ball),
+        "noise 1.5 px": Capture(ring(16, [WIDE], seed=seed), ball, Noise(features_px=1.5)),
+        "40 % wrong matches": Capture(ring(16, [WIDE], seed=seed), ball, Noise(outliers=0.4)),
+        "two cameras": Capture(ring(16, [WIDE, LONG], seed=seed), ball),
+        "phone lens": Capture(ring(24, [PHONE], seed=seed), ball),
+        "fisheye": Capture(ring(16, [FISHEYE], seed=seed, radius=2.0), rooms),
+        "low overlap": Capture(ring(12, [WIDE], seed=seed), ball, pairs=lambda i, j: (j - i) % 12 in (1, 11)),
+        "disconnected": Capture(
+            [*ring(10, [WIDE], seed=seed), *ring(7, [WIDE], seed=seed + 1, at=far)], apart, refused="parts of 10 + 7"
+        ),
+        "repeated structure": Capture(
+            ring(24, [WIDE], seed=seed), synthetic.twofold(2400, seed=seed), refused="look alike"
+        ),
+        "pure rotation": Capture(
+            synthetic.panorama(16, WIDE), synthetic.room(4000, seed=seed), refused="pure rotation"
+        ),
+    }
+
+
+def solve(name: str, capture: Capture, *, seed: int) -> Result:
+    """Map a capture from its database, examine the result, and measure it against the truth."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        synthetic.write_database(
+            folder / "database.db",
+            capture.views,
+            capture.scene,
+            noise=capture.noise,
+            seed=seed,
+            pairs=capture.pairs,
+        )
+        job = synthetic.synthetic_job(folder, capture.views, seed=seed)
+        start = time.process_time()
+        climbed = climb(job, lambda *told: None)
+        examined = examine(climbed.models, climbed.job, lambda *told: None)
+        seconds = time.process_time() - start
+        model = examined.model
+        failures = [f"{failure.kind}: {failure.evidence}" for failure in examined.verdict.failures]
+        parts = examined.details["parts"]
+        if len(parts) > 1:
+            failures.append("parts of " + " + ".join(map(str, parts)))
+        errors = np.full(1, np.inf) if model is None else pair_errors_deg(model, capture.views)
+        cameras = [] if model is None else [camera.model.name for camera in model.cameras.values()]
+        return Result(
+            name,
+            seed,
+            len(capture.views),
+            0 if model is None else model.num_reg_images(),
+            *(auc(errors, bound) for bound in BOUNDS_DEG),
+            reprojection_px=np.nan if model is None else model.compute_mean_reprojection_error(),
+            lens=", ".join(cameras),
+            rungs=len(climbed.rungs),
+            cpu_seconds=seconds,
+            verdict="; ".join(failures) or "accepted",
+        )
+
+
+def pair_errors_deg(model: pycolmap.Reconstruction, views: list[View]) -> np.ndarray:
+    """The pose error of every pair of views, infinite where one was not placed."""
+    placed = set(model.reg_image_ids())
+    errors = []
+    for i, j in combinations(range(len(views)), 2):
+        if i + 1 not in placed or j + 1 not in placed:
+            errors.append(np.inf)
+            continue
+        found = model.image(j + 1).cam_from_world() * model.image(i + 1).cam_from_world().inverse()
+        one, other = (pycolmap.Rigid3d(views[k].cam_from_world) for k in (i, j))
+        truth = other * one.inverse()
+        turned = np.degrees((found.rotation * truth.rotation.inverse()).angle())
+        cosine = found.translation @ truth.translation
+        cosine /= np.linalg.norm(found.translation) * np.linalg.norm(truth.translation) + 1e-300
+        errors.append(max(turned, np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+    return np.array(errors)
+
+
+def auc(errors: np.ndarray, bound: float) -> float:
+    """Area under the cumulative share of errors up to a bound, per cent: the mean of 1 - error / bound, at least 0."""
+    return float(100 * np.maximum(1 - errors / bound, 0).mean())
+
+
+def main(
+    output: Annotated[Path | None, typer.Option("-o", help="Write a CSV too.")] = None,
+    seeds: Annotated[int, typer.Option(help="How many of each.", min=1)] = 1,
+    only: Annotated[str, typer.Option(help="Captures whose name contains this.")] = "",
+) -> None:
+    """Solve every capture and print a table."""
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    console = Console()
+    table = Table("capture", "placed", "AUC 1", "3", "5", "10 deg", "px", "lens", "rungs", "CPU s", "verdict")
+    results, wrong = [], []
+    for seed in range(seeds):
+        for name, capture in captures(seed).items():
+            if only not in name:
+                continue
+            result = solve(name, capture, seed=seed)
+            results.append(result)
+            aucs = [f"{value:.1f}" for value in (result.auc_1, result.auc_3, result.auc_5, result.auc_10)]
+            placed = f"{result.placed}/{result.photos}"
+            numbers = [f"{result.reprojection_px:.2f}", result.lens, str(result.rungs), f"{result.cpu_seconds:.1f}"]
+            table.add_row(name, placed, *aucs, *numbers, result.verdict)
+            expected = result.verdict == "accepted" if capture.refused is None else capture.refused in result.verdict
+            if not expected:
+                wrong.append(f"{name} (seed {seed})")
+    console.print(table)
+    console.print("verdicts as they should be" if not wrong else f"wrong verdicts: {', '.join(wrong)}")
+    if output:
+        with output.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, [field.name for field in fields(Result)])
+            writer.writeheader()
+            writer.writerows(asdict(result) for result in results)
+    raise typer.Exit(1 if wrong else 0)
+
+
+if __name__ == "__main__":
+    typer.run(main)

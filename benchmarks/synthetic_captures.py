@@ -1,0 +1,324 @@
+"""Captures without pictures: features and matches of known cameras, in the database that pycolmap maps from.
+
+What an extractor and a matcher would have found in a scene is drawn at random: noise on every feature, features that
+have no partner, matches that are wrong. Everything from the verification of the matches on is real.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from nerfcli.poses.job import CameraGroup, Job
+from nerfcli.poses.pairs import all_pairs
+from nerfcli.poses.settings import FULL_SIZE
+
+Array = NDArray[np.float64]
+
+# What is farther away is too small to have features.
+_FARTHEST = 15.0
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera: its COLMAP model and true parameters, and the model that the mapper starts from."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+    start_model: str = "SIMPLE_RADIAL"
+
+
+WIDE = Lens("SIMPLE_RADIAL", 1000, 750, (800.0, 500.0, 375.0, -0.05))
+LONG = Lens("SIMPLE_RADIAL", 900, 1200, (1600.0, 450.0, 600.0, 0.02))
+PHONE = Lens("RADIAL", 1000, 750, (820.0, 510.0, 369.0, 0.12, -0.25))
+FISHEYE = Lens("OPENCV_FISHEYE", 1000, 1000, (320.0, 320.0, 500.0, 500.0, 0.03, -0.01, 0.004, -0.001), "OPENCV_FISHEYE")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What there is to see. points (n, 3); normals (n, 3): a point is seen from its front only; looks: (n,) points
+    of the same number look alike, and a matcher may take one for the other."""
+
+    points: Array
+    normals: Array
+    looks: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class View:
+    """A photo: its lens, and the pose (3, 4) of its camera from the world, OpenCV axes."""
+
+    lens: Lens
+    cam_from_world: Array
+
+    @property
+    def centre(self) -> Array:
+        """Where it was taken."""
+        return -self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """features_px: standard deviation. outliers: share of wrong matches. missed: share of matches not found."""
+
+    features_px: float = 0.5
+    outliers: float = 0.1
+    missed: float = 0.3
+
+
+def boulder(count: int, *, seed: int, centre: Sequence[float] = (0.0, 0.0, 0.0)) -> Scene:
+    """A bumpy ball of radius about 1."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = normals * rng.uniform(0.75, 1.15, size=(count, 1)) + np.asarray(centre)
+    return Scene(points, normals, np.arange(count))
+
+
+def twofold(count: int, *, seed: int) -> Scene:
+    """A boulder whose back looks like its front: each point has its like on the other side of the z axis."""
+    half = boulder(count // 2, seed=seed)
+    turn = np.diag([-1.0, -1.0, 1.0])
+    return Scene(
+        np.vstack([half.points, half.points @ turn]),
+        np.vstack([half.normals, half.normals @ turn]),
+        np.concatenate([half.looks, half.looks]),
+    )
+
+
+def room(count: int, *, seed: int) -> Scene:
+    """The inside of a box of 8 x 8 x 4."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, size=(count, 3))
+    wall, side = rng.integers(0, 3, count), rng.choice([-1.0, 1.0], count)
+    points[np.arange(count), wall] = side
+    normals = np.zeros((count, 3))
+    normals[np.arange(count), wall] = -side
+    return Scene(points * [4.0, 4.0, 2.0], normals, np.arange(count))
+
+
+def together(one: Scene, other: Scene) -> Scene:
+    """Both; nothing of the one looks like anything of the other."""
+    return Scene(
+        np.vstack([one.points, other.points]),
+        np.vstack([one.normals, other.normals]),
+        np.concatenate([one.looks, other.looks + one.looks.max() + 1]),
+    )
+
+
+def looking_at(centre: Array, target: Array) -> Array:
+    """Pose (3, 4) of a camera at `centre` that looks at `target`, z being up."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.column_stack([rotation, -rotation @ centre])
+
+
+def ring(
+    count: int,
+    lenses: Sequence[Lens],
+    *,
+    seed: int,
+    radius: float = 3.5,
+    turn_deg: float = 360,
+    at: Sequence[float] = (),
+) -> list[View]:
+    """Photos around the origin (or `at`) that look at it, the lenses in turn, from uneven heights and distances."""
+    rng = np.random.default_rng(seed)
+    middle = np.asarray(at) if at else np.zeros(3)
+    views = []
+    for index in range(count):
+        angle = np.radians(turn_deg) * index / count
+        centre = radius * rng.uniform(0.9, 1.1) * np.array([np.cos(angle), np.sin(angle), rng.uniform(-0.1, 0.4)])
+        target = middle + rng.normal(scale=0.1, size=3)
+        views.append(View(lenses[index % len(lenses)], looking_at(middle + centre, target)))
+    return views
+
+
+def panorama(count: int, lens: Lens, *, turn_deg: float = 300) -> list[View]:
+    """Photos from one place, the camera only being turned."""
+    angles = np.radians(turn_deg) * np.arange(count) / count
+    centre = np.array([0.3, -0.2, 0.1])
+    return [
+        View(lens, looking_at(centre, centre + np.array([np.cos(a), np.sin(a), 0.1 * np.sin(3 * a)]))) for a in angles
+    ]
+
+
+def seen(view: View, scene: Scene) -> tuple[NDArray[np.int64], Array]:
+    """Numbers of the points that a view sees from their front, and their pixels (n, 2)."""
+    camera = _camera(view.lens, 1)
+    towards = view.centre - scene.points
+    distances = np.linalg.norm(towards, axis=1)
+    facing = (np.einsum("ij,ij->i", towards, scene.normals) > 0.3 * distances) & (distances < _FARTHEST)
+    local = scene.points @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
+    candidates = np.flatnonzero(facing & (local[:, 2] > 0.1))
+    pixels = np.asarray(camera.img_from_cam(local[candidates]), dtype=np.float64).reshape(-1, 2)
+    inside = ((pixels > 1) & (pixels < np.array([camera.width, camera.height]) - 1)).all(axis=1)
+    return candidates[inside], pixels[inside]
+
+
+def write_database(
+    path: Path,
+    views: Sequence[View],
+    scene: Scene,
+    *,
+    noise: Noise,
+    seed: int,
+    pairs: Callable[[int, int], bool] = lambda i, j: True,
+    threads: int = 1,
+) -> None:
+    """Features and verified matches of the views; photo i is called 0000i.jpg, image id i + 1.
+
+    Lenses become one camera each, with the focal length unknown. Of the pairs only those are compared for which `pairs`
+    is true. Look-alike points that two photos see are matched as if they were the same.
+    """
+    rng = np.random.default_rng(seed)
+    lenses = list(dict.fromkeys(view.lens for view in views))
+    with pycolmap.Database.open(str(path)) as database:
+        for number, lens in enumerate(lenses):
+            start = pycolmap.Camera.create_from_model_name(
+                number + 1, lens.start_model, 1.2 * max(lens.width, lens.height), lens.width, lens.height
+            )
+            if "FISHEYE" in lens.start_model:  # as a user would say who knows the lens
+                start.params = [*lens.params[:4], *[0.0] * (len(start.params) - 4)]
+                start.has_prior_focal_length = True
+            _write_camera(database, start)
+        order: list[dict[int, int]] = []
+        for number, view in enumerate(views):
+            points, pixels = seen(view, scene)
+            keypoints, index = _features(points, pixels, view.lens, scene, noise=noise, rng=rng)
+            _write_image(database, number, lenses.index(view.lens) + 1, keypoints)
+            order.append(index)
+        for i in range(len(views)):
+            for j in range(i + 1, len(views)):
+                if pairs(i, j):
+                    matches = _matches(order[i], order[j], noise=noise, rng=rng)
+                    if len(matches) >= 15:
+                        database.write_matches(i + 1, j + 1, matches)
+    verifier = pycolmap.GeometricVerifierOptions()
+    verifier.num_threads = threads
+    geometry = pycolmap.TwoViewGeometryOptions()
+    geometry.ransac.random_seed = seed
+    pycolmap.geometric_verification(str(path), verifier, two_view_geometry_options=geometry)
+
+
+def synthetic_job(folder: Path, views: Sequence[View], *, seed: int) -> Job:
+    """The job of mapping from folder/database.db. There are no photos: all features and matches are sought already."""
+    work = folder / "work"
+    (work / "photos").mkdir(parents=True)
+    names = tuple(photo_name(number) for number in range(len(views)))
+    lenses = dict.fromkeys(view.lens for view in views)
+    groups = tuple(
+        CameraGroup(
+            photos=tuple(number for number, view in enumerate(views) if view.lens == lens),
+            model=lens.start_model,
+            width=lens.width,
+            height=lens.height,
+            choose=True,
+        )
+        for lens in lenses
+    )
+    return Job(
+        folder=str(work),
+        files=names,
+        originals=str(work / "photos"),
+        names=names,
+        keys=names,
+        groups=groups,
+        pairs=all_pairs(len(views)),
+        neighbours=0,
+        max_image_size=FULL_SIZE,
+        max_features=8192,
+        seed=seed,
+        threads=1,
+    )
+
+
+def true_model(views: Sequence[View]) -> pycolmap.Reconstruction:
+    """The true cameras and poses, with the image ids and names of `write_database`; no points."""
+    model = pycolmap.Reconstruction()
+    lenses = list(dict.fromkeys(view.lens for view in views))
+    for number, lens in enumerate(lenses):
+        model.add_camera_with_trivial_rig(_camera(lens, number + 1))
+    for number, view in enumerate(views):
+        image = pycolmap.Image(name=photo_name(number), camera_id=lenses.index(view.lens) + 1, image_id=number + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world))
+    return model
+
+
+def observed_model(views: Sequence[View], scene: Scene, *, noise_px: float, seed: int) -> pycolmap.Reconstruction:
+    """The true cameras, poses and points, and where each view sees the points, with noise."""
+    rng = np.random.default_rng(seed)
+    model = true_model(views)
+    sightings: dict[int, list[tuple[int, int]]] = {}
+    for number, view in enumerate(views):
+        points, pixels = seen(view, scene)
+        noisy = pixels + rng.normal(scale=noise_px, size=pixels.shape)
+        model.image(number + 1).points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in noisy])
+        for index, point in enumerate(points):
+            sightings.setdefault(int(point), []).append((number + 1, index))
+    for point, seen_by in sorted(sightings.items()):
+        if len(seen_by) >= 2:
+            track = pycolmap.Track([pycolmap.TrackElement(image_id, index) for image_id, index in seen_by])
+            model.add_point3D(scene.points[point], track)
+    model.update_point_3d_errors()
+    return model
+
+
+def photo_name(number: int) -> str:
+    """As the worker numbers photos."""
+    return f"{number:05d}.jpg"
+
+
+def _camera(lens: Lens, camera_id: int) -> pycolmap.Camera:
+    camera = pycolmap.Camera.create_from_model_name(camera_id, lens.model, 1.0, lens.width, lens.height)
+    camera.params = list(lens.params)
+    return camera
+
+
+def _features(
+    points: NDArray[np.int64], pixels: Array, lens: Lens, scene: Scene, *, noise: Noise, rng: np.random.Generator
+) -> tuple[Array, dict[int, int]]:
+    """Keypoints in random order, clutter among them, and the keypoint of each look."""
+    noisy = pixels + rng.normal(scale=noise.features_px, size=pixels.shape)
+    clutter = rng.uniform(0, [lens.width, lens.height], size=(len(points) // 4 + 10, 2))
+    looks = np.concatenate([scene.looks[points], np.full(len(clutter), -1)])
+    shuffled = rng.permutation(len(looks))
+    index = {int(looks[old]): new for new, old in enumerate(shuffled) if looks[old] >= 0}
+    return np.vstack([noisy, clutter])[shuffled], index
+
+
+def _matches(
+    one: dict[int, int], other: dict[int, int], *, noise: Noise, rng: np.random.Generator
+) -> NDArray[np.uint32]:
+    common = [look for look in one if look in other and rng.uniform() > noise.missed]
+    right = [(one[look], other[look]) for look in common]
+    wrong_count = round(len(right) * noise.outliers / (1 - noise.outliers))
+    if not right:
+        return np.zeros((0, 2), np.uint32)
+    wrong = np.column_stack(
+        [rng.choice(list(one.values()), wrong_count), rng.choice(list(other.values()), wrong_count)]
+    )
+    return np.vstack([right, wrong]).astype(np.uint32)
+
+
+def _write_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
+    camera_id = database.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+
+
+def _write_image(database: pycolmap.Database, number: int, camera_id: int, keypoints: Array) -> None:
+    image = pycolmap.Image(name=photo_name(number), camera_id=camera_id, image_id=number + 1)
+    database.write_image(image, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=number + 1, rig_id=camera_id)
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame, use_frame_id=True)
+    database.write_keypoints(number + 1, keypoints.astype(np.float32))

@@ -1,0 +1,82 @@
+"""After mapping: which lens the photos can hold, what contradicts the model, whether to believe it, how sharp it is."""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import pycolmap
+
+from nerfcli.poses.acceptance import MIN_MATCHES, Verdict, judge, leave_out_contradicting, nothing_placed
+from nerfcli.poses.intrinsics import Candidate, choose_lenses
+from nerfcli.poses.job import Job
+from nerfcli.poses.parallax import best_turn
+from nerfcli.poses.reasons import FEW_MATCHES
+from nerfcli.poses.two_views import read_verified_pairs
+from nerfcli.poses.uncertainty import pose_blur_px
+from nerfcli.poses.view_graph import parts
+
+# From here on the covariance of all poses together takes minutes.
+_MOST_PHOTOS_FOR_BLUR = 500
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A model after examination, and what is to be said of it.
+
+    left_out: why photos were taken out, by number. blur_px: of each photo's pose, by number. details: for the report.
+    """
+
+    model: pycolmap.Reconstruction | None
+    verdict: Verdict
+    left_out: dict[int, str]
+    blur_px: dict[int, float]
+    details: dict[str, Any]
+
+
+def examine(models: list[pycolmap.Reconstruction], job: Job, report: Callable[[str, int, int], None]) -> Examined:
+    """Choose lenses, leave out what contradicts, adjust, judge, and measure the uncertainty of the largest model."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
+    sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
+    strong = [pair for pair in pairs if pair.matches >= FEW_MATCHES]
+    turn = best_turn(strong, sizes)
+    joined = parts(job.image_ids, [(pair.one, pair.other) for pair in strong])
+    details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
+    if not models:
+        return Examined(None, nothing_placed(turn), {}, {}, details)
+    numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
+    report("check", 0, 4)
+    model, left_out = leave_out_contradicting(models[0], pairs)
+    report("check", 1, 4)
+    model, tried = _with_lenses(model, job)
+    details["lenses"] = [asdict(candidate) for candidate in tried]
+    report("check", 2, 4)
+    verdict = judge(
+        model,
+        pairs,
+        turn=turn,
+        names=dict(zip(job.files, job.names, strict=True)),
+        seed=job.seed,
+        threads=job.threads,
+    )
+    report("check", 3, 4)
+    blur = {}
+    if verdict.accepted and model.num_reg_images() <= _MOST_PHOTOS_FOR_BLUR:
+        blur = pose_blur_px(model, threads=job.threads)
+    report("check", 4, 4)
+    reasons = {numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
+    return Examined(model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details)
+
+
+def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> tuple[pycolmap.Reconstruction, list[Candidate]]:
+    """Lens models by evidence, where neither the user nor a file has said what they are."""
+    fixed = [number for number, group in enumerate(job.groups, start=1) if group.fixed]
+    named = [number for number, group in enumerate(job.groups, start=1) if not group.choose]
+    return choose_lenses(model, seed=job.seed, threads=job.threads, fixed=fixed, named=named)
+
+
+def _with_names(reason: str, job: Job) -> str:
+    for file, name in zip(job.files, job.names, strict=True):
+        reason = reason.replace(file, name)
+    return reason

@@ -1,0 +1,138 @@
+"""Bundle adjustment without a tenth of the observations, and how far they are off afterwards.
+
+The mean reprojection error is measured on what was adjusted to it. An observation that was not used tells whether poses
+and intrinsics hold where nobody pulled at them: the measure by which camera models are compared and results accepted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_SHARE = 0.1
+# Beyond this, more observations cost time and change nothing; a part of the points is adjusted instead.
+_MOST_OBSERVATIONS = 40_000
+# With the others of its point left, it must still be two that hold the point, and better three.
+_MIN_TRACK = 3
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Observations that were taken out of a model: image ids (n,), point ids (n,), pixels (n, 2)."""
+
+    images: NDArray[np.int64]
+    points: NDArray[np.int64]
+    pixels: Array
+
+
+def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Reconstruction, HeldOut]:
+    """A copy of a model without every tenth observation, and these; at most one of each point.
+
+    Points seen fewer than three times give none away. Of a large model the copy holds a part of the points.
+    """
+    rng = np.random.default_rng(seed)
+    copy = pycolmap.Reconstruction(model)
+    point_ids = np.array(sorted(copy.point3D_ids()), dtype=np.int64)
+    kept_share = min(1.0, _MOST_OBSERVATIONS / max(copy.compute_num_observations(), 1))
+    dropped = rng.uniform(size=len(point_ids)) >= kept_share
+    for point_id in point_ids[dropped]:
+        copy.delete_point3D(int(point_id))
+    lengths = np.array([copy.point3D(int(point_id)).track.length() for point_id in point_ids[~dropped]])
+    # One observation of a point in so many that a tenth of all are taken.
+    taken = (lengths >= _MIN_TRACK) & (rng.uniform(size=len(lengths)) < _SHARE * lengths)
+    images, points, pixels = [], [], []
+    for point_id, length in zip(point_ids[~dropped][taken], lengths[taken], strict=True):
+        element = copy.point3D(int(point_id)).track.elements[int(rng.integers(length))]
+        image = copy.image(element.image_id)
+        images.append(element.image_id)
+        points.append(int(point_id))
+        pixels.append(np.asarray(image.points2D[element.point2D_idx].xy))
+        copy.delete_observation(element.image_id, element.point2D_idx)
+    return copy, HeldOut(
+        np.array(images, dtype=np.int64), np.array(points, dtype=np.int64), np.array(pixels, dtype=float).reshape(-1, 2)
+    )
+
+
+def errors_px(model: pycolmap.Reconstruction, held: HeldOut) -> Array:
+    """(n,) distance of each held-out observation from where the model projects its point; inf if it does not."""
+    errors = np.full(len(held.points), np.inf)
+    for index, (image_id, point_id) in enumerate(zip(held.images, held.points, strict=True)):
+        projected = model.image(int(image_id)).project_point(model.point3D(int(point_id)).xyz)
+        if projected is not None:
+            errors[index] = np.linalg.norm(projected - held.pixels[index])
+    return errors
+
+
+def adjust(
+    model: pycolmap.Reconstruction,
+    *,
+    threads: int,
+    principal_points: bool = False,
+    fixed: Sequence[int] = (),
+) -> pycolmap.CeresBundleAdjuster:
+    """Bundle adjustment of a whole model, in place, until it no longer moves; the adjuster, for the covariance.
+
+    Args:
+        model: what is adjusted.
+        threads: -1 for all.
+        principal_points: whether they are adjusted too.
+        fixed: camera ids whose intrinsics stay as they are.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point = principal_points
+    options.ceres.solver_options.num_threads = threads
+    # To the end: of two models that are compared, the one that was adjusted longer must not look better for that.
+    options.ceres.solver_options.max_num_iterations = 200
+    options.ceres.solver_options.function_tolerance = 1e-9
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        config.add_image(image_id)
+    for camera_id in fixed:
+        config.set_constant_cam_intrinsics(camera_id)
+    # Points, not cameras, hold the frame: so every camera has a covariance.
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.THREE_POINTS)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    adjuster.solve()
+    return adjuster
+
+
+def intrinsic_deviations(
+    model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster, *, principal_points: bool
+) -> dict[int, Array]:
+    """Standard deviation of each intrinsic parameter by camera id, NaN where it was held; from an adjustment's end.
+
+    The residuals themselves say how noisy an observation is.
+    """
+    options = pycolmap.BACovarianceOptions()
+    options.params = pycolmap.BACovarianceOptionsParams.ALL
+    covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
+    deviations: dict[int, Array] = {}
+    for camera_id, camera in model.cameras.items():
+        deviations[camera_id] = np.full(len(camera.params), np.nan)
+        found = None if covariance is None else covariance.get_other_params_cov(camera.params)
+        if found is None:
+            continue
+        free = [*camera.focal_length_idxs(), *camera.extra_params_idxs()]
+        free += camera.principal_point_idxs() if principal_points else []
+        spread = np.sqrt(np.maximum(np.diag(found), 0)) * residual_deviation_px(model)
+        deviations[camera_id][sorted(free)] = spread
+    return deviations
+
+
+def residual_deviation_px(model: pycolmap.Reconstruction) -> float:
+    """Standard deviation of one coordinate of an observation, by what an adjustment has left; unbiased."""
+    squares, count = 0.0, 0
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        for point in image.get_observation_points2D():
+            projected = image.project_point(model.point3D(point.point3D_id).xyz)
+            if projected is not None:
+                squares += float(((projected - point.xy) ** 2).sum())
+                count += 2
+    unknowns = 6 * model.num_reg_images() + 3 * model.num_points3D() - 7
+    return float(np.sqrt(squares / max(count - unknowns, 1)))

@@ -1,0 +1,160 @@
+"""One attempt after the other, each costlier than the one before, until enough photos are placed.
+
+Every attempt is written down with its result. The first ones ask the same matches in another way; the last ones look
+for more matches and more features.
+"""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from nerfcli.poses.database import evidence
+from nerfcli.poses.features import extract, match, start_matching
+from nerfcli.poses.job import Job, Report
+from nerfcli.poses.mapping import Start, map_photos
+from nerfcli.poses.merging import merge_models
+from nerfcli.poses.pairs import all_pairs
+from nerfcli.poses.reasons import FEW_FEATURES, FEW_MATCHES
+from nerfcli.poses.settings import FULL_SIZE
+from nerfcli.poses.view_graph import parts
+
+# Registered shares below which the mapper gets another chance; a photo or two missing is often the photo's own fault.
+_GOOD_SHARE = 0.9
+# Below this, it is worth several times the work that was done so far.
+_FEW_SHARE = 0.75
+# Beyond this, comparing every pair, or searching full-size photos, takes longer than taking better photos.
+_MOST_PAIRS = 12_000
+_MOST_FULL_SIZE = 150
+_MORE_FEATURES = 8192
+
+SMALLER_BASELINE = Start(init_min_tri_angle=8.0, init_min_num_inliers=50)
+LOW_ANGLES = Start(
+    init_min_tri_angle=3.0, init_min_num_inliers=30, filter_min_tri_angle=0.5, init_max_forward_motion=1.0
+)
+
+
+@dataclass(frozen=True)
+class Climb:
+    """What the ladder led to: the models, largest first, the job whose features and matches they are of, the rungs.
+
+    A rung is {"what", "models": sizes, largest first}.
+    """
+
+    models: list[pycolmap.Reconstruction]
+    job: Job
+    rungs: list[dict[str, Any]]
+
+
+class _Ladder:
+    def __init__(self, job: Job, report: Report) -> None:
+        self.best = Climb([], job, [])
+        self.rungs: list[dict[str, Any]] = []
+        self._report = report
+
+    def attempt(self, what: str, job: Job, start: Start) -> None:
+        """Map once; the result counts if it places more photos than the best so far."""
+        number = len(self.rungs)
+        models = map_photos(job, self._report, attempt=number, start=start)
+        self._take(what, models, job)
+        if len(models) > 1:
+            output = Path(job.folder) / f"merged_{number}"
+            merged = merge_models(models, job.database, output=output, seed=job.seed, threads=job.threads)
+            if _placed(merged) > _placed(models):
+                self._take("sub-models merged", merged, job)
+
+    def go_on(self, what: str, start: Start) -> None:
+        """Try to place the rest from the best model as it is."""
+        models, job = self.best.models, self.best.job
+        if not models:
+            return
+        grown = map_photos(job, self._report, attempt=len(self.rungs), start=start, base=models[0])
+        if grown:
+            self._take(what, [grown[0], *models[1:]], job)
+
+    def _take(self, what: str, models: list[pycolmap.Reconstruction], job: Job) -> None:
+        self.rungs.append({"what": what, "models": [model.num_reg_images() for model in models]})
+        if _placed(models) > _placed(self.best.models):
+            self.best = Climb(models, job, self.rungs)
+
+    def share(self, candidates: int) -> float:
+        """Of the photos that can be placed, the share that the best model places."""
+        return _placed(self.best.models) / max(candidates, 1)
+
+
+def climb(job: Job, report: Report) -> Climb:
+    """Map a job's photos, with as many attempts as it takes.
+
+    The first attempt has pycolmap's own thresholds. If it leaves out many photos that match some other one well, the
+    next ones start from a pair with a smaller baseline, from the strongest pair that was left out, and with low angles.
+    If photos with features are still missing, all pairs are compared that were not, and last, more features are sought
+    in the photos' full size.
+    """
+    ladder = _Ladder(job, report)
+    ladder.attempt("default thresholds", job, Start())
+    featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
+    _other_starts(ladder, job)
+    rest = [pair for pair in all_pairs(len(job.files)) if pair not in set(job.pairs)]
+    if rest and len(rest) <= _MOST_PAIRS and ladder.share(featured) < _GOOD_SHARE:
+        job = replace(job, pairs=(*job.pairs, *rest))
+        match(job, rest, report)
+        ladder.attempt("every pair compared", job, SMALLER_BASELINE)
+    if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE:
+        full = replace(
+            job,
+            rung="full-size",
+            max_image_size=FULL_SIZE,
+            max_features=_MORE_FEATURES,
+            pairs=all_pairs(len(job.files)),
+        )
+        extract(full, report)
+        start_matching(full, full.pairs)
+        match(full, full.pairs, report)
+        ladder.attempt("more features, full size", full, Start())
+        _other_starts(ladder, full)
+    return replace(ladder.best, rungs=ladder.rungs)
+
+
+def _other_starts(ladder: _Ladder, job: Job) -> None:
+    """Other ways to begin, until nearly all photos are placed that matches hold together."""
+    candidates = len(parts(job.image_ids, [(one, other) for _, one, other in _strong_pairs(job)])[0])
+    steps: list[Callable[[], None]] = [
+        lambda: ladder.attempt("start from a smaller baseline", job, SMALLER_BASELINE),
+        lambda: _from_left_out(ladder, job),
+        lambda: ladder.go_on("lower angles", LOW_ANGLES),
+        lambda: ladder.attempt("start from low angles", job, LOW_ANGLES),
+    ]
+    for step in steps:
+        if ladder.share(candidates) >= _GOOD_SHARE:
+            return
+        step()
+
+
+def _from_left_out(ladder: _Ladder, job: Job) -> None:
+    """Start from the strongest pair of which the best model lacks a photo."""
+    placed = set(ladder.best.models[0].reg_image_ids()) if ladder.best.models else set()
+    left = [pair for pair in _strong_pairs(job) if not {pair[1], pair[2]} <= placed]
+    if left:
+        _, one, other = max(left, key=lambda pair: (pair[0], -pair[1], -pair[2]))
+        start = replace(SMALLER_BASELINE, init_pair=(one, other))
+        ladder.attempt("start from the strongest pair that was left out", job, start)
+
+
+def _strong_pairs(job: Job) -> list[tuple[int, int, int]]:
+    """(verified matches, image id, image id) of the pairs that can hold a photo."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pair_ids, counts = database.read_two_view_geometry_num_inliers()
+    pairs = [(count, *pycolmap.pair_id_to_image_pair(pair_id)) for pair_id, count in zip(pair_ids, counts, strict=True)]
+    return [pair for pair in pairs if pair[0] >= FEW_MATCHES]
+
+
+def _can_have_more_features(job: Job) -> bool:
+    richer = job.max_image_size < FULL_SIZE or job.max_features < _MORE_FEATURES
+    return richer and len(job.files) <= _MOST_FULL_SIZE
+
+
+def _placed(models: list[pycolmap.Reconstruction]) -> int:
+    return models[0].num_reg_images() if models else 0

@@ -1,0 +1,191 @@
+"""What pairs of photos say about each other, against what a model says about them.
+
+The verified matches of a pair hold whatever the mapper made of them. A wrong model has small residuals because it has
+thrown away the observations that contradict it; they still stand in the database, and here they are asked.
+
+Letters: p, q are unit rays of a match in the two cameras; R, t the pose of the second camera from the first.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# COLMAP verifies matches within 4 px of the epipolar line; a model that holds more than the pair may leave twice that.
+TOLERANCE_PX = 8.0
+# Pairs whose relative pose is estimated anew; they are spread over the photos.
+_ROTATIONS_PER_PHOTO = 4
+# Below this median angle between the rays of a match, the relative pose of a pair is too weak to contradict anything.
+_ROTATION_MIN_ANGLE_DEG = 2.0
+
+
+@dataclass(frozen=True)
+class VerifiedPair:
+    """Two photos by their image ids, and the pixels (matches, 2) in each that two-view geometry holds for one point."""
+
+    one: int
+    other: int
+    pixels_one: Array
+    pixels_other: Array
+
+    @property
+    def matches(self) -> int:
+        """How many."""
+        return len(self.pixels_one)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well a pair's matches fit the poses that a model gives the two photos.
+
+    matches: how many can be judged. share: of them within `TOLERANCE_PX` of the epipolar line and before both
+    cameras. angle_deg: the median angle between the rays of a match.
+    """
+
+    one: int
+    other: int
+    matches: int
+    share: float
+    angle_deg: float
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether most of what the two photos have in common cannot be as the model says."""
+        return self.share < 0.5
+
+
+def read_verified_pairs(database: pycolmap.Database, *, min_matches: int) -> list[VerifiedPair]:
+    """The pairs with at least `min_matches` verified matches, by image ids."""
+    pair_ids, counts = database.read_two_view_geometry_num_inliers()
+    keypoints: dict[int, Array] = {}
+
+    def pixels(image_id: int) -> Array:
+        if image_id not in keypoints:
+            keypoints[image_id] = np.asarray(database.read_keypoints(image_id), dtype=np.float64)[:, :2]
+        return keypoints[image_id]
+
+    pairs = []
+    for pair_id, count in sorted(zip(pair_ids, counts, strict=True)):
+        if count < min_matches:
+            continue
+        one, other = pycolmap.pair_id_to_image_pair(pair_id)
+        matches = np.asarray(database.read_two_view_geometry(one, other).inlier_matches, dtype=np.int64)
+        pairs.append(VerifiedPair(one, other, pixels(one)[matches[:, 0]], pixels(other)[matches[:, 1]]))
+    return pairs
+
+
+def placed_pairs(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[VerifiedPair]:
+    """The pairs of which a model places both photos."""
+    placed = set(model.reg_image_ids())
+    return [pair for pair in pairs if pair.one in placed and pair.other in placed]
+
+
+def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[Agreement]:
+    """Each pair's matches against the model's poses and intrinsics; pairs without a finite ray are left out."""
+    found = []
+    for pair in placed_pairs(model, pairs):
+        first, second = model.image(pair.one), model.image(pair.other)
+        camera, other_camera = model.camera(first.camera_id), model.camera(second.camera_id)
+        p, q = rays(camera, pair.pixels_one), rays(other_camera, pair.pixels_other)
+        finite = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
+        if not finite.any():
+            continue
+        pose = second.cam_from_world() * first.cam_from_world().inverse()
+        R, t = pose.rotation.matrix(), np.asarray(pose.translation)
+        p, q = p[finite] @ R.T, q[finite]  # both in the second camera's axes
+        focal_px = 0.5 * (camera.mean_focal_length() + other_camera.mean_focal_length())
+        fits = (epipolar_angles(p, q, t) * focal_px < TOLERANCE_PX) & _in_front(p, q, t)
+        angle = np.degrees(np.median(_angles(p, q)))
+        found.append(Agreement(pair.one, pair.other, len(p), float(fits.mean()), float(angle)))
+    return found
+
+
+def rays(camera: pycolmap.Camera, pixels: Array) -> Array:
+    """Unit rays (n, 3) in the camera's axes; NaN where the lens model cannot be inverted."""
+    found = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64).reshape(-1, 3)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def epipolar_angles(p: Array, q: Array, t: Array) -> Array:
+    """The angle, radians, by which the two rays of each match miss each other's epipolar plane, the larger of both.
+
+    p and q are in the same axes, t is the baseline in them; without a baseline it is the angle between the rays.
+    """
+    if np.linalg.norm(t) < 1e-12:
+        return _angles(p, q)
+    lift = np.einsum("ij,ij->i", np.cross(t, p), q)
+    norms = np.minimum(np.linalg.norm(np.cross(t, p), axis=1), np.linalg.norm(np.cross(t, q), axis=1))
+    return np.arcsin(np.clip(np.abs(lift) / np.maximum(norms, 1e-300), 0, 1))
+
+
+@dataclass(frozen=True)
+class RotationError:
+    """The angle between a pair's own relative rotation and the model's, degrees; weight: the inliers behind it."""
+
+    one: int
+    other: int
+    degrees: float
+    weight: int
+
+
+def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], *, seed: int) -> list[RotationError]:
+    """Relative poses from the matches of two photos alone, with the model's intrinsics, against the model.
+
+    Only the pairs with the most matches of each photo are asked, and of these only those that have parallax: without
+    it the five-point problem may turn a camera about.
+    """
+    options = pycolmap.RANSACOptions()
+    options.max_error = 4.0
+    # The matches are verified; few trials are enough, and pycolmap's own number takes ten times as long.
+    options.min_num_trials, options.max_num_trials = 50, 500
+    options.random_seed = seed
+    errors = []
+    for pair in strongest(placed_pairs(model, pairs), per_photo=_ROTATIONS_PER_PHOTO):
+        first, second = model.image(pair.one), model.image(pair.other)
+        camera, other_camera = model.camera(first.camera_id), model.camera(second.camera_id)
+        found = pycolmap.estimate_relative_pose(
+            camera, pair.pixels_one, other_camera, pair.pixels_other, options=options
+        )
+        if found is None:
+            continue
+        own = found["cam2_from_cam1"]
+        inliers = np.asarray(found["inlier_mask"])
+        p = rays(camera, pair.pixels_one[inliers]) @ own.rotation.matrix().T
+        q = rays(other_camera, pair.pixels_other[inliers])
+        if not len(p) or np.degrees(np.nanmedian(_angles(p, q))) < _ROTATION_MIN_ANGLE_DEG:
+            continue
+        pose = second.cam_from_world() * first.cam_from_world().inverse()
+        degrees = float(np.degrees((own.rotation * pose.rotation.inverse()).angle()))
+        errors.append(RotationError(pair.one, pair.other, degrees, int(inliers.sum())))
+    return errors
+
+
+def strongest(pairs: Sequence[VerifiedPair], *, per_photo: int) -> list[VerifiedPair]:
+    """The pairs that are, for one of their photos, among the `per_photo` with the most matches."""
+    taken: dict[int, int] = {}
+    kept = []
+    for pair in sorted(pairs, key=lambda pair: (-pair.matches, pair.one, pair.other)):
+        if min(taken.get(pair.one, 0), taken.get(pair.other, 0)) < per_photo:
+            kept.append(pair)
+            for photo in (pair.one, pair.other):
+                taken[photo] = taken.get(photo, 0) + 1
+    return kept
+
+
+def _angles(p: Array, q: Array) -> Array:
+    """Angles between unit vectors, radians; exact for small ones, where arccos is not."""
+    return 2 * np.arcsin(np.clip(np.linalg.norm(p - q, axis=1) / 2, 0, 1))
+
+
+def _in_front(p: Array, q: Array, t: Array) -> NDArray[np.bool_]:
+    """Whether rays a p + t and b q come nearest at positive a and b. True for parallel rays: they meet far away."""
+    cosine = np.einsum("ij,ij->i", p, q)
+    along_p, along_q = p @ t, q @ t
+    distance_p = cosine * along_q - along_p  # times 1 / (1 - cosine^2), which is positive
+    distance_q = along_q - cosine * along_p
+    parallel = 1 - cosine**2 < 1e-8
+    return parallel | ((distance_p > 0) & (distance_q > 0))

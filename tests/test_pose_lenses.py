@@ -1,0 +1,180 @@
+"""The lens that photos can hold, and the uncertainty of their poses, against models with known truth."""
+
+import numpy as np
+import pycolmap
+import pytest
+import synthetic_captures as synthetic
+from synthetic_captures import Lens
+
+from nerfcli.poses import held_out
+from nerfcli.poses.intrinsics import choose_lenses, converted
+from nerfcli.poses.uncertainty import pose_blur_px
+
+
+def ring_model(name: str, params: tuple[float, ...], *, seed: int = 0) -> pycolmap.Reconstruction:
+    """Twelve photos around a boulder in a room, so that pictures are full to the corners; half a pixel of noise."""
+    views = synthetic.ring(12, [Lens(name, 1024, 768, params)], seed=1, radius=2.5)
+    scene = synthetic.together(synthetic.boulder(150, seed=2), synthetic.room(350, seed=3))
+    return synthetic.observed_model(views, scene, noise_px=0.5, seed=seed)
+
+
+def synthetic_model(
+    name: str, params: list[float], *, photos: int = 12, points: int = 250, noise_px: float = 0.5, seed: int = 0
+) -> tuple[pycolmap.Reconstruction, pycolmap.Reconstruction]:
+    """The truth, and the same with noise in the observations."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = 1
+    options.num_frames_per_rig = photos
+    options.num_points3D = points
+    options.num_points2D_without_point3D = 0
+    options.camera_model_id = getattr(pycolmap.CameraModelId, name)
+    options.camera_params = params
+    pycolmap.set_random_seed(3)
+    truth = pycolmap.synthesize_dataset(options)
+    noisy = pycolmap.Reconstruction(truth)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = noise_px
+    pycolmap.set_random_seed(seed + 1)
+    pycolmap.synthesize_noise(noise, noisy)
+    noisy.update_point_3d_errors()
+    return truth, noisy
+
+
+def started_from(model: pycolmap.Reconstruction, name: str) -> pycolmap.Reconstruction:
+    """The model as a mapper leaves it that knew one distortion term and no principal point."""
+    started = pycolmap.Reconstruction(model)
+    for camera in started.cameras.values():
+        camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
+        simple = converted(camera, name)
+        camera.model = simple.model
+        camera.params = simple.params.tolist()
+    held_out.adjust(started, threads=1)
+    return started
+
+
+def camera_of(model: pycolmap.Reconstruction) -> pycolmap.Camera:
+    return next(iter(model.cameras.values()))
+
+
+@pytest.mark.parametrize(
+    ("name", "params"),
+    [
+        ("SIMPLE_RADIAL", (800.0, 512.0, 384.0, 0.05)),
+        ("RADIAL", (800.0, 512.0, 384.0, 0.08, -0.12)),
+        ("OPENCV_FISHEYE", (380.0, 380.0, 512.0, 384.0, 0.1, -0.05, 0.03, -0.02)),
+    ],
+)
+def test_the_lens_model_is_the_one_that_took_the_pictures(name: str, params: tuple[float, ...]):
+    """Synthetic truth; nothing richer is kept than what was there, and the principal point stays at the centre."""
+    chosen, tried = choose_lenses(started_from(ring_model(name, params), "SIMPLE_RADIAL"), seed=0, threads=1)
+    camera = camera_of(chosen)
+    assert camera.model.name == name
+    assert (camera.principal_point_x, camera.principal_point_y) == (512.0, 384.0)
+    assert camera.mean_focal_length() == pytest.approx(params[0], rel=0.005)
+    kept = [candidate for candidate in tried if candidate.kept]
+    assert kept[-1].model == name
+    # Half a pixel of noise in both coordinates is a mean distance of 0.63 px; points of few photos are uncertain too.
+    assert kept[-1].held_out_px is not None
+    assert 0.6 < kept[-1].held_out_px < 1.3
+
+
+def test_a_principal_point_off_the_centre_is_found():
+    """Synthetic truth: 1.5 % of the width off, recovered to two pixels."""
+    noisy = ring_model("SIMPLE_RADIAL", (800.0, 527.0, 380.0, 0.05))
+    chosen, tried = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1)
+    assert camera_of(chosen).params[1:3] == pytest.approx((527.0, 380.0), abs=2.0)
+    assert any(candidate.principal_point and candidate.kept for candidate in tried)
+
+
+def test_intrinsics_that_are_given_stay():
+    _, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 527.0, 380.0, 0.05])
+    camera_of(noisy).params = [1300.0, 512.0, 384.0, 0.04]
+    chosen, tried = choose_lenses(noisy, seed=0, threads=1, fixed=[1])
+    assert camera_of(chosen).params.tolist() == [1300.0, 512.0, 384.0, 0.04]
+    assert tried == []
+
+
+def test_a_named_model_stays():
+    noisy = ring_model("RADIAL", (1000.0, 512.0, 384.0, 0.1, -0.2))
+    chosen, tried = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1, named=[1])
+    assert camera_of(chosen).model.name == "SIMPLE_RADIAL"
+    assert {candidate.model for candidate in tried} == {"SIMPLE_RADIAL"}
+
+
+@pytest.mark.parametrize("name", ["RADIAL", "OPENCV", "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"])
+def test_a_converted_lens_sees_the_same(name: str):
+    """To a pixel in the corners of a normal lens."""
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 900.0, 1024, 768)
+    camera.params = [900.0, 512.0, 384.0, -0.05]
+    pixels = np.random.default_rng(0).uniform(0, [1024, 768], size=(50, 2))
+    rays = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64)
+    assert converted(camera, name).img_from_cam(rays) == pytest.approx(pixels, abs=1.0)
+
+
+def test_held_out_observations_are_a_tenth_and_off_by_the_noise():
+    """Without adjustment each is off by a Rayleigh distance, whose median is 1.177 sigma."""
+    truth, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], points=600)
+    _, held = held_out.split(noisy, seed=0)
+    errors = held_out.errors_px(truth, held)
+    assert len(errors) == pytest.approx(0.1 * noisy.compute_num_observations(), rel=0.25)
+    assert np.median(errors) == pytest.approx(0.5 * 1.177, rel=0.1)
+    training, _ = held_out.split(noisy, seed=0)
+    assert training.compute_num_observations() == noisy.compute_num_observations() - len(errors)
+
+
+def test_the_residuals_tell_the_noise():
+    _, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], noise_px=0.8)
+    held_out.adjust(noisy, threads=1)
+    assert held_out.residual_deviation_px(noisy) == pytest.approx(0.8, rel=0.05)
+
+
+def test_pose_blur_is_how_far_pictures_really_move():
+    """Monte Carlo: 24 captures with the same truth and other noise; every photo's predicted motion within a third."""
+    predicted, moved = [], []
+    for seed in range(24):
+        truth, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], photos=8, points=120, seed=seed)
+        held_out.adjust(noisy, threads=1)
+        if seed < 3:
+            blur = pose_blur_px(noisy, threads=1)
+            predicted.append([blur[image_id] for image_id in sorted(blur)])
+        moved.append(_picture_motion(truth, noisy))
+    ratio = np.mean(predicted, axis=0) / np.sqrt(np.mean(moved, axis=0))
+    assert ratio == pytest.approx(1.0, abs=0.33)
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.15)
+
+
+def _picture_motion(truth: pycolmap.Reconstruction, found: pycolmap.Reconstruction) -> list[float]:
+    """Mean squared motion of the true points in each photo, after the similarity that fits all points best."""
+    source = np.array([found.point3D(i).xyz for i in sorted(found.point3D_ids())])
+    target = np.array([truth.point3D(i).xyz for i in sorted(truth.point3D_ids())])
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    u, sizes, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    scale = sizes.sum() / ((source - source_mean) ** 2).sum()
+    moved = pycolmap.Reconstruction(found)
+    moved.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), target_mean - scale * rotation @ source_mean))
+    motions = []
+    for image_id in sorted(truth.reg_image_ids()):
+        pixels = [
+            np.asarray(camera_of(model).img_from_cam(_local(model.image(image_id), target))) for model in (truth, moved)
+        ]
+        motions.append(float(((pixels[0] - pixels[1]) ** 2).sum(axis=1).mean()))
+    return motions
+
+
+def _local(image: pycolmap.Image, points: np.ndarray) -> np.ndarray:
+    pose = image.cam_from_world()
+    return points @ pose.rotation.matrix().T + pose.translation
+
+
+def test_the_blur_grows_with_the_noise_and_does_not_depend_on_the_frame():
+    """Law: proportional to the noise's standard deviation; unchanged by a similarity of the world."""
+    blurs = []
+    for noise_px in (0.5, 1.0):
+        _, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 512.0, 384.0, 0.05], noise_px=noise_px)
+        blurs.append(pose_blur_px(noisy, threads=1))
+    assert [blurs[1][i] / blurs[0][i] for i in sorted(blurs[0])] == pytest.approx([2.0] * 12, rel=0.1)
+    turned = pycolmap.Reconstruction(noisy)
+    turned.transform(pycolmap.Sim3d(7.0, pycolmap.Rotation3d(np.array([0.1, 2.0, -0.4])), np.array([3.0, 1.0, -8.0])))
+    again = pose_blur_px(turned, threads=1)
+    assert [again[i] for i in sorted(again)] == pytest.approx([blurs[1][i] for i in sorted(again)], rel=1e-3)

@@ -1,0 +1,248 @@
+"""Poses against synthetic truth: right ones are accepted with the right accuracy, wrong ones refused with the reason.
+
+Features and matches are drawn for known cameras (benchmarks/synthetic_captures.py); from the verification of matches on
+everything is real.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import synthetic_captures as synthetic
+from synthetic_captures import LONG, WIDE, Noise, Scene, View
+
+from nerfcli.poses import merging
+from nerfcli.poses.acceptance import judge, leave_out_contradicting
+from nerfcli.poses.examine import Examined, examine
+from nerfcli.poses.job import Job
+from nerfcli.poses.ladder import Climb, climb
+from nerfcli.poses.parallax import best_turn
+from nerfcli.poses.two_views import read_verified_pairs, rotation_errors
+from nerfcli.poses.view_graph import Bottlenecks, parts
+
+pytestmark = pytest.mark.usefixtures("_quiet")
+
+
+@pytest.fixture(scope="module")
+def _quiet() -> None:
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+
+
+@dataclass(frozen=True)
+class Solved:
+    views: Sequence[View]
+    job: Job
+    climbed: Climb
+    examined: Examined
+
+    @property
+    def model(self) -> pycolmap.Reconstruction:
+        assert self.examined.model is not None
+        return self.examined.model
+
+    @property
+    def kinds(self) -> list[str]:
+        return [failure.kind for failure in self.examined.verdict.failures]
+
+
+def solve(folder: Path, views: Sequence[View], scene: Scene, noise: Noise = Noise(), **options) -> Solved:
+    synthetic.write_database(folder / "database.db", views, scene, noise=noise, seed=0, **options)
+    job = synthetic.synthetic_job(folder, views, seed=0)
+    climbed = climb(job, lambda *told: None)
+    return Solved(views, job, climbed, examine(climbed.models, climbed.job, lambda *told: None))
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Solved:
+    """Two cameras, a fifth of the matches wrong, three photos in ten unmatched."""
+    views = synthetic.ring(10, [WIDE, LONG], seed=0, turn_deg=200)
+    return solve(tmp_path_factory.mktemp("right"), views, synthetic.boulder(900, seed=0), Noise(outliers=0.2))
+
+
+def test_a_right_result_is_accepted_and_right(solved: Solved):
+    """Synthetic truth: relative rotations within 0.4 degrees, focal lengths within 1 %."""
+    assert solved.examined.verdict.accepted
+    assert solved.examined.left_out == {}
+    assert solved.model.num_reg_images() == 10
+    truth = synthetic.true_model(solved.views)
+    first, true_first = solved.model.image(1).cam_from_world(), truth.image(1).cam_from_world()
+    for image_id in range(2, 11):
+        found = solved.model.image(image_id).cam_from_world() * first.inverse()
+        true = truth.image(image_id).cam_from_world() * true_first.inverse()
+        assert np.degrees((found.rotation * true.rotation.inverse()).angle()) < 0.4
+    for camera_id, camera in solved.model.cameras.items():
+        assert camera.mean_focal_length() == pytest.approx(truth.camera(camera_id).mean_focal_length(), rel=0.01)
+
+
+def test_what_was_measured_on_a_right_result_is_as_it_must_be(solved: Solved):
+    measures = solved.examined.verdict.measures
+    assert measures["pairs"]["contradicting"] == 0
+    assert measures["strong_contradictions"] == []
+    assert measures["strong_contradictions_share"] == 0
+    assert measures["share_in_front"] == 1
+    # Half a pixel of noise in each coordinate, and the point's own error: a Rayleigh median of 0.6 px and more.
+    assert 0.5 < measures["held_out"]["median_px"] < 1.2
+    assert measures["parallax_px"] > 10
+    # A ring of radius 3.5 around a ball of radius 1, seen from 2.5 at the nearest.
+    assert 0.7 < measures["camera_spread_over_distance"] < 1.5
+
+
+def test_every_rotation_of_a_pair_agrees_with_a_right_result(solved: Solved):
+    with pycolmap.Database.open(str(solved.job.database)) as database:
+        pairs = read_verified_pairs(database, min_matches=30)
+    errors = rotation_errors(solved.model, pairs, seed=0)
+    assert len(errors) > 15
+    assert np.median([error.degrees for error in errors]) < 1
+    assert max(error.degrees for error in errors) < 6
+
+
+def bent(model: pycolmap.Reconstruction, first: int) -> pycolmap.Reconstruction:
+    """The photos from `first` on and half of the points turned by 40 degrees about an axis outside the scene.
+
+    All residuals within either half stay as they are; observations across are deleted, as a mapper would.
+    """
+    wrong = pycolmap.Reconstruction(model)
+    angle = np.radians(40)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    move = pycolmap.Rigid3d(np.column_stack([turn, [2.0, 0.0, 0.5]]))
+    for point_id in sorted(wrong.point3D_ids()):
+        elements = [(element.image_id, element.point2D_idx) for element in wrong.point3D(point_id).track.elements]
+        moved = sum(image_id >= first for image_id, _ in elements) > len(elements) / 2
+        for image_id, index in elements:
+            if (image_id >= first) != moved and wrong.exists_point3D(point_id):
+                wrong.delete_observation(image_id, index)
+        if moved and wrong.exists_point3D(point_id):
+            wrong.point3D(point_id).xyz = move * wrong.point3D(point_id).xyz
+    for image_id in wrong.reg_image_ids():
+        if image_id >= first:
+            frame = wrong.frame(wrong.image(image_id).frame_id)
+            frame.rig_from_world = wrong.image(image_id).cam_from_world() * move.inverse()
+    wrong.update_point_3d_errors()
+    return wrong
+
+
+def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
+    """Two halves, each right in itself: what the reprojection error praises, the matches between them refuse."""
+    wrong = bent(solved.model, 6)
+    assert wrong.compute_mean_reprojection_error() < 1.05 * solved.model.compute_mean_reprojection_error()
+    with pycolmap.Database.open(str(solved.job.database)) as database:
+        pairs = read_verified_pairs(database, min_matches=15)
+    same, left_out = leave_out_contradicting(wrong, pairs)
+    assert same is wrong
+    assert left_out == {}
+    verdict = judge(wrong, pairs, turn=None, names={"00005.jpg": "kitchen 5.jpg"}, seed=0, threads=1)
+    assert verdict.failures[0].kind == "the poses contradict the strongest matches"
+    assert "verified matches of" in verdict.failures[0].evidence
+
+
+def test_one_photo_that_contradicts_is_left_out(solved: Solved):
+    """A tenth of the photos; the others are accepted."""
+    wrong = bent(solved.model, 10)
+    with pycolmap.Database.open(str(solved.job.database)) as database:
+        pairs = read_verified_pairs(database, min_matches=15)
+    rest, left_out = leave_out_contradicting(wrong, pairs)
+    assert set(left_out) == {10}
+    assert left_out[10].startswith("contradicts the rest: its ")
+    assert rest.num_reg_images() == 9
+    assert judge(rest, pairs, turn=None, names={}, seed=0, threads=1).accepted
+
+
+def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
+    wrong = pycolmap.Reconstruction(solved.model)
+    frame = wrong.frame(wrong.image(10).frame_id)
+    pose = wrong.image(10).cam_from_world()
+    frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, pose.translation + np.array([0.0, 0.0, 300.0]))
+    with pycolmap.Database.open(str(solved.job.database)) as database:
+        pairs = read_verified_pairs(database, min_matches=15)
+    rest, left_out = leave_out_contradicting(wrong, pairs)
+    assert rest.num_reg_images() == 9
+    assert "times as far away as the others" in left_out[10]
+
+
+def test_a_scene_that_repeats_itself_is_recognised(tmp_path: Path):
+    """A body whose back looks like its front. The mapper places every photo at half a pixel, half of them wrong."""
+    folded = solve(tmp_path, synthetic.ring(18, [WIDE], seed=0), synthetic.twofold(1200, seed=0))
+    assert folded.model.num_reg_images() == 18
+    assert folded.model.compute_mean_reprojection_error() < 0.8
+    assert folded.kinds == ["parts of the scene look alike (repeated structure)"]
+
+
+def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
+    """What fits all matches is a turn, with the true focal length."""
+    views = synthetic.panorama(6, WIDE, turn_deg=120)
+    still = solve(tmp_path, views, synthetic.room(1800, seed=0))
+    assert still.kinds[0] == "no baseline (pure rotation)"
+    with pycolmap.Database.open(str(still.job.database)) as database:
+        pairs = read_verified_pairs(database, min_matches=30)
+    turn = best_turn(pairs, dict.fromkeys(still.job.image_ids, (WIDE.width, WIDE.height)))
+    assert turn is not None
+    assert turn.parallax_px < 1.5
+    assert turn.focal_px == pytest.approx(WIDE.params[0], rel=0.03)
+
+
+def test_parts_that_share_nothing_are_told_apart(tmp_path: Path):
+    far = (40.0, 0.0, 0.0)
+    scene = synthetic.together(synthetic.boulder(600, seed=0), synthetic.boulder(600, seed=1, centre=far))
+    views = [*synthetic.ring(6, [WIDE], seed=0, turn_deg=150), *synthetic.ring(4, [WIDE], seed=1, at=far, turn_deg=100)]
+    apart = solve(tmp_path, views, scene)
+    assert apart.examined.details["parts"] == [6, 4]
+    assert apart.examined.verdict.accepted
+    assert sorted(apart.model.reg_image_ids()) == [1, 2, 3, 4, 5, 6]
+
+
+def test_every_rung_is_written_down_with_its_result(tmp_path: Path):
+    """A boulder with too few features for any start: all cheap rungs are tried, and none places a photo."""
+    views = synthetic.ring(5, [WIDE], seed=0, turn_deg=60)
+    weak = solve(tmp_path, views, synthetic.boulder(70, seed=0), Noise(missed=0.1))
+    assert [rung["what"] for rung in weak.climbed.rungs] == [
+        "default thresholds",
+        "start from a smaller baseline",
+        "start from low angles",
+    ]
+    assert all(rung["models"] == [] for rung in weak.climbed.rungs)
+    assert weak.examined.model is None
+
+
+def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path):
+    """Two models of photos 1...6 and 6...10, the second turned, moved and three times as large, become the whole."""
+    first, second = (pycolmap.Reconstruction(solved.model) for _ in range(2))
+    for image_id in range(1, 11):
+        if image_id > 6:
+            first.deregister_frame(first.image(image_id).frame_id)
+        if image_id < 6:
+            second.deregister_frame(second.image(image_id).frame_id)
+    turn = pycolmap.Rotation3d(np.array([0.3, -0.4, 1.2]))
+    second.transform(pycolmap.Sim3d(3.0, turn, np.array([5.0, -2.0, 1.0])))
+    merged = merging.merge_models([first, second], solved.job.database, output=tmp_path / "merged", seed=0, threads=1)
+    assert [model.num_reg_images() for model in merged] == [10]
+    for image_id in range(2, 11):
+        poses = [model.image(image_id).cam_from_world() for model in (merged[0], solved.model)]
+        relative = [
+            pose * model.image(1).cam_from_world().inverse()
+            for pose, model in zip(poses, (merged[0], solved.model), strict=True)
+        ]
+        assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.3
+
+
+def test_models_with_nothing_in_common_stay_apart(solved: Solved, tmp_path: Path):
+    first = pycolmap.Reconstruction(solved.model)
+    second = pycolmap.Reconstruction(solved.model)
+    for image_id in range(1, 11):
+        model = first if image_id > 3 else second
+        model.deregister_frame(model.image(image_id).frame_id)
+    for point_id in sorted(second.point3D_ids()):
+        second.delete_point3D(point_id)
+    merged = merging.merge_models([second, first], solved.job.database, output=tmp_path / "m", seed=0, threads=1)
+    assert sorted(model.num_reg_images() for model in merged) == [3, 7]
+
+
+def test_the_bottleneck_is_the_weakest_join_of_the_strongest_chain():
+    """By hand: 1-2-3 holds with 5, the direct join with 2; 4 is alone with 5."""
+    chains = Bottlenecks([1, 2, 3, 4, 5], [(1, 2, 9.0), (2, 3, 5.0), (1, 3, 2.0), (4, 5, 1.0)])
+    assert chains.between(1, 3) == chains.between(3, 1) == 5
+    assert chains.between(1, 2) == 9
+    assert chains.between(1, 4) == 0
+    assert parts([1, 2, 3, 4, 5], [(1, 2), (2, 3), (1, 3), (4, 5)]) == [[1, 2, 3], [4, 5]]
