@@ -211,6 +211,7 @@ def _scene(root: Path, capture: Capture) -> Scene:
         test_names=test_names,
         points=capture.points,
         missing=capture.missing,
+        unit=capture.unit,
         depth_bounds=bounds,
         unit_source=capture.unit_source,
         rescaled=capture.rescaled,

@@ -209,7 +209,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train x --budget soon", "'soon' is not a time"),
         ("train x --device tpu", "'tpu'"),
         ("poses x --camera-model PERSPECTIVE", "'PERSPECTIVE'; choose auto"),
-        ("render x --depth expected", "'expected'; choose one of conditional, moment"),
+        ("render x --depth expected", "'expected'; choose conditional, moment"),
         ("render x --depth-axis y", "'y'; choose ray or z"),
         ("render x --outputs rgb,normals", "'normals'; choose some of rgb,depth,opacity"),
         ("render x --opacity-floor 1.5", "--opacity-floor"),

@@ -56,7 +56,7 @@ def listing(folder: Path) -> list[str]:
 
 
 def test_files_hold_what_was_rendered(model, tmp_path):
-    written = export(model, [frame("a.png")], tmp_path / "views", npy=True)
+    written = export(model, [frame("a.png")], tmp_path / "views", formats=("tiff", "npy"))
     assert written == [tmp_path / "views" / name for name in ("rgb", "depth", "opacity")]
     assert listing(tmp_path / "views") == [
         *("depth/a.json", "depth/a.npy", "depth/a.png", "depth/a.tiff"),
@@ -140,7 +140,7 @@ def test_names_stay_inside_the_folder():
 
 def test_frames_in_subfolders_with_equal_names(model, tmp_path):
     frames = [frame(name) for name in ("left/a.png", "right/a.png", "b.jpg", "b.png")]
-    export(model, frames, tmp_path / "views", npy=True)
+    export(model, frames, tmp_path / "views", formats=("tiff", "npy"))
     for output, suffix in (("rgb", "png"), ("depth", "tiff"), ("depth", "npy"), ("depth", "png"), ("opacity", "png")):
         found = [name for name in listing(tmp_path / "views" / output) if name.endswith(suffix)]
         assert sorted(f"{name}.{suffix}" for name in ("left/a", "right/a", "b.jpg", "b.png")) == found, output

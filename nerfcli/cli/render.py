@@ -7,6 +7,7 @@ import typer
 
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
+from nerfcli.cli.depth_options import DepthFormat, DepthScale, depth_formats, finite, level_scale
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
 from nerfcli.cli.playing import frame_range, one_of, video_settings
 from nerfcli.cli.views import Views, chosen_frames, write_frames
@@ -32,7 +33,7 @@ def render(
         Path | None,
         typer.Option(help="The dataparser_transforms.json of the nerfstudio run in whose world --cameras FILE is."),
     ] = None,
-    outputs: Annotated[str, typer.Option(help="Some of rgb,depth,opacity.")] = "rgb,depth,opacity",
+    outputs: Annotated[str, typer.Option(help="Some of rgb,depth,opacity,spread,disagreement.")] = "rgb,depth,opacity",
     depth: Annotated[
         str, typer.Option(help="Which depth: conditional, moment, background, max-weight, median or quantile:0.05.")
     ] = "conditional",
@@ -41,7 +42,8 @@ def render(
     background_distance: Annotated[
         float | None, typer.Option(help="What --depth background counts for light that passes, scene units.", min=0)
     ] = None,
-    npy: Annotated[bool, typer.Option("--npy", help="Depth as .npy beside the TIFF.")] = False,
+    depth_format: DepthFormat = "tiff",
+    depth_scale: DepthScale = "auto",
     colour_map: Annotated[str, typer.Option(help="Of depth to look at: turbo, viridis or grey.")] = "turbo",
     video: Annotated[bool, typer.Option("--video", help="A video of each output: --video-format mp4.")] = False,
     video_format: Annotated[
@@ -89,7 +91,8 @@ def render(
       max-weight     mean inside the interval that stops most light
       median         where half of all light has ended                     (NaN if less than half ends)
       quantile:0.05  where that share of all light has ended               (NaN if less ends)
-    Depth files are float32 TIFF; convention, axis, unit, opacity floor and invalid value are in each file.
+    spread is the standard deviation of where light ends, disagreement |median - conditional|: both are large where no
+    single depth is right (edges, glass, fog). Every file says what its numbers mean: nerfcli info FILE.
     Writes RUN/renders/CAMERAS/. A command that was interrupted goes on with the missing views when it is given again.
     A cluster renders --frames 0:100, --frames 100:200, ... at a time; without --frames the same command then assembles.
 
@@ -117,6 +120,10 @@ def render(
         raise typer.BadParameter(f"{depth!r}; choose {known}", param_hint="--depth")
     if depth_axis not in ("ray", "z"):
         raise typer.BadParameter(f"{depth_axis!r}; choose ray or z", param_hint="--depth-axis")
+    formats = depth_formats(depth_format, outputs=chosen, convention=depth)
+    scale = level_scale(depth_scale, formats=formats)
+    finite(background_distance, "--background-distance")
+    finite(min_opacity, "--min-opacity")
     console = Console(quiet=quiet, json_lines=json)
     request = DepthRequest(
         convention=depth, axis=depth_axis, min_opacity=min_opacity, background_distance=background_distance
@@ -128,7 +135,9 @@ def render(
         videos = video_settings(
             video_format or "mp4", layout=video_layout, direction=direction, fps=fps, crf=crf, loop=loop
         )
-    settings = ExportSettings(outputs=chosen, depth=request, npy=npy, colour_map=colour_map, video=videos)
+    settings = ExportSettings(
+        outputs=chosen, depth=request, formats=formats, depth_scale=scale, colour_map=colour_map, video=videos
+    )
     views = Views(cameras, count, through, nerfstudio_frame, max_size)
 
     def work(folder: Path, one_of_many: bool) -> None:
@@ -162,7 +171,7 @@ def render(
 
 def folder_name(views: Views, settings: "ExportSettings") -> str:
     """The folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
-    if "depth" not in settings.outputs:
+    if not settings.measured:
         return views.name
     return f"{views.name}-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}"
 

@@ -1,16 +1,18 @@
 """The walk over all frames of an order: what is missing is rendered, then what needs all of them is made."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from nerfcli.atomic import write_json
+from nerfcli.export.depth_files import write_levels
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import DESCRIPTION, Order
 from nerfcli.export.presentation import write_previews, write_videos
 from nerfcli.export.processes import render_in_processes
 from nerfcli.export.settings import depth_meta
 from nerfcli.export.unfinished import Unfinished, unfinished_of
+from nerfcli.media.levels import scale_in_words
 from nerfcli.render.model import Model
 
 
@@ -38,10 +40,11 @@ def export_frames(
 ) -> list[Path]:
     """Render every frame and write what was ordered; the folder appears when it is complete.
 
-    Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; rgb.mp4, depth.mp4,
-    opacity.mp4 or rgb+depth+opacity.mp4; render.json. The colours of all depth previews share one range, so that a
-    video does not flicker. Until then everything gathers in a hidden folder beside it, which stays when the command
-    ends early: the same order then renders the missing frames alone. Memory does not grow with the number of frames.
+    Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; exr/NAME.exr, npz/NAME.npz,
+    depth16/NAME.png; rgb.mp4, depth.mp4, opacity.mp4 or rgb+depth+opacity.mp4; render.json. The colours of all depth
+    previews share one range, so that a video does not flicker. Until then everything gathers in a hidden folder beside
+    it, which stays when the command ends early: the same order then renders the missing frames alone. Memory does not
+    grow with the number of frames.
 
     Args:
         model: the trained model.
@@ -63,11 +66,17 @@ def export_frames(
     _render_missing(model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers)
     meta = depth_meta(model, order.settings.depth)
     ranges = write_previews(unfinished.folder, order, meta)
+    levels = {}
+    if order.settings.in_levels:
+        scale = write_levels(unfinished.folder, order.names, settings=order.settings, meaning=meta)
+        levels = {"depth16": {"units_per_level": scale}}
+        notify(f"16-bit files: {scale_in_words(replace(meta, units_per_level=scale))}")
     write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
     description = {
         **order.of_pictures(),
         **order.settings.of_presentation(),
-        **({"depth_meaning": meta.to_json()} if "depth" in order.settings.outputs else {}),
+        **({"depth_meaning": meta.to_json()} if order.settings.measured else {}),
+        **levels,
         "ranges": ranges,
         "facts": {name: unfinished.facts(name) for name in order.names},
     }

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from nerfcli.cameras.frame import Frame
@@ -26,3 +26,8 @@ def describe_frames(frames: Sequence[Frame]) -> list[dict[str, Any]]:
         {"file": name, "camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
         for frame, name in zip(frames, file_names(frames), strict=True)
     ]
+
+
+def with_suffix(stem: Path, suffix: str) -> Path:
+    """The name with a suffix added; one that it has already stays, as it tells a.jpg from a.png."""
+    return stem.with_name(stem.name + suffix)

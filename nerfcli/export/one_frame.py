@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from nerfcli.export.depth_files import frame_meta
 from nerfcli.export.order import Order
 from nerfcli.export.picture_files import write_picture
 from nerfcli.export.settings import depth_meta
@@ -28,8 +29,9 @@ def render_frame(
         UserError: a file cannot be written.
     """
     frame, name, settings = order.frames[index], order.names[index], order.settings
-    wanted = settings.depth if "depth" in settings.outputs else None
+    wanted = settings.depth if settings.measured else None
     picture = render_picture(model, frame, background=model.background, depth=wanted, on_tile=on_rays)
-    meta = depth_meta(model, settings.depth)
+    facts = {"truncation_of_colour_max": float(picture.truncation_error.max())}
+    meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=order.provenance, error_bounds=facts)
     files = write_picture(picture, unfinished.folder, name, settings=settings, meta=meta, background=model.background)
-    unfinished.note(name, files, facts={})
+    unfinished.note(name, files, facts=facts)

@@ -55,7 +55,7 @@ class Order:
         """The paths to show: the videos if there are any, else the folders of the outputs."""
         video = self.settings.video
         if video is None:
-            return [folder / output for output in self.settings.outputs]
+            return [folder / output for output in (*self.settings.outputs, *self.settings.folders_of_formats)]
         together = ["+".join(self.settings.outputs)]
         names = together if video.layout == "side-by-side" else self.settings.outputs
         return [folder / f"{name}{FORMATS[form].suffix}" for form in video.formats for name in names]
@@ -88,6 +88,14 @@ class Order:
         made = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
         wanted = self.of_pictures() | self.settings.of_presentation()
         del wanted["nerfcli"]
+        depth, there = wanted["settings"]["depth"], made.get("settings", {}).get("depth")
+        if self.settings.measured and depth != there and isinstance(there, dict):
+            names = [name for name, value in depth.items() if there.get(name) != value]
+            differing = [f"{name} {there.get(name)}, not {depth[name]}" for name in names]
+            raise UserError(
+                f"{folder} holds depth of another meaning: {', '.join(differing)}",
+                "choose another place with -o; --overwrite replaces the whole folder, so that nothing is mixed",
+            )
         if any(made.get(key) != value for key, value in wanted.items()):
             raise UserError(f"{folder} exists", "add --overwrite to replace it, or choose another place with -o")
         return True

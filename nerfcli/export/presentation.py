@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from nerfcli import __version__
+from nerfcli.export.depth_files import read_map
 from nerfcli.export.order import Order
-from nerfcli.export.picture_files import read_values
-from nerfcli.export.settings import MEASURED
+from nerfcli.export.settings import MEASURED, floor_of
 from nerfcli.media.depth import KEY, DepthMeta
 from nerfcli.media.images import read_image, write_png
 from nerfcli.media.preview import beside, preview
@@ -37,14 +37,14 @@ def write_previews(folder: Path, order: Order, meta: DepthMeta) -> dict[str, tup
         UserError: a file cannot be read or written.
     """
     ranges = {}
-    for output in [output for output in order.settings.outputs if output in MEASURED]:
+    for output in order.settings.measured:
+        meaning = meta.of(output, opacity_floor=floor_of(order.settings.depth, output))
 
-        def maps(output: str = output) -> Iterator[np.ndarray]:
+        def maps(meaning: DepthMeta = meaning) -> Iterator[np.ndarray]:
             for name in order.names:
-                yield read_values(folder, output, name)
+                yield read_map(folder, name, meaning)
 
         lo, hi = ranges[output] = value_range(maps, output)
-        meaning = meta.of(output)
         metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": order.settings.colour_map}
         for name, values in zip(order.names, maps(), strict=True):
             picture = preview(values, meaning, lo=lo, hi=hi, colour_map=order.settings.colour_map)

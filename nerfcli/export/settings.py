@@ -4,12 +4,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from nerfcli.media.depth import DepthMeta
-from nerfcli.render.depth import DepthRequest, effective_floor
+from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
 
-OUTPUTS = ("rgb", "depth", "opacity")
+OUTPUTS = ("rgb", "depth", "opacity", "spread", "disagreement")
 # Those that are measured: floats on disk, and pictures in colours to look at.
-MEASURED = ("depth",)
+MEASURED = ("depth", "spread", "disagreement")
+FLOAT_FORMATS = ("tiff", "exr", "npy", "npz")
+FORMATS = (*FLOAT_FORMATS, "png16")
+# A file of these holds all that was asked for of a view, in a folder under the name of the format.
+TOGETHER = ("exr", "npz")
+LEVELS_FOLDER = "depth16"
 LAYOUTS = ("separate", "side-by-side")
 DIRECTIONS = ("forward", "reverse", "ping-pong")
 
@@ -42,27 +47,53 @@ class ExportSettings:
     Args:
         outputs: some of `OUTPUTS`.
         depth: which depth, where "depth" is among the outputs.
-        npy: depth as .npy beside the TIFF.
+        formats: some of `FORMATS`, for what is measured. 16-bit levels are made from floats, which stay beside them.
+        depth_scale: scene units per level of 16-bit files; None chooses the same for all frames.
         colour_map: of what is measured, one of `media.colour_maps.COLOUR_MAPS`.
         video: which videos; None for none.
     """
 
     outputs: tuple[str, ...]
     depth: DepthRequest
-    npy: bool = False
+    formats: tuple[str, ...] = ("tiff",)
+    depth_scale: float | None = None
     colour_map: str = "turbo"
     video: VideoSettings | None = None
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The outputs that are measured, in the order of `MEASURED`."""
+        return tuple(output for output in MEASURED if output in self.outputs)
+
+    @property
+    def float_formats(self) -> tuple[str, ...]:
+        """The formats of floats: at least one, because previews and levels are made from them."""
+        return tuple(name for name in FLOAT_FORMATS if name in self.formats) or FLOAT_FORMATS[:1]
+
+    @property
+    def folders_of_formats(self) -> tuple[str, ...]:
+        """The folders of files that hold all that was asked for of a view, and of levels."""
+        if not self.measured:
+            return ()
+        together = [name for name in self.float_formats if name in TOGETHER]
+        return (*together, *([LEVELS_FOLDER] if self.in_levels else []))
+
+    @property
+    def in_levels(self) -> bool:
+        """Whether depth is written in 16-bit levels too."""
+        return "png16" in self.formats and "depth" in self.outputs
 
     def of_pictures(self) -> dict[str, Any]:
         """Plain values of what decides over the rendered numbers and their files."""
         settings = asdict(self)
-        del settings["colour_map"], settings["video"]
-        return settings | {"outputs": list(self.outputs)}
+        del settings["colour_map"], settings["video"], settings["depth_scale"]
+        return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
 
     def of_presentation(self) -> dict[str, Any]:
         """Plain values of what decides over the previews and videos that are made of these files."""
         video = None if self.video is None else asdict(self.video) | {"formats": list(self.video.formats)}
-        return {"colour_map": self.colour_map, "video": video}
+        levels = {"scale": self.depth_scale or "auto"} if self.in_levels else None
+        return {"colour_map": self.colour_map, "levels": levels, "video": video}
 
 
 def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
@@ -71,6 +102,17 @@ def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
         convention=request.convention,
         axis=request.axis,
         unit=model.unit,
+        unit_source=model.unit_source,
         opacity_floor=effective_floor(request),
         background_distance=request.background_distance if request.convention == "background" else None,
     )
+
+
+def floor_of(request: DepthRequest, output: str) -> float:
+    """The opacity below which a pixel has no value in an output that is measured."""
+    match output:
+        case "depth":
+            return effective_floor(request)
+        case "spread":
+            return request.min_opacity
+    return max(request.min_opacity, MEDIAN)  # the disagreement: of the median, too, there must be one

@@ -31,7 +31,7 @@ _IN_WORDS = {
     "max-weight": "the mean place inside the interval that stops most light",
     "median": "the distance at which half of all light has ended",
     "standard-deviation": "the standard deviation of the distance at which light ends, given that it ends",
-    "median-conditional": "|median - conditional|: large where no single depth is right (edges, glass, fog)",
+    "median-conditional": "their disagreement, large where no single depth is right (edges, glass, fog)",
 }
 _WHAT_MUST_AGREE = (
     *("quantity", "convention", "axis", "unit", "opacity_floor", "background_distance"),
@@ -94,8 +94,9 @@ class DepthMeta:
 
     @property
     def title(self) -> str:
-        """A few words for legends: "conditional depth", "spread"."""
-        return f"{self.convention} depth" if self.quantity == "depth" else self.quantity
+        """A few words for legends: "conditional depth"."""
+        named = {"spread": "spread of depth", "disagreement": "|median - conditional| depth"}
+        return named.get(self.quantity, f"{self.convention} depth")
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, with the format and the version that wrote them."""

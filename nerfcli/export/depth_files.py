@@ -1,0 +1,166 @@
+"""What is measured of a picture, in files of any format: depth, spread, disagreement, each with its meaning.
+
+TIFF, NPY and 16-bit PNG hold one map each; OpenEXR and NPZ hold all that was asked for of a picture, and its opacity.
+16-bit levels are made last, from the floats, because all frames share the length of a level.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.export.names import with_suffix
+from nerfcli.export.settings import FLOAT_FORMATS, LEVELS_FOLDER, TOGETHER, ExportSettings, floor_of
+from nerfcli.media.arrays import read_arrays, write_npy, write_npz
+from nerfcli.media.depth import DepthMeta, difference_of, mixed
+from nerfcli.media.descriptions import depth_meta_of
+from nerfcli.media.exr import CHANNELS, read_exr, write_exr
+from nerfcli.media.float_tiff import read_tiff, write_tiff
+from nerfcli.media.levels import chosen_scale, write_png16
+from nerfcli.render.pictures import Picture
+
+_AXES_OF_VIEW = "OpenCV: +x right, +y down, +z forward; the top-left pixel's centre is (0.5, 0.5)"
+
+
+def map_path(folder: Path, output: str, name: str, file_format: str) -> Path:
+    """Where a map of a picture stands."""
+    match file_format:
+        case "exr" | "npz":
+            return with_suffix(folder / file_format / name, f".{file_format}")
+        case "png16":
+            return with_suffix(folder / LEVELS_FOLDER / name, ".png")
+        case _:
+            return with_suffix(folder / output / name, f".{file_format}")
+
+
+def frame_meta(
+    meta: DepthMeta, frame: Frame, *, provenance: Mapping[str, Any], error_bounds: Mapping[str, Any]
+) -> DepthMeta:
+    """The meaning of one frame's depth: `meta` with its camera, its origin and what rendering says of its own error."""
+    view = {
+        "name": frame.name,
+        "camera": frame.camera.to_json(),
+        "world_from_cam": frame.world_from_cam.tolist(),
+        "axes": _AXES_OF_VIEW,
+    }
+    return replace(meta, view=view, provenance=dict(provenance), error_bounds=dict(error_bounds))
+
+
+def write_maps(picture: Picture, folder: Path, name: str, *, settings: ExportSettings, meta: DepthMeta) -> list[Path]:
+    """Write what is measured of a picture in the float formats that `settings` asks for; each file atomically.
+
+    Args:
+        picture: with depth.
+        folder: of the export.
+        name: without suffix, with "/" between folders.
+        settings: the outputs and formats.
+        meta: of the depth of this frame, see `frame_meta`.
+
+    Returns:
+        The files, complete.
+
+    Raises:
+        UserError: a file cannot be written.
+    """
+    maps = {output: _map_of(picture, output) for output in settings.measured}
+    metas = {output: meta.of(output, opacity_floor=floor_of(settings.depth, output)) for output in maps}
+    written: list[Path] = []
+    for file_format in settings.float_formats:
+        if file_format in TOGETHER:
+            path = map_path(folder, "", name, file_format)
+            write = write_exr if file_format == "exr" else write_npz
+            colour = {"rgb": picture.rgb} if "rgb" in settings.outputs else {}
+            write(path, {**colour, **maps, "opacity": picture.opacity}, _meta_of_layers(metas))
+            written.append(path)
+            continue
+        for output, values in maps.items():
+            path = map_path(folder, output, name, file_format)
+            if file_format == "npy":
+                write_npy(path, values, metas[output])
+                written.append(path.with_suffix(".json"))
+            else:
+                write_tiff(path, values, metas[output])
+            written.append(path)
+    return written
+
+
+def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
+    """The floats (height, width) that `write_maps` wrote, NaN where invalid, from whichever format is there.
+
+    Args:
+        folder: of the export.
+        name: of the frame's files.
+        meaning: of the map, as all frames of the clip have it.
+
+    Raises:
+        UserError: there is none, it is damaged, or it means something else.
+    """
+    path, output = _floats_of(folder, name, meaning.quantity), meaning.quantity
+    found = depth_meta_of(path)
+    if found is not None and path.suffix in (".exr", ".npz"):
+        found = found.of(output, opacity_floor=found.layers.get(output, {}).get("opacity_floor"))
+    difference = "nothing says what it means" if found is None else difference_of(meaning, found)
+    if difference:
+        raise mixed(path, Path("the other frames"), difference)
+    match path.suffix:
+        case ".exr":
+            return read_exr(path)[CHANNELS[output]]
+        case ".npz":
+            return read_arrays(path)[output]
+        case ".npy":
+            return read_arrays(path)["array"]
+    return read_tiff(path)[0]
+
+
+def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings, meaning: DepthMeta) -> float:
+    """Write the depth of all frames as 16-bit levels of one length, from the floats that are there.
+
+    Args:
+        folder: of the export.
+        names: of the frames, all of which `write_maps` has written.
+        settings: the length of a level, or None to choose it so that all frames fit.
+        meaning: of the depth, as all frames have it.
+
+    Returns:
+        The length of a level in scene units.
+
+    Raises:
+        UserError: a depth does not fit, or a file cannot be written.
+    """
+
+    def depths() -> Iterator[np.ndarray]:
+        for name in names:
+            yield read_map(folder, name, meaning)
+
+    scale = settings.depth_scale
+    if scale is None:
+        largest = max((float(depth[np.isfinite(depth)].max(initial=0.0)) for depth in depths()), default=0.0)
+        scale = chosen_scale(largest, meaning.unit)
+    for name, depth in zip(names, depths(), strict=True):
+        meta = depth_meta_of(_floats_of(folder, name, "depth")) or meaning
+        path = map_path(folder, "depth", name, "png16")
+        write_png16(path, depth, replace(meta, layers={}), units_per_level=scale)
+    return scale
+
+
+def _floats_of(folder: Path, name: str, output: str) -> Path:
+    """The file that holds the floats of a map; the TIFF's path where there is none."""
+    paths = [map_path(folder, output, name, file_format) for file_format in FLOAT_FORMATS]
+    return next((path for path in paths if path.exists()), paths[0])
+
+
+def _map_of(picture: Picture, output: str) -> np.ndarray:
+    values: np.ndarray | None = getattr(picture, output)
+    if values is None:
+        raise ValueError(f"the picture was rendered without {output}")
+    return values
+
+
+def _meta_of_layers(metas: Mapping[str, DepthMeta]) -> DepthMeta:
+    """The meaning of the first map, with what the others in the same file are."""
+    first, *others = metas.values()
+    layers = {meta.quantity: {"convention": meta.convention, "opacity_floor": meta.opacity_floor} for meta in others}
+    return replace(first, layers={**layers, "opacity": {"convention": "1 - transmittance"}})

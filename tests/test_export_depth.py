@@ -1,0 +1,167 @@
+"""What is measured, in files of every format: the numbers of the picture, with the meaning of the map and the view."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+import pytest
+import tifffile
+from fog import fog, foggy_cells
+from PIL import Image
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.errors import UserError
+from nerfcli.export.depth_files import map_path, read_map, write_maps
+from nerfcli.export.frames import export_frames
+from nerfcli.export.order import Order
+from nerfcli.export.settings import MEASURED, ExportSettings, depth_meta, floor_of
+from nerfcli.media.descriptions import depth_meta_of
+from nerfcli.media.exr import linear_light
+from nerfcli.render.model import Model
+from nerfcli.render.pictures import DepthRequest, Picture, render_picture
+
+CAMERA = Camera.pinhole(10, 8, 8.0)
+DEPTH = DepthRequest("conditional", "z", min_opacity=0.1)
+OUTPUTS = ("rgb", *MEASURED)
+
+
+@pytest.fixture
+def model() -> Model:
+    """A cube of fog in metres, said to be measured by GPS."""
+    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    foggy = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32, unit="metre")
+    return replace(foggy, unit_source="gps")
+
+
+def frame(name: str, distance: float = 2.0) -> Frame:
+    return Frame(name, CAMERA, look_at(np.array([0.0, 0.0, -distance]), np.zeros(3), np.array([0.0, -1.0, 0.0])))
+
+
+def ordered(frames: list[Frame], **settings: Any) -> Order:
+    wanted = {"outputs": OUTPUTS, "depth": DEPTH} | settings
+    return Order(tuple(frames), ExportSettings(**wanted), {"run": "a run", "field_sha256": "ab"})
+
+
+def export(model: Model, order: Order, folder: Path) -> list[str]:
+    """The notes of an export."""
+    notes: list[str] = []
+    export_frames(model, order, folder, on_rays=lambda rays: None, notify=notes.append)
+    return notes
+
+
+def pictured(model: Model, name: str = "a", distance: float = 2.0) -> Picture:
+    return render_picture(model, frame(name, distance), background=model.background, depth=DEPTH)
+
+
+def test_every_format_holds_the_maps_of_the_picture(model, tmp_path):
+    export(model, ordered([frame("a.png")], formats=("tiff", "exr", "npy", "npz")), tmp_path / "views")
+    picture = pictured(model)
+    with OpenEXR.File(str(tmp_path / "views/exr/a.exr"), separate_channels=True) as file:
+        channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    archive = np.load(tmp_path / "views/npz/a.npz", allow_pickle=False)
+    for output, channel in zip(MEASURED, ("Z", "spread.V", "disagreement.V"), strict=True):
+        expected = getattr(picture, output)
+        assert np.isfinite(expected).any()
+        assert np.isnan(expected).any()
+        tiff = tifffile.imread(tmp_path / "views" / output / "a.tiff")
+        npy = np.load(tmp_path / "views" / output / "a.npy")
+        for found in (channels[channel], archive[output], tiff, npy):
+            np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(channels["opacity.V"], picture.opacity)
+    np.testing.assert_array_equal(channels["R"], linear_light(picture.rgb)[..., 0])
+    np.testing.assert_array_equal(archive["rgb"], picture.rgb)
+
+
+@pytest.mark.parametrize("file_format", ["tiff", "exr", "npy", "npz", "png16"])
+def test_every_file_says_what_it_is_and_who_saw_it(file_format, model, tmp_path):
+    export(model, ordered([frame("a.png")], formats=(file_format,)), tmp_path / "views")
+    meta = depth_meta_of(map_path(tmp_path / "views", "depth", "a", file_format))
+    assert meta is not None
+    assert (meta.convention, meta.axis, meta.opacity_floor) == ("conditional", "z", 0.1)
+    assert (meta.unit, meta.unit_source) == ("metre", "gps")
+    assert Camera.from_json(meta.view["camera"]) == CAMERA
+    assert meta.view["name"] == "a.png"
+    np.testing.assert_array_equal(meta.view["world_from_cam"], frame("a").world_from_cam)
+    assert meta.provenance == {"run": "a run", "field_sha256": "ab"}
+    assert meta.error_bounds["truncation_of_colour_max"] == float(pictured(model).truncation_error.max())
+
+
+def test_maps_beside_depth_state_their_own_convention_and_floor(model, tmp_path):
+    """The median exists only where half of the light ends; the spread wherever depth is valid."""
+    export(model, ordered([frame("a")], formats=("tiff", "exr")), tmp_path / "views")
+    for output, convention, floor in (
+        ("spread", "standard-deviation", 0.1),
+        ("disagreement", "median-conditional", 0.5),
+    ):
+        meta = depth_meta_of(tmp_path / "views" / output / "a.tiff")
+        assert meta is not None
+        assert (meta.quantity, meta.convention, meta.opacity_floor) == (output, convention, floor)
+        assert floor_of(DEPTH, output) == floor
+    whole = depth_meta_of(tmp_path / "views/exr/a.exr")
+    assert whole is not None
+    assert whole.layers["disagreement"] == {"convention": "median-conditional", "opacity_floor": 0.5}
+
+
+def test_levels_of_a_clip_in_metres_are_millimetres(model, tmp_path):
+    notes = export(model, ordered([frame("a"), frame("b", 3.0)], formats=("png16",)), tmp_path / "views")
+    assert "16-bit files: a level is 1 mm, 0 is no value" in notes
+    for name, distance in (("a", 2.0), ("b", 3.0)):
+        depth = pictured(model, name, distance).depth
+        assert depth is not None
+        levels = np.asarray(Image.open(tmp_path / "views/depth16" / f"{name}.png"))
+        expected = np.where(np.isnan(depth), 0, np.rint(depth.astype(np.float64) * 1000))
+        np.testing.assert_array_equal(levels, expected)
+        # The floats that they were made of stay.
+        np.testing.assert_array_equal(tifffile.imread(tmp_path / "views/depth" / f"{name}.tiff"), depth)
+    description = json.loads((tmp_path / "views/render.json").read_text())
+    assert description["depth16"] == {"units_per_level": 1e-3}
+
+
+def test_levels_that_are_too_short_leave_the_earlier_export_alone(model, tmp_path):
+    export(model, ordered([frame("a")]), tmp_path / "views")
+    before = {path: path.read_bytes() for path in (tmp_path / "views").rglob("*") if path.is_file()}
+    with pytest.raises(UserError, match=r"16 bits hold depths up to 0\.65535 at 1e-05 per level; one is"):
+        export(model, ordered([frame("a")], formats=("png16",), depth_scale=1e-5), tmp_path / "views")
+    assert {path: path.read_bytes() for path in (tmp_path / "views").rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("file_format", ["tiff", "exr", "npy", "npz"])
+def test_a_file_of_another_meaning_is_not_read_into_a_clip(file_format, model, tmp_path):
+    """Previews, levels and videos are made from the files: a foreign one among them is refused with its name."""
+    settings = ordered([], formats=(file_format,)).settings
+    meaning = depth_meta(model, DEPTH)
+    write_maps(pictured(model), tmp_path, "a", settings=settings, meta=meaning)
+    for output in MEASURED:
+        expected = meaning.of(output, opacity_floor=floor_of(DEPTH, output))
+        np.testing.assert_array_equal(read_map(tmp_path, "a", expected), getattr(pictured(model), output))
+    write_maps(pictured(model), tmp_path, "a", settings=settings, meta=replace(meaning, axis="ray"))
+    with pytest.raises(UserError, match=r"a\.\w+ and the other frames do not mean the same: axis z and ray"):
+        read_map(tmp_path, "a", meaning)
+
+
+def test_depth_without_a_meaning_is_not_read_into_a_clip(model, tmp_path):
+    tifffile.imwrite(tmp_path / "a.tiff", np.zeros((8, 10), np.float32))
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "a.tiff").rename(tmp_path / "depth/a.tiff")
+    with pytest.raises(UserError, match="nothing says what it means"):
+        read_map(tmp_path, "a", depth_meta(model, DEPTH))
+
+
+@pytest.mark.parametrize(
+    ("other", "told"),
+    [
+        (DepthRequest("median", "z", min_opacity=0.1), "convention conditional, not median"),
+        (DepthRequest("conditional", "ray", min_opacity=0.1), "axis z, not ray"),
+        (DepthRequest("conditional", "z", min_opacity=0.2), "min_opacity 0.1, not 0.2"),
+    ],
+)
+def test_a_folder_of_another_meaning_is_told_as_that(other, told, model, tmp_path):
+    export(model, ordered([frame("a")], outputs=("depth",)), tmp_path / "views")
+    with pytest.raises(UserError, match=f"views holds depth of another meaning: {told}"):
+        ordered([frame("a")], outputs=("depth",), depth=other).is_held_by(tmp_path / "views")
+    assert ordered([frame("a")], outputs=("depth",)).is_held_by(tmp_path / "views")
