@@ -32,6 +32,17 @@ def quadrature_of_end_density(density, starts, ends, steps=20000):
     return mass, first
 
 
+def quadrature_of_squares(density, starts, ends, steps=20000):
+    """Integral of t^2 p(t), as in `quadrature_of_end_density`."""
+    second, depth = 0.0, 0.0
+    for s, t0, t1 in zip(density, starts, ends, strict=True):
+        h = (t1 - t0) / steps
+        t = t0 + (np.arange(steps) + 0.5) * h
+        second += (t * t * s * np.exp(-(depth + s * (t - t0)))).sum() * h
+        depth += s * (t1 - t0)
+    return second
+
+
 def trilinear_hash(point, table, resolutions, primes=(1, 2654435761, 805459861)):
     """One point through the hash grid with Python integers."""
     out = []

@@ -1,12 +1,16 @@
-"""The five depths against quadrature, float64, and at the points where they degenerate."""
+"""The depths against quadrature, float64, and at the points where they degenerate."""
 
+import itertools
 import math
+from decimal import Decimal, localcontext
 
+import numpy as np
 import pytest
 import torch
+from conftest import TOLERANCE
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import quadrature_of_end_density
+from oracles import quadrature_of_end_density, quadrature_of_squares
 
 from nerfcli import kernels
 from nerfcli.kernels import depth
@@ -41,32 +45,50 @@ def test_one_place_per_interval_is_not_the_moment():
 
 
 @settings(deadline=None)  # the first call imports
-@given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 4), at=st.floats(0.01, 0.99))
-def test_splitting_an_interval_moves_no_depth_but_max_weight(seed, cut, at):
-    density, starts, ends, offsets = ray(seed)
+@given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 4), at=st.floats(0.01, 0.99), exponent=st.floats(-12.0, 6.0))
+def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exponent):
+    density, starts, ends, offsets = ray(seed, scale=10.0**exponent)
     middle = starts[cut] + at * (ends[cut] - starts[cut])
-    split = (
+    split = depth.light_ends(
         torch.cat([density[: cut + 1], density[cut:]]),
         torch.cat([starts[: cut + 1], middle[None], starts[cut + 1 :]]),
         torch.cat([ends[:cut], middle[None], ends[cut:]]),
-        torch.tensor([0, 6]),
+        offsets=torch.tensor([0, 6]),
+        shares=(0.05, 0.5, 0.9),
     )
-    for convention in (lambda *r: _conditional(*r), lambda d, s, e, o: depth.quantile(d, s, e, offsets=o, share=0.5)):
+    whole = depth.light_ends(density, starts, ends, offsets=offsets, shares=(0.05, 0.5, 0.9))
+    for name in ("opacity", "transmittance", "mean", "spread", "quantiles"):
+        # Lengths are differences of distances, which lie below 6.
         torch.testing.assert_close(
-            convention(*split), convention(density, starts, ends, offsets), rtol=1e-11, atol=0, equal_nan=True
-        )
+            getattr(split, name), getattr(whole, name), rtol=1e-11, atol=1e-14 if name == "spread" else 0,
+            equal_nan=True, msg=lambda text, name=name: f"{name}: {text}",
+        )  # fmt: skip
 
 
-def _conditional(density, starts, ends, offsets):
-    weights, _ = kernels.interval_weights(density, ends - starts, offsets)
-    means = depth.interval_means(density, starts, ends)
-    return depth.conditional(weights, means, offsets)
+@pytest.mark.parametrize("seed", range(4))
+def test_spread_is_the_standard_deviation_of_the_end_density(seed):
+    density, starts, ends, offsets = ray(seed)
+    light = depth.light_ends(density, starts, ends, offsets=offsets, shares=())
+    mean = light.mean.item()
+    mass, first = quadrature_of_end_density(density.numpy(), starts.numpy() - mean, ends.numpy() - mean)
+    assert first / mass == pytest.approx(0, abs=1e-8)
+    second = quadrature_of_squares(density.numpy(), starts.numpy() - mean, ends.numpy() - mean)
+    assert light.spread.item() == pytest.approx(math.sqrt(second / mass), rel=1e-7)
 
 
-def test_mean_fraction_in_float32_across_magnitudes():
-    x = torch.logspace(-12, 6, 2000, dtype=torch.float64).float()
-    exact = depth.mean_fraction(x.double())
-    assert ((depth.mean_fraction(x).double() - exact).abs() / exact).max() < 1e-6
+@pytest.mark.parametrize("fraction", [depth.mean_fraction, depth.variance_fraction])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 2e-14), (torch.float32, 2e-6)])
+def test_fractions_across_magnitudes_against_sixty_digits(fraction, dtype, tolerance):
+    x = torch.cat([torch.logspace(-12, 6, 400, dtype=dtype), torch.linspace(0.2, 1.2, 200, dtype=dtype)])
+    with localcontext() as context:
+        context.prec = 60
+        values = [Decimal(value) for value in x.double().tolist()]
+        if fraction is depth.mean_fraction:
+            exact = [1 / v - 1 / (v.exp() - 1) for v in values]
+        else:
+            exact = [1 / (v * v) - v.exp() / (v.exp() - 1) ** 2 for v in values]
+    wanted = torch.tensor([float(value) for value in exact], dtype=torch.float64)
+    assert ((fraction(x).double() - wanted) / wanted).abs().max() < tolerance
 
 
 def test_mean_fraction_branches_meet():
@@ -86,6 +108,95 @@ def test_mean_fraction_gradient_at_the_extremes(x, slope, dtype):
 def test_mean_fraction_gradcheck_on_both_sides_of_the_series():
     x = torch.tensor([0.01, 0.2, 0.3, 2.0, 40.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(depth.mean_fraction, x)
+
+
+@pytest.mark.parametrize("name", ["opacity", "transmittance", "mean", "spread", "heaviest", "largest", "quantiles"])
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 30.0])
+def test_gradcheck(name, scale):
+    density, starts, ends, _ = ray(7, count=6, scale=scale)
+    offsets = torch.tensor([0, 0, 2, 6])
+    arguments = tuple(x.clone().requires_grad_() for x in (density, starts, ends))
+
+    def function(*values):
+        result = getattr(depth.light_ends(*values, offsets=offsets, shares=(0.001, 0.4)), name)
+        return result[~result.isnan()]
+
+    assert len(function(*arguments)) >= 2
+    assert torch.autograd.gradcheck(function, arguments, atol=1e-7)
+
+
+def test_gradients_are_finite_at_the_extremes():
+    density = torch.tensor([0.0, 1e-12, 1e6, 0.0], dtype=torch.float64, requires_grad=True)
+    starts = torch.arange(4, dtype=torch.float64)
+    light = depth.light_ends(density, starts, starts + 1, offsets=torch.tensor([0, 1, 4]), shares=(0.5,))
+    total = sum(torch.where(values.isnan(), 0.0, values).sum() for values in light)
+    assert isinstance(total, torch.Tensor)
+    (gradient,) = torch.autograd.grad(total, density)
+    assert torch.isfinite(gradient).all()
+
+
+def many_rays(seed, counts, *, low, high):
+    """Packed float32 rays whose optical depths per interval are log-uniform, with empty intervals and gaps."""
+    random = np.random.default_rng(seed)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    starts, ends = (np.empty(offsets[-1]) for _ in range(2))
+    for first, last in itertools.pairwise(offsets):
+        edges = np.cumsum(random.uniform(0.01, 1.0, 2 * (last - first))) + 0.5
+        starts[first:last], ends[first:last] = edges[::2], edges[1::2]
+    starts, ends = starts.astype(np.float32), ends.astype(np.float32)
+    density = 10 ** random.uniform(low, high, len(starts)) * (random.uniform(size=len(starts)) > 0.1)
+    return torch.tensor(density, dtype=torch.float32), torch.tensor(starts), torch.tensor(ends), torch.tensor(offsets)
+
+
+@pytest.mark.parametrize("counts", [[], [0], [1], [5, 0, 1], [123, 1, 0, 7, 40] * 5])
+@pytest.mark.parametrize(("low", "high"), [(-12, -3), (-3, 1), (-1, 6), (-12, 6)])
+def test_the_fast_kernel_agrees_with_the_definition_in_float64(counts, low, high):
+    density, starts, ends, offsets = many_rays(3, counts, low=low, high=high)
+    shares = (0.9, 0.05, 0.5)
+    fast = kernels.light_ends(density, starts, ends, offsets=offsets, shares=shares)
+    exact = depth.light_ends(density.double(), starts.double(), ends.double(), offsets=offsets, shares=shares)
+    for name, value, wanted in zip(depth.LightEnds._fields, fast, exact, strict=True):
+        assert value.dtype == torch.float32
+        torch.testing.assert_close(
+            value.double(), wanted, rtol=TOLERANCE[torch.float32], atol=torch.finfo(torch.float32).tiny, equal_nan=True,
+            msg=lambda text, name=name: f"{name}: {text}",
+        )  # fmt: skip
+
+
+def test_gradients_come_from_the_definition_where_they_are_wanted():
+    density, starts, ends, offsets = many_rays(4, [3, 5], low=-2, high=1)
+    density.requires_grad_()
+    light = kernels.light_ends(density, starts, ends, offsets=offsets, shares=())
+    (gradient,) = torch.autograd.grad(light.mean.sum(), density)
+    wanted = density.detach().double().requires_grad_()
+    light = depth.light_ends(wanted, starts.double(), ends.double(), offsets=offsets, shares=())
+    (exact,) = torch.autograd.grad(light.mean.sum(), wanted)
+    torch.testing.assert_close(gradient.double(), exact, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("module", [depth, kernels])
+def test_quantiles_of_a_mixture_of_rays(module):
+    # Two rays: a wall at 1 and one at 3. The light of both together ends half here, half there.
+    density, starts = torch.tensor([1e6, 1e6]), torch.tensor([1.0, 3.0])
+    pair = {"offsets": torch.tensor([0, 1, 2]), "rays_per_pixel": 2}
+    for share, wanted in ((0.25, 1.0), (0.49, 1.0), (0.51, 3.0), (0.75, 3.0)):
+        value = module.mixture_quantile(density, starts, starts + 0.5, share=share, **pair)
+        torch.testing.assert_close(value, torch.tensor([wanted]), rtol=1e-5, atol=0)
+    # A wall beside nothing: half of the light passes.
+    lone = {"offsets": torch.tensor([0, 0, 1]), "rays_per_pixel": 2}
+    assert module.mixture_quantile(density[1:], starts[1:], starts[1:] + 0.5, share=0.6, **lone).isnan().all()
+
+
+@pytest.mark.parametrize("rays_per_pixel", [1, 4])
+def test_the_fast_quantile_of_a_mixture_agrees_with_the_definition(rays_per_pixel):
+    density, starts, ends, offsets = many_rays(5, [3, 0, 9, 1, 4, 4, 20, 6], low=-2, high=1)
+    group = {"offsets": offsets, "rays_per_pixel": rays_per_pixel, "share": 0.3}
+    fast = kernels.mixture_quantile(density, starts, ends, **group)
+    exact = depth.mixture_quantile(density.double(), starts.double(), ends.double(), **group)
+    torch.testing.assert_close(fast.double(), exact, rtol=1e-6, atol=0, equal_nan=True)
+    if rays_per_pixel == 1:  # a mixture of one ray is that ray
+        alone = depth.quantile(density.double(), starts.double(), ends.double(), offsets=offsets, share=0.3)
+        torch.testing.assert_close(exact, alone, rtol=1e-9, atol=0, equal_nan=True)
 
 
 def test_median_crossing_in_a_later_interval_and_through_a_gap():

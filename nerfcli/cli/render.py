@@ -10,6 +10,7 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.depth_options import DepthFormat, DepthScale, depth_formats, finite, level_scale
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
 from nerfcli.cli.playing import frame_range, one_of, video_settings
+from nerfcli.cli.rendering import Rgba, SamplesPerPixel, Tolerance, tolerance_of
 from nerfcli.cli.views import Views, chosen_frames, write_frames
 from nerfcli.errors import UserError
 
@@ -44,6 +45,9 @@ def render(
     ] = None,
     depth_format: DepthFormat = "tiff",
     depth_scale: DepthScale = "auto",
+    tolerance: Tolerance = "1/1020",
+    samples_per_pixel: SamplesPerPixel = 1,
+    rgba: Rgba = False,
     colour_map: Annotated[str, typer.Option(help="Of depth to look at: turbo, viridis or grey.")] = "turbo",
     video: Annotated[bool, typer.Option("--video", help="A video of each output: --video-format mp4.")] = False,
     video_format: Annotated[
@@ -110,6 +114,7 @@ def render(
     from nerfcli.media.colour_maps import COLOUR_MAPS
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.render.model import load_model
+    from nerfcli.render.pictures import Quality
     from nerfcli.train.run_folder import FIELD
 
     chosen = tuple(dict.fromkeys(outputs.split(",")))
@@ -136,8 +141,17 @@ def render(
             video_format or "mp4", layout=video_layout, direction=direction, fps=fps, crf=crf, loop=loop
         )
     settings = ExportSettings(
-        outputs=chosen, depth=request, formats=formats, depth_scale=scale, colour_map=colour_map, video=videos
+        outputs=chosen,
+        depth=request,
+        formats=formats,
+        depth_scale=scale,
+        colour_map=colour_map,
+        video=videos,
+        quality=Quality(tolerance_of(tolerance), samples_per_pixel),
+        rgba=rgba,
     )
+    if rgba and videos is not None:
+        raise typer.BadParameter("a video has no alpha; leave out --rgba or the video", param_hint="--rgba")
     views = Views(cameras, count, through, nerfstudio_frame, max_size)
 
     def work(folder: Path, one_of_many: bool) -> None:

@@ -13,6 +13,7 @@ from nerfcli.export.processes import render_in_processes
 from nerfcli.export.settings import depth_meta
 from nerfcli.export.unfinished import Unfinished, unfinished_of
 from nerfcli.media.levels import scale_in_words
+from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.model import Model
 
 
@@ -78,6 +79,7 @@ def export_frames(
         **({"depth_meaning": meta.to_json()} if order.settings.measured else {}),
         **levels,
         "ranges": ranges,
+        "error_meaning": ERROR_IN_WORDS,
         "facts": {name: unfinished.facts(name) for name in order.names},
     }
     write_json(unfinished.folder / DESCRIPTION, description)

@@ -1,14 +1,20 @@
 """One frame of an order: rendered, written, and noted as complete."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from nerfcli.export.depth_files import frame_meta
 from nerfcli.export.order import Order
 from nerfcli.export.picture_files import write_picture
 from nerfcli.export.settings import depth_meta
 from nerfcli.export.unfinished import Unfinished
+from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
+from nerfcli.render.accuracy import measure_error, truncation_bounds
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import render_picture
+from nerfcli.render.pictures import render_picture, straight_rgba
+
+# Behind pictures with alpha: their colours are then premultiplied, and nothing of a background is in them.
+BLACK = (0.0, 0.0, 0.0)
 
 
 def render_frame(
@@ -30,8 +36,16 @@ def render_frame(
     """
     frame, name, settings = order.frames[index], order.names[index], order.settings
     wanted = settings.depth if settings.measured else None
-    picture = render_picture(model, frame, background=model.background, depth=wanted, on_tile=on_rays)
-    facts = {"truncation_of_colour_max": float(picture.truncation_error.max())}
-    meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=order.provenance, error_bounds=facts)
+    background = BLACK if settings.rgba else model.background
+    picture = render_picture(
+        model, frame, background=background, depth=wanted, quality=settings.quality, on_tile=on_rays
+    )
+    if settings.rgba:
+        picture = replace(picture, rgb=straight_rgba(picture))
+    tolerance = settings.quality.tolerance
+    measured = measure_error(model, frame, depth=wanted, tolerance=tolerance)
+    facts = truncation_bounds(picture, tolerance) | measured.to_json()
+    bounds = {**facts, "meaning": ERROR_IN_WORDS}
+    meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=order.provenance, error_bounds=bounds)
     files = write_picture(picture, unfinished.folder, name, settings=settings, meta=meta, background=model.background)
     unfinished.note(name, files, facts=facts)

@@ -1,6 +1,8 @@
 """The files of one rendered picture: one function per output."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +27,7 @@ def write_picture(
     """Write what `settings` asks for; each file atomically.
 
     Args:
-        picture: what was rendered.
+        picture: what was rendered; rgb with straight alpha or without.
         folder: of the export; the files are folder/OUTPUT/name.SUFFIX.
         name: without suffix, with "/" between folders.
         settings: the outputs, and the formats of depth.
@@ -40,7 +42,7 @@ def write_picture(
     """
     written = []
     if "rgb" in settings.outputs:
-        written += _write_rgb(picture.rgb, folder / "rgb" / name, background=background)
+        written += _write_rgb(picture.rgb, folder / "rgb" / name, background=background, bounds=meta.error_bounds)
     if "opacity" in settings.outputs:
         written += _write_opacity(picture.opacity, folder / "opacity" / name)
     if settings.measured:
@@ -48,9 +50,14 @@ def write_picture(
     return written
 
 
-def _write_rgb(rgb: np.ndarray, stem: Path, *, background: tuple[float, float, float]) -> list[Path]:
+def _write_rgb(
+    rgb: np.ndarray, stem: Path, *, background: tuple[float, float, float], bounds: Mapping[str, Any]
+) -> list[Path]:
     path = with_suffix(stem, ".png")
-    write_png(path, _to_bytes(rgb), metadata={"colour": "sRGB", "background": str(background), "nerfcli": __version__})
+    behind = str(background) if rgb.shape[-1] == 3 else "none: straight alpha"
+    error = {f"error {name}": str(value) for name, value in bounds.items()}
+    metadata = {"colour": "sRGB", "background": behind, **error, "nerfcli": __version__}
+    write_png(path, _to_bytes(rgb), metadata=metadata)
     return [path]
 
 

@@ -1,11 +1,12 @@
 """What an export shall hold: which pictures, in which files, and which videos of them."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from nerfcli.media.depth import DepthMeta
 from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
+from nerfcli.render.pictures import Quality
 
 OUTPUTS = ("rgb", "depth", "opacity", "spread", "disagreement")
 # Those that are measured: floats on disk, and pictures in colours to look at.
@@ -51,6 +52,8 @@ class ExportSettings:
         depth_scale: scene units per level of 16-bit files; None chooses the same for all frames.
         colour_map: of what is measured, one of `media.colour_maps.COLOUR_MAPS`.
         video: which videos; None for none.
+        quality: how much work goes into a picture.
+        rgba: colours without the background, the opacity as straight alpha.
     """
 
     outputs: tuple[str, ...]
@@ -59,6 +62,8 @@ class ExportSettings:
     depth_scale: float | None = None
     colour_map: str = "turbo"
     video: VideoSettings | None = None
+    quality: Quality = field(default_factory=Quality)
+    rgba: bool = False
 
     @property
     def measured(self) -> tuple[str, ...]:

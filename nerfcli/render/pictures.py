@@ -93,9 +93,9 @@ def render_picture(
     columns: list[tuple[Tensor, ...]] = []
     block, tile = max(1, RAYS_PER_BLOCK // count), max(1, RAYS_PER_TILE // count)
     for first in range(0, width * height, block):
-        chosen = slice(first, min(first + block, width * height))
+        chosen = np.arange(first, min(first + block, width * height))
         rays = pixel_rays(frame, model.training_from_scene, pixels=chosen, places=places, device=model.device)
-        for begin in range(0, chosen.stop - chosen.start, tile):
+        for begin in range(0, len(chosen), tile):
             part = slice(begin * count, min((begin + tile) * count, len(rays.directions)))
             columns.append(_render_tile(model, rays, part, background=behind, depth=depth, quality=quality))
             if on_tile is not None:
@@ -114,6 +114,13 @@ def render_picture(
         truncation_error=error,
         valid=valid,
     )
+
+
+def straight_rgba(picture: Picture) -> np.ndarray:
+    """(H, W, 4) float32 sRGB with straight alpha of a picture that was rendered on black; 0 where nothing is."""
+    alpha = picture.opacity[..., None]
+    colour = np.divide(picture.rgb, alpha, out=np.zeros_like(picture.rgb), where=alpha > 0)
+    return np.concatenate([np.minimum(colour, 1.0), alpha], axis=-1)
 
 
 def _render_tile(

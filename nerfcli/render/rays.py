@@ -36,16 +36,15 @@ class Rays:
 
 def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> Rays:
     """Rays of every pixel centre of a frame; geometry in float64, the result in float32."""
-    pixels = slice(0, frame.camera.width * frame.camera.height)
+    pixels = np.arange(frame.camera.width * frame.camera.height)
     return pixel_rays(frame, training_from_scene, pixels=pixels, places=CENTRES, device=device)
 
 
 def pixel_rays(
-    frame: Frame, training_from_scene: Similarity, *, pixels: slice, places: np.ndarray, device: torch.device
+    frame: Frame, training_from_scene: Similarity, *, pixels: np.ndarray, places: np.ndarray, device: torch.device
 ) -> Rays:
-    """Rays of some pixels, counted row by row, at the same places (P, 2) inside [0, 1]^2 of each: N = pixels * P."""
-    number = np.arange(pixels.start, pixels.stop)
-    corners = np.stack([number % frame.camera.width, number // frame.camera.width], axis=-1)
+    """Rays of pixels (M,), counted row by row, at the same places (P, 2) inside [0, 1]^2 of each: N = M * P."""
+    corners = np.stack([pixels % frame.camera.width, pixels // frame.camera.width], axis=-1)
     bearings, valid = frame.camera.bearings((corners[:, None] + places).reshape(-1, 2))
     world_from_cam = training_from_scene.apply_pose(frame.world_from_cam)
     # Component by component: products of matrices round differently with the number of rows.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerfcli import kernels
 from nerfcli.kernels.depth import LightEnds
-from nerfcli.render.model import Model
+from nerfcli.render.model import Marching, Model
 
 # The default: a quarter of a grey level.
 TOLERANCE = 1 / 1020
@@ -72,11 +72,16 @@ def render_rays(
         shares: quantiles to compute.
         tolerance: bound on what is left out of a colour, > 0.
     """
-    edges = model.marching.edges().to(directions)
-    cuts = edges[:-1] + 0.5 * edges.diff()
+    cuts = uniform_cuts(model.marching).to(directions)
     return render_cut_rays(
         model, origins, directions, cuts=cuts, background=background, shares=shares, tolerance=tolerance
     )
+
+
+def uniform_cuts(marching: Marching) -> Tensor:
+    """(S + 1,) float64 distances at which pictures cut all rays: in the middle between those of a training."""
+    edges = marching.edges()
+    return edges[:-1] + 0.5 * edges.diff()
 
 
 def render_cut_rays(

@@ -1,0 +1,159 @@
+"""How far a rendering can be from what its field says: bounds that come with every picture, and a measurement.
+
+Two errors are kept apart. What was left out for speed (the early stop, colours of negligible samples) is bounded for
+every pixel. That density and colour are taken as constant inside each interval is measured: some rays are rendered
+again with every interval cut into 2 and into 4, the field asked anew in each part. Both are about the rendering of the
+field. How far the field is from the scene, only photos and depths that it has not seen can tell.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.render.depth import DepthRequest, requested, shares
+from nerfcli.render.model import Model
+from nerfcli.render.pictures import Picture
+from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.render.tracing import RaysSeen, render_cut_rays, uniform_cuts
+
+IN_WORDS = (
+    "these numbers are about the rendering of the field, not about how far the field is from the scene: "
+    "truncation_of_colour bounds what the early stop and negligible samples left out of a channel, "
+    "truncation_of_depth and quadrature measure on random pixels what deeper stops and finer samples change"
+)
+PIXELS = 256
+# Of the renderings that are compared with each other: what they leave out must not show.
+TIGHT = 1e-6
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How large absolute differences are: over how many values, and three of their statistics."""
+
+    values: int
+    median: float
+    percentile_95: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class MeasuredError:
+    """Differences between renderings of the same rays.
+
+    Args:
+        colour: of the largest channel, sRGB in [0, 1], between intervals as they are and cut into 4.
+        colour_halved: the same between intervals cut into 2 and into 4: where it is much smaller, the steps converge.
+        depth, depth_halved: the same of the depth that was asked for, in the unit of the scene; None without depth.
+        depth_stop: what the tolerance changed of depth, which has no bound of its own: the light that was left out may
+            end anywhere; None without depth.
+    """
+
+    colour: Spread
+    colour_halved: Spread
+    depth: Spread | None
+    depth_halved: Spread | None
+    depth_stop: Spread | None
+
+    def to_json(self) -> dict[str, float]:
+        """Plain numbers by name; nothing of depth where none was asked for."""
+        named = {
+            "quadrature_of_colour": self.colour,
+            "quadrature_of_colour_halved": self.colour_halved,
+            "quadrature_of_depth": self.depth,
+            "quadrature_of_depth_halved": self.depth_halved,
+            "truncation_of_depth": self.depth_stop,
+        }
+        numbers: dict[str, float] = {"pixels_measured": self.colour.values}
+        for name, spread in named.items():
+            if spread is not None:
+                numbers |= {f"{name}_median": spread.median, f"{name}_p95": spread.percentile_95}
+        return numbers
+
+
+def truncation_bounds(picture: Picture, tolerance: float) -> dict[str, float]:
+    """What a picture states about itself: the tolerance asked for, the largest and the mean bound of its pixels."""
+    error = picture.truncation_error
+    return {
+        "tolerance": tolerance,
+        "truncation_of_colour_max": float(error.max(initial=0.0)),
+        "truncation_of_colour_mean": float(error.mean(dtype=np.float64)) if error.size else 0.0,
+    }
+
+
+@torch.no_grad()
+def measure_error(
+    model: Model, frame: Frame, *, depth: DepthRequest | None, tolerance: float, seed: int = 0
+) -> MeasuredError:
+    """Render the centres of 256 random pixels with finer and finer intervals; the same pixels for the same seed.
+
+    Args:
+        model: the trained model.
+        frame: camera and pose in the scene's frame.
+        depth: the depth to measure along with the colour.
+        tolerance: of the rendering, for `depth_stop`.
+        seed: of the choice of pixels.
+    """
+    total = frame.camera.width * frame.camera.height
+    pixels = np.sort(np.random.default_rng(seed).choice(total, size=min(total, PIXELS), replace=False))
+    rgb, distances = (
+        values.double().cpu().numpy() for values in _renderings(model, frame, pixels, depth=depth, tolerance=tolerance)
+    )
+    asked = depth is not None
+    return MeasuredError(
+        colour=_spread(np.abs(rgb[1] - rgb[3]).max(-1)),
+        colour_halved=_spread(np.abs(rgb[2] - rgb[3]).max(-1)),
+        depth=_spread(np.abs(distances[1] - distances[3])) if asked else None,
+        depth_halved=_spread(np.abs(distances[2] - distances[3])) if asked else None,
+        depth_stop=_spread(np.abs(distances[0] - distances[1])) if asked else None,
+    )
+
+
+def refined(cuts: Tensor, parts: int) -> Tensor:
+    """(S * parts + 1,) distances that cut each interval of `cuts` (S + 1,) into equal parts."""
+    share = torch.arange(parts, dtype=cuts.dtype, device=cuts.device) / parts
+    inner = cuts[:-1, None] + cuts.diff()[:, None] * share
+    return torch.cat([inner.flatten(), cuts[-1:]])
+
+
+def _renderings(
+    model: Model, frame: Frame, pixels: np.ndarray, *, depth: DepthRequest | None, tolerance: float
+) -> tuple[Tensor, Tensor]:
+    """Colours (4, P, 3) and depths (4, P) of pixels: as rendered; then tightly with intervals whole, halved, in 4."""
+    rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
+    directions, cosines = rays.directions[rays.valid], rays.cosines[rays.valid]
+    background = directions.new_tensor(model.background)
+    cuts = uniform_cuts(model.marching)
+    seen = [
+        render_cut_rays(
+            model,
+            rays.origin.expand_as(directions),
+            directions,
+            cuts=refined(cuts, parts).to(directions),
+            background=background,
+            shares=shares(depth) if depth is not None else (),
+            tolerance=wanted,
+        )
+        for parts, wanted in ((1, tolerance), (1, TIGHT), (2, TIGHT), (4, TIGHT))
+    ]
+    scale = model.training_from_scene.scale
+
+    def distance(one: RaysSeen) -> Tensor:
+        if depth is None:
+            return torch.full_like(cosines, torch.nan)
+        far = torch.full_like(cosines, (depth.background_distance or 0.0) * scale)
+        along_ray = requested(depth, one.ends, background_distance=far) / scale
+        return along_ray if depth.axis == "ray" else torch.where(cosines > 0, along_ray * cosines, torch.nan)
+
+    return torch.stack([one.rgb.clamp(0.0, 1.0) for one in seen]), torch.stack([distance(one) for one in seen])
+
+
+def _spread(differences: np.ndarray) -> Spread:
+    """Of those that are defined; zeros where there are none."""
+    finite = differences[np.isfinite(differences)]
+    if finite.size == 0:
+        return Spread(0, 0.0, 0.0, 0.0)
+    median, high = np.percentile(finite, (50, 95))
+    return Spread(finite.size, float(median), float(high), float(finite.max()))
