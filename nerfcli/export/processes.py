@@ -72,7 +72,7 @@ def render_in_processes(
 
     def give(worker: _Worker) -> None:
         worker.index = left.popleft()
-        with suppress(BrokenPipeError):  # it died meanwhile: waiting for it tells
+        with suppress(ConnectionError):  # it died meanwhile: waiting for it tells
             worker.connection.send(worker.index)
 
     try:
@@ -83,7 +83,7 @@ def render_in_processes(
             for worker in [worker for worker in workers if worker.connection in ready]:
                 try:
                     failure = worker.connection.recv()
-                except EOFError:
+                except (EOFError, ConnectionError):  # the latter where it never read what it was sent
                     workers.remove(worker)
                     deaths[worker.index] += 1
                     _tell_death(worker, order, notify, last=deaths[worker.index] == _MOST_DEATHS)
@@ -127,7 +127,7 @@ def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, 
     while True:
         try:
             index = connection.recv()
-        except EOFError:
+        except (EOFError, ConnectionError):
             return
         try:
             render_frame(model, order, index, unfinished=unfinished, on_rays=lambda rays: None)
@@ -138,7 +138,7 @@ def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, 
             report = _Failure(traceback.format_exc())
         try:
             connection.send(report)
-        except BrokenPipeError:  # nobody is there any more
+        except ConnectionError:  # nobody is there any more
             return
 
 

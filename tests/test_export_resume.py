@@ -1,0 +1,273 @@
+"""Exports that end early go on with what is missing; parts and processes leave the same files as one go does."""
+
+import hashlib
+import json
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fog import fog, foggy_cells
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.export.frames import Workers, export_frames, export_part
+from nerfcli.export.order import Order
+from nerfcli.export.presentation import playing_order
+from nerfcli.export.settings import ExportSettings, VideoSettings
+from nerfcli.media.descriptions import description_of
+from nerfcli.media.images import read_image
+from nerfcli.render.depth import DepthRequest
+from nerfcli.render.model import Model
+
+PIXELS = 10 * 8
+VIDEO = VideoSettings(layout="side-by-side", direction="ping-pong", fps=12)
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    return fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
+
+
+def order(count: int = 4, *, convention: str = "conditional", video: VideoSettings | None = VIDEO) -> Order:
+    poses = [
+        look_at(np.array([0.1 * index, 0.0, -2.0]), np.zeros(3), np.array([0.0, -1.0, 0.0])) for index in range(count)
+    ]
+    frames = tuple(Frame(f"f{index}/v.png", Camera.pinhole(10, 8, 8.0), pose) for index, pose in enumerate(poses))
+    depth = DepthRequest(convention, "z", min_opacity=0.1)
+    return Order(frames, ExportSettings(outputs=("rgb", "depth"), depth=depth, video=video), {"run": "a run"})
+
+
+def export(model: Model, ordered: Order, folder: Path, *, on_rays: Callable[[int], None] = lambda rays: None) -> None:
+    export_frames(model, ordered, folder, on_rays=on_rays, notify=lambda text: None)
+
+
+def stop_in_frame(number: int, problem: BaseException) -> Callable[[int], None]:
+    """For `on_rays`: raises once the first tile of this frame is rendered; these frames are one tile."""
+    calls = iter(range(1000))
+
+    def on_rays(rays: int) -> None:
+        if next(calls) == number:
+            raise problem
+
+    return on_rays
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture(scope="module")
+def in_one_go(model, tmp_path_factory) -> dict[str, str]:
+    folder = tmp_path_factory.mktemp("in one go") / "views"
+    export(model, order(), folder)
+    return contents(folder)
+
+
+@pytest.mark.parametrize(
+    "problem", [KeyboardInterrupt(), UserError("cannot write: No space left on device", "free space")]
+)
+def test_an_export_that_ends_early_goes_on_and_ends_the_same(model, tmp_path, in_one_go, problem):
+    folder = tmp_path / "views"
+    with pytest.raises(type(problem)):
+        export(model, order(), folder, on_rays=stop_in_frame(2, problem))
+    assert not folder.exists()
+    (unfinished,) = tmp_path.glob(".views.unfinished-*")
+    assert len(list(unfinished.rglob("v.tiff"))) == 2
+    done: list[int] = []
+    export(model, order(), folder, on_rays=done.append)
+    assert done == [2 * PIXELS, PIXELS, PIXELS]  # what is there counts at once
+    assert contents(folder) == in_one_go
+    assert not list(tmp_path.glob(".views*"))
+
+
+def lose(path: Path) -> None:
+    path.unlink()
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize("file", ["rgb/f1/v.png", "depth/f1/v.tiff", ".frames/done/f1/v.json"])
+@pytest.mark.parametrize("damage", [lose, halve])
+def test_a_frame_that_is_not_whole_is_rendered_again(model, tmp_path, in_one_go, file, damage):
+    if (file.endswith("json"), damage) == (True, halve):
+        return  # notes are written in one step
+    folder = tmp_path / "views"
+    with pytest.raises(KeyboardInterrupt):
+        export(model, order(), folder, on_rays=stop_in_frame(3, KeyboardInterrupt()))
+    (unfinished,) = tmp_path.glob(".views.unfinished-*")
+    damage(unfinished / file)
+    (unfinished / "rgb" / "f1" / ".v.partial-1.png").write_bytes(b"of a command that was killed")
+    done: list[int] = []
+    export(model, order(), folder, on_rays=done.append)
+    assert done == [2 * PIXELS, PIXELS, PIXELS]
+    assert contents(folder) == in_one_go
+
+
+def test_another_order_takes_nothing_from_it_and_leaves_it(model, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        export(model, order(), tmp_path / "views", on_rays=stop_in_frame(3, KeyboardInterrupt()))
+    left = contents(tmp_path)
+    done: list[int] = []
+    export(model, order(convention="median"), tmp_path / "views", on_rays=done.append)
+    assert done == [PIXELS] * 4
+    assert json.loads((tmp_path / "views/render.json").read_text())["settings"]["depth"]["convention"] == "median"
+    assert left.items() <= contents(tmp_path).items()
+
+
+def test_other_videos_of_the_same_pictures_take_them(model, tmp_path):
+    """What is made of the pictures afterwards does not decide over them."""
+    with pytest.raises(KeyboardInterrupt):
+        export(model, order(), tmp_path / "views", on_rays=stop_in_frame(3, KeyboardInterrupt()))
+    done: list[int] = []
+    export(model, order(video=None), tmp_path / "views", on_rays=done.append)
+    assert done == [3 * PIXELS, PIXELS]
+    assert not list(tmp_path.rglob("*.mp4"))
+
+
+def test_an_export_that_is_stopped_leaves_the_old_one(model, tmp_path):
+    export(model, order(2), tmp_path / "views")
+    old = contents(tmp_path / "views")
+    with pytest.raises(KeyboardInterrupt):
+        export(model, order(3), tmp_path / "views", on_rays=stop_in_frame(1, KeyboardInterrupt()))
+    assert contents(tmp_path / "views") == old
+    export(model, order(3), tmp_path / "views")
+    assert len(list((tmp_path / "views").rglob("v.tiff"))) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["views"]
+
+
+def test_parts_are_put_together_without_rendering(model, tmp_path, in_one_go):
+    folder, told = tmp_path / "views", []
+    for part in (range(3, 4), range(0, 3, 2), range(1, 4)):
+        export_part(model, order(), folder, part, on_rays=lambda rays: None, notify=told.append)
+        assert not folder.exists()
+    assert [text.split(" frames are there")[0] for text in told] == ["1 of 4", "3 of 4", "2 of 3", "4 of 4"]
+    done: list[int] = []
+    export(model, order(), folder, on_rays=done.append)
+    assert done == [4 * PIXELS]
+    assert contents(folder) == in_one_go
+
+
+def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go):
+    """One of two is killed when the first frame is done; its frame is rendered by another, and all are told."""
+    told: list[str] = []
+    done: list[int] = []
+
+    def kill_one(rays: int) -> None:
+        done.append(rays)
+        if len(done) == 1:
+            multiprocessing.active_children()[-1].kill()
+
+    export_frames(
+        *(model, order(), tmp_path / "views"), on_rays=kill_one, notify=told.append, workers=Workers(jobs=2, threads=2)
+    )
+    assert done == [PIXELS] * 4
+    assert contents(tmp_path / "views") == in_one_go
+    (death,) = [text for text in told if "process" in text]
+    assert "was ended by signal 9 (SIGKILL) while it rendered" in death
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+def test_what_goes_wrong_in_a_process_is_told_as_it_is_without(model, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        export(model, order(), tmp_path / "views", on_rays=stop_in_frame(0, KeyboardInterrupt()))
+    (unfinished,) = tmp_path.glob(".views.unfinished-*")
+    (unfinished / "depth").write_text("in the way of a folder")
+    with pytest.raises(UserError, match=r"cannot write .*depth"):
+        export_frames(
+            *(model, order(), tmp_path / "views"),
+            on_rays=lambda rays: None,
+            notify=lambda text: None,
+            workers=Workers(jobs=2, threads=2),
+        )
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monkeypatch):
+    start = multiprocessing.get_context("spawn").Process.start
+
+    def start_and_kill(process: Any) -> None:
+        start(process)
+        process.kill()
+
+    monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_kill)
+    told: list[str] = []
+    with pytest.raises(UserError, match=f"die while they render f[01]/v: .* signal {signal.SIGKILL:d}") as caught:
+        export_frames(
+            *(model, order(), tmp_path / "views"),
+            on_rays=lambda rays: None,
+            notify=told.append,
+            workers=Workers(jobs=2, threads=2),
+        )
+    assert caught.value.exit_code == OUT_OF_MEMORY
+    assert "renders it again" in told[0]
+
+
+# Videos of an export
+
+
+def test_a_video_says_what_it_shows(model, tmp_path):
+    export(model, order(video=replace(VIDEO, formats=("mp4", "gif"))), tmp_path / "views")
+    description = json.loads((tmp_path / "views/render.json").read_text())
+    for name in ("rgb+depth.mp4", "rgb+depth.gif"):
+        told = description_of(tmp_path / "views" / name)
+        assert told is not None
+        assert (told["convention"], told["axis"], told["unit"]) == ("conditional", "z", "arbitrary")
+        assert told["ranges"] == {"depth": description["ranges"]["depth"]}
+        assert told["run"] == "a run"
+        assert told["nerfcli"] == description["nerfcli"]
+
+
+def test_side_by_side_holds_colour_and_depth_in_one_picture(model, tmp_path, monkeypatch):
+    """The frames that go to the encoder: the picture left of its preview, forth and back without double ends."""
+    seen: list[np.ndarray] = []
+
+    def collect(path: Path, frames: Callable[[], Iterator[np.ndarray]], **options: Any) -> None:
+        seen.extend(frames())
+        path.write_bytes(b"")
+
+    monkeypatch.setattr("nerfcli.export.presentation.write_video", collect)
+    export(model, order(), tmp_path / "views")
+    for frame, index in zip(seen, [0, 1, 2, 3, 2, 1], strict=True):
+        colour = read_image(tmp_path / f"views/rgb/f{index}/v.png")
+        depth = read_image(tmp_path / f"views/depth/f{index}/v.png")
+        np.testing.assert_array_equal(frame[:8, :10], colour)
+        np.testing.assert_array_equal(frame[:, 10:], depth)
+
+
+def test_orders_of_playing():
+    assert playing_order(4, "forward") == [0, 1, 2, 3]
+    assert playing_order(4, "reverse") == [3, 2, 1, 0]
+    assert playing_order(4, "ping-pong") == [0, 1, 2, 3, 2, 1]
+    assert playing_order(1, "ping-pong") == [0]
+    assert playing_order(2, "ping-pong") == [0, 1]
+
+
+def test_what_no_video_can_be_made_of_is_told_before_rendering(model, tmp_path, monkeypatch):
+    def rendered(rays: int) -> None:
+        raise AssertionError("a picture was rendered")
+
+    first, second = order(2).frames
+    other = Frame("other.png", Camera.pinhole(12, 8, 8.0), second.world_from_cam)
+    mixed = Order((first, other), order().settings, {})
+    with pytest.raises(UserError, match="the views have 2 sizes \\(10x8, 12x8\\); a video has one"):
+        export(model, mixed, tmp_path / "views", on_rays=rendered)
+    program = tmp_path / "ffmpeg"
+    program.write_text("#!/bin/sh\necho ' V....D libx264 H.264'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    with pytest.raises(UserError, match="cannot make gif videos"):
+        export(model, order(video=VideoSettings(formats=("gif",))), tmp_path / "views", on_rays=rendered)
+    assert list(tmp_path.iterdir()) == [program]
