@@ -212,7 +212,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --depth expected", "'expected'; choose conditional, moment"),
         ("render x --depth-axis y", "'y'; choose ray or z"),
         ("render x --outputs rgb,normals", "'normals'; choose some of rgb,depth,opacity"),
-        ("render x --opacity-floor 1.5", "--opacity-floor"),
+        ("render x --min-opacity 1.5", "--min-opacity"),
         ("run x --budget -1", "'-1' is not a time"),
     ],
 )
