@@ -1,7 +1,6 @@
-"""Which photos of a folder can be used, which share a camera, which are compared, and what is said about the rest."""
+"""Which photos of a folder can be used, which share a camera, and what is said about the rest."""
 
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ from PIL import Image
 
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.images import Exif
-from nerfcli.poses.pairs import EXHAUSTIVE_UP_TO, capture_order, choose_pairs
 from nerfcli.poses.photos import Photo, camera_groups, find_photos
 from nerfcli.poses.reasons import Evidence, dominant, reason
 
@@ -131,41 +129,6 @@ def test_photos_share_a_camera_when_all_optics_and_the_size_agree():
     ]
     groups = camera_groups(photos)
     assert groups == (("1", "3"), ("2", "7"), ("4",), ("5",), ("6",), ("8",))
-
-
-@pytest.mark.parametrize("names", [["IMG_9.jpg", "IMG_10.jpg", "IMG_8.jpg"], ["0009.png", "0010.png", "0008.png"]])
-def test_names_are_ordered_by_their_number(names: list[str]):
-    assert capture_order(names) == [2, 0, 1]
-
-
-@pytest.mark.parametrize("names", [["a.jpg", "b.jpg"], ["a1.jpg", "b2.jpg"], ["a1.jpg", "a01.jpg"], ["1.jpg", "x.jpg"]])
-def test_names_that_differ_in_more_than_a_number_have_no_order(names: list[str]):
-    assert capture_order(names) is None
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, EXHAUSTIVE_UP_TO])
-def test_small_captures_are_compared_exhaustively(count: int):
-    pairing = choose_pairs([f"{number:03}.jpg" for number in range(count)])
-    assert pairing.rule == "exhaustive"
-    assert sorted(pairing.pairs) == list(combinations(range(count), 2))
-
-
-def test_large_unordered_captures_are_compared_by_likeness():
-    names = [f"{chr(97 + k % 26)}{chr(97 + k // 26)}.jpg" for k in range(100)]
-    assert choose_pairs(names).rule == "retrieval"
-    assert choose_pairs(names).pairs == ()
-    assert 20 <= choose_pairs(names).neighbours <= 30
-
-
-def test_large_numbered_captures_compare_neighbours_and_close_loops():
-    count = 300
-    pairing = choose_pairs([f"frame_{number}.jpg" for number in range(count)])
-    pairs = set(pairing.pairs)
-    assert pairing.rule == "sequential"
-    assert len(pairs) == len(pairing.pairs) < 0.15 * count * (count - 1) / 2
-    assert all(0 <= i < j < count for i, j in pairs)
-    assert all((i, i + step) in pairs for step in (1, 10, 16, 256) for i in range(count - step))
-    assert pairing.neighbours > 0
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,20 @@ def downscale_factor(downscale: str) -> int | None:
     return None if downscale == "auto" else int(downscale)
 
 
+def bytes_from_text(text: str) -> int:
+    """4GB, 500MB, 1.5GiB; a plain number is bytes.
+
+    Raises:
+        typer.BadParameter: anything else, or nothing left to use.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:([kmgt])(i?)b?|b)?", text.strip().lower())
+    if match is None or not (
+        size := int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " "))
+    ):
+        raise typer.BadParameter(f"{text!r} is not an amount of memory; write 4GB or 500MB")
+    return size
+
+
 def thread_count(threads: int) -> int:
     """The number of CPU threads to use: as asked, or the processors this process may run on."""
     if threads:

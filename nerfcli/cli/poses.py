@@ -8,13 +8,31 @@ import typer
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.clips import Frames, photos_of, without_suffix
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Seed, Threads, thread_count
+from nerfcli.cli.options import (
+    Json,
+    Output,
+    Overwrite,
+    Quiet,
+    Seed,
+    Threads,
+    bytes_from_text,
+    seconds_from_text,
+    thread_count,
+)
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.poses.settings import PoseSettings
+    from nerfcli.poses.plan import Plan
+    from nerfcli.poses.settings import Limits, PoseSettings
 
 NAMES_SHOWN = 8
+_STAGES = {
+    "read": "photos read",
+    "extract": "photos searched for features",
+    "pair": "photos looked up",
+    "match": "pairs compared",
+    "map": "photos placed",
+}
 
 
 @command
@@ -25,10 +43,31 @@ def poses(
     masks: Annotated[
         Path | None, typer.Option(help="A folder of masks named after the photos; black is not used.")
     ] = None,
-    max_size: Annotated[int, typer.Option(help="Longer side for feature extraction, pixels.", min=100)] = 1600,
-    max_features: Annotated[int, typer.Option(help="SIFT features per photo.", min=100)] = 4096,
+    quality: Annotated[str, typer.Option(help="fast, default or best: sizes and numbers of features.")] = "default",
+    max_size: Annotated[
+        int | None, typer.Option(help="Longer side for feature extraction, pixels.  [default: by --quality]", min=100)
+    ] = None,
+    max_features: Annotated[
+        int | None, typer.Option(help="SIFT features per photo.  [default: by --quality]", min=100)
+    ] = None,
+    pairing: Annotated[
+        str, typer.Option(help="Photos to compare: auto, exhaustive, sequential, retrieval or spatial.")
+    ] = "auto",
+    pairs: Annotated[
+        Path | None, typer.Option(help="A file with the pairs to compare, two names per line.", dir_okay=False)
+    ] = None,
     camera_model: Annotated[str, typer.Option(help="auto, or a COLMAP model such as SIMPLE_RADIAL, OPENCV.")] = "auto",
     min_registered: Annotated[float, typer.Option(help="Share of photos that must register.", min=0, max=1)] = 0.5,
+    memory: Annotated[
+        str | None, typer.Option(help="Memory it may use: 4GB, 500MB.  [default: 4/5 of the machine's]")
+    ] = None,
+    time_limit: Annotated[
+        str | None, typer.Option(help="Time it may take: 90s, 10m, 2h; then it ends, and a second call goes on.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and how long it takes.")] = False,
+    drop_database: Annotated[
+        bool, typer.Option("--drop-database", help="Delete features and matches once the scene is there.")
+    ] = False,
     seed: Seed = 0,
     threads: Threads = 0,
     overwrite: Overwrite = False,
@@ -41,44 +80,102 @@ def poses(
     changed. Photos that do not register are listed with the reason. Of a video, the sharpest frames are written to
     VIDEO-frames/ first; where the camera stands still it gives none.
 
+    A call that was interrupted is gone on from by the next one. database.db stays in the scene, so that with
+    --overwrite and another setting only what depends on it is done again.
+
     \b
     Examples:
       nerfcli poses photos/kitchen
-      nerfcli poses photos/kitchen -o kitchen --max-size 1000 --max-features 2048
+      nerfcli poses photos/kitchen -o kitchen --quality fast
+      nerfcli poses photos/kitchen --dry-run --json
       nerfcli poses kitchen.mp4 --frames 200
       nerfcli poses statue/ --masks statue-masks/
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
-    from nerfcli.poses.settings import CAMERA_MODELS, PoseSettings
+    from nerfcli.poses.memory import default_memory_limit
+    from nerfcli.poses.pairs import PAIRINGS
+    from nerfcli.poses.settings import CAMERA_MODELS, QUALITIES, Limits, PoseSettings
 
-    if camera_model not in CAMERA_MODELS:
-        raise typer.BadParameter(f"{camera_model!r}; choose {', '.join(CAMERA_MODELS)}", param_hint="--camera-model")
+    for value, choices, option in (
+        (camera_model, CAMERA_MODELS, "--camera-model"),
+        (pairing, PAIRINGS, "--pairing"),
+        (quality, tuple(QUALITIES), "--quality"),
+    ):
+        if value not in choices:
+            raise typer.BadParameter(f"{value!r}; choose {', '.join(choices)}", param_hint=option)
+    if pairs is not None and pairing != "auto":
+        raise typer.BadParameter("the pairs come from --pairs; leave out --pairing", param_hint="--pairing")
     console = Console(quiet=quiet, json_lines=json)
+    usual_size, usual_features = QUALITIES[quality]
     settings = PoseSettings(
-        max_image_size=max_size,
-        max_features=max_features,
+        max_image_size=usual_size if max_size is None else max_size,
+        max_features=usual_features if max_features is None else max_features,
         seed=seed,
         threads=thread_count(threads),
         camera_model=camera_model,
         min_registered=min_registered,
+        pairing=pairing,
+        pairs_file=None if pairs is None else str(pairs.absolute()),
         masks=str(masks.resolve()) if masks else None,
+    )
+    limits = Limits(
+        memory_bytes=default_memory_limit() if memory is None else bytes_from_text(memory),
+        seconds=None if time_limit is None else seconds_from_text(time_limit),
     )
 
     def work(source: Path, one_of_many: bool) -> None:
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
+        if dry_run:
+            plan_scene(source, scene, settings=settings, console=console)
+            return
         folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
-        estimate_scene(folder, scene, settings=settings, overwrite=overwrite, console=console)
+        estimate_scene(folder, scene, settings=settings, limits=limits, overwrite=overwrite, console=console)
+        tell_of_database(scene, drop=drop_database, console=console)
         console.result(scene)
 
     for_each_input(photos, work)
 
 
-def estimate_scene(folder: Path, scene: Path, *, settings: "PoseSettings", overwrite: bool, console: Console) -> None:
+def plan_scene(source: Path, scene: Path, *, settings: "PoseSettings", console: Console) -> None:
+    """Print what would be done with a folder of photos, or with the frames of a video that are there already.
+
+    Raises:
+        UserError: see `plan_poses`; or a video's frames are not there.
+    """
+    from nerfcli.poses.structure_from_motion import plan_poses
+    from nerfcli.poses.video_frames import frames_folder
+
+    folder = frames_folder(scene) if source.is_file() else source
+    if source.is_file() and not folder.exists():
+        raise UserError(
+            f"--dry-run: the frames of {source} are not in {folder} yet, and a dry run writes nothing",
+            "call it without --dry-run, or give a folder of photos",
+        )
+    with console.progress(f"poses {folder.name}") as update:
+        _, _, plan = plan_poses(
+            folder, settings=settings, progress=lambda stage, done, total: update(done / max(total, 1), _STAGES[stage])
+        )
+    if console.json_lines:
+        console.result(source, plan.to_json())
+    else:
+        typer.echo(f"{source}: {plan.describe()}")
+
+
+def estimate_scene(
+    folder: Path,
+    scene: Path,
+    *,
+    settings: "PoseSettings",
+    limits: "Limits",
+    overwrite: bool,
+    console: Console,
+) -> None:
     """Estimate one scene, or keep the one that was made from the same photos with the same settings.
 
     Raises:
         UserError: see `estimate_poses`; or something else stands at `scene`.
     """
+    from nerfcli.poses.plan import Outlook, duration
     from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
     from nerfcli.scene import SCENE_FILE
 
@@ -87,13 +184,22 @@ def estimate_scene(folder: Path, scene: Path, *, settings: "PoseSettings", overw
             console.note(f"{scene} is kept: it was made from these photos; --overwrite makes it again")
             return
         raise UserError(f"{scene} exists", "add --overwrite to replace it, or choose another place with -o")
+    outlook: Outlook | None = None
+
+    def planned(plan: "Plan") -> None:
+        nonlocal outlook
+        console.note(plan.describe())
+        outlook = Outlook(plan)
+
     with console.progress(f"poses {folder.name}") as update:
+
+        def progress(stage: str, done: int, total: int) -> None:
+            share, left = (0.0, None) if outlook is None else outlook.update(stage, done, total)
+            about = "" if left is None else f", about {duration(left)} left"
+            update(share, f"({done} of {total} {_STAGES[stage]}{about})")
+
         report = estimate_poses(
-            folder,
-            scene,
-            settings=settings,
-            notify=console.note,
-            progress=lambda stage, done, total: update(done / max(total, 1), stage),
+            folder, scene, settings=settings, notify=console.note, progress=progress, limits=limits, planned=planned
         )
     left_out = [image for image in report.images if not image.registered]
     for image in left_out[:NAMES_SHOWN]:
@@ -104,3 +210,16 @@ def estimate_scene(folder: Path, scene: Path, *, settings: "PoseSettings", overw
         f"{scene}: {report.registered} of {report.total} photos registered in {report.seconds['total']:.0f} s, "
         f"mean reprojection error {report.mean_reprojection_error_px:.2f} px"
     )
+
+
+def tell_of_database(scene: Path, *, drop: bool, console: Console) -> None:
+    """Delete the database of features and matches, or say what it takes and what for."""
+    from nerfcli.poses.workspace import database_bytes, drop_database
+
+    if drop:
+        drop_database(scene)
+    elif size := database_bytes(scene):
+        console.note(
+            f"{scene / 'database.db'}: features and matches, {size / 1e6:.0f} MB, make other settings quick; "
+            "--drop-database deletes them"
+        )

@@ -59,7 +59,8 @@ def run(
     from nerfcli.cli.train import train_scene, was_interrupted
     from nerfcli.cli.views import Views
     from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
-    from nerfcli.poses.settings import PoseSettings
+    from nerfcli.poses.memory import default_memory_limit
+    from nerfcli.poses.settings import Limits, PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.train.settings import TrainSettings
 
@@ -81,7 +82,8 @@ def run(
         if output is not None:
             scene, field = scene / "scene", scene / "run"
         folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
-        estimate_scene(folder, scene, settings=pose_settings, overwrite=overwrite, console=console)
+        limits = Limits(memory_bytes=default_memory_limit())
+        estimate_scene(folder, scene, settings=pose_settings, limits=limits, overwrite=overwrite, console=console)
         resume = not overwrite and was_interrupted(scene, field, train_settings)
         train_scene(scene, field, settings=train_settings, resume=resume, overwrite=overwrite, console=console)
         metrics, numbers = evaluate_run(field, device=torch_device, threads=cores, overwrite=overwrite, console=console)

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from numbers import Rational
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,8 @@ class Exif:
 
     focal_35mm is the equivalent focal length on 36 x 24 mm film. orientation is 1...8, 1 where absent.
     width and height are those of the upright picture. gps is (latitude_deg, longitude_deg, altitude in metres
-    or None), north and east positive.
+    or None), north and east positive. taken is when, in seconds of the camera's own clock, comparable between photos of
+    one camera.
     """
 
     make: str | None
@@ -68,6 +70,7 @@ class Exif:
     exposure_seconds: float | None
     iso: float | None
     gps: tuple[float, float, float | None] | None
+    taken: float | None = None
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -193,6 +196,7 @@ def read_exif(path: Path) -> Exif:
         exposure_seconds=_positive(camera.get(ExifTags.Base.ExposureTime)),
         iso=_positive(camera.get(ExifTags.Base.ISOSpeedRatings)),
         gps=_position(gps),
+        taken=_clock(camera.get(ExifTags.Base.DateTimeOriginal), camera.get(ExifTags.Base.SubsecTimeOriginal)),
     )
 
 
@@ -330,6 +334,16 @@ def _number(value: Any) -> float | None:
 def _positive(value: Any) -> float | None:
     number = _number(value)
     return number if number is not None and number > 0 else None
+
+
+def _clock(value: Any, fraction: Any) -> float | None:
+    """Seconds of the camera's clock, from its local time, whatever its zone, and the digits after the point."""
+    digits = _text(fraction)
+    try:
+        local = datetime.strptime(_text(value) or "", "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return local.timestamp() + (float(f"0.{digits}") if digits and digits.isdecimal() and digits.isascii() else 0.0)
 
 
 def _position(gps: dict[int, Any]) -> tuple[float, float, float | None] | None:

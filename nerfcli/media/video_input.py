@@ -271,6 +271,5 @@ def _unreadable(path: Path, decoder: _Decoder) -> UserError:
     reason = said[0] if said else "no frame can be decoded"
     if decoder.cut_short:
         return UserError(f"{path} is cut short: {reason}", "copy the video once more")
-    return UserError(
-        f"{path} cannot be read as a video: {reason}", "copy the video once more, or save it as MP4 (H.264)"
-    )
+    hint = "give a video or a folder of photos; copy a damaged video once more, or save it as MP4 (H.264)"
+    return UserError(f"{path} cannot be read as a video: {reason}", hint)

@@ -1,5 +1,7 @@
 """What structure from motion is about to do and about how long it will take: said before it starts."""
 
+import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -8,10 +10,11 @@ from nerfcli.poses.photos import Photos
 from nerfcli.poses.settings import PoseSettings
 
 # CPU seconds, measured on one core of a 2-core server; within a factor of two on others.
-_SECONDS_PER_MEGAPIXEL = 0.6
-_SECONDS_PER_PAIR = 0.12
+_SECONDS_PER_MEGAPIXEL = 0.4
+_SECONDS_PER_PAIR = 0.045
 _FEATURES_PER_PAIR = 4096
-_MAP_SECONDS_PER_PHOTO = 0.45
+_SECONDS_PER_LOOK = 0.0006
+_MAP_SECONDS_PER_PHOTO = 0.3
 
 
 @dataclass(frozen=True)
@@ -36,19 +39,22 @@ class Plan:
         return f"{self.photos} photos, {self.pairs} pairs to compare ({self.rule}), {about}: {times}"
 
 
-_WORDS = {"extract": "features", "match": "matches", "map": "poses"}
+# In the order of the work.
+_WORDS = {"extract": "features", "pair": "pairs", "match": "matches", "map": "poses"}
 
 
 def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threads: int) -> Plan:
     """The plan for these photos; threads is how many there really are."""
     count = len(photos.photos)
-    pairs = min(len(pairing.pairs) + pairing.neighbours * count, count * (count - 1) // 2)
+    all_pairs = count * (count - 1) // 2
+    pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     megapixels = 0.0
     for photo in photos.photos:
         scale = min(1.0, settings.max_image_size / max(photo.width, photo.height))
         megapixels += photo.width * photo.height * scale**2 / 1e6
     seconds = {
         "extract": megapixels * _SECONDS_PER_MEGAPIXEL / threads,
+        "pair": all_pairs * _SECONDS_PER_LOOK / threads if pairing.neighbours else 0.0,
         "match": pairs * _SECONDS_PER_PAIR * settings.max_features / _FEATURES_PER_PAIR / threads,
         "map": count * _MAP_SECONDS_PER_PHOTO,
     }
@@ -58,8 +64,48 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
         max_features=settings.max_features,
         rule=pairing.rule,
         pairs=pairs,
-        seconds={stage: round(value, 1) for stage, value in seconds.items()},
+        seconds={stage: round(value, 1) for stage, value in seconds.items() if value > 0},
     )
+
+
+class Outlook:
+    """How much is left, told as the work goes on: measured for the stage at hand, for later ones from the plan.
+
+    The plan's seconds are stretched by what the stages so far took longer, so that after a few photos it fits the
+    machine and what else it does.
+
+    Args:
+        plan: for the stages that have not begun.
+        clock: seconds.
+    """
+
+    def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic):
+        self._plan = plan
+        self._clock = clock
+        self._start = clock()
+        self._stage = ""
+        self._began = (0.0, 0)
+        self._stretch = 1.0
+
+    def update(self, stage: str, done: int, total: int) -> tuple[float, float]:
+        """(share of all work that is done, seconds that are left)."""
+        now = self._clock()
+        if stage != self._stage or done < self._began[1]:
+            self._stage, self._began = stage, (now, done)
+        planned = self._plan.seconds.get(stage, 0.0)
+        began, done_before = self._began
+        if done > done_before:
+            left = (now - began) * (total - done) / (done - done_before)
+            whole = (now - began) * total / (done - done_before)
+            if planned > 0:
+                self._stretch = whole / planned
+        else:
+            left = self._stretch * planned * (total - done) / max(total, 1)
+        stages = list(self._plan.seconds)
+        later = stages[stages.index(stage) + 1 :] if stage in stages else stages
+        left += self._stretch * sum(self._plan.seconds[name] for name in later)
+        spent = now - self._start
+        return (spent / (spent + left) if left > 0 else 1.0), left
 
 
 def duration(seconds: float) -> str:

@@ -22,10 +22,12 @@ from nerfcli.poses.job import CameraGroup, Job, write_job
 from nerfcli.poses.layout import lay_out
 from nerfcli.poses.masks import lay_out_masks
 from nerfcli.poses.pairs import Pairing, choose_pairs
+from nerfcli.poses.pairs_file import read_pairs
 from nerfcli.poses.photos import Photo, Photos, camera_groups, find_photos
 from nerfcli.poses.plan import Plan, make_plan
 from nerfcli.poses.report import PosesReport, make_report, refusal
 from nerfcli.poses.settings import Limits, PoseSettings, check_settings
+from nerfcli.poses.stages import file_key
 from nerfcli.poses.supervise import run_worker
 from nerfcli.poses.workspace import is_in_the_making, publish, workspace
 
@@ -38,6 +40,7 @@ def estimate_poses(
     notify: Callable[[str], None],
     progress: Callable[[str, int, int], None],
     limits: Limits = Limits(),
+    planned: Callable[[Plan], None] = lambda plan: None,
 ) -> PosesReport:
     """Estimate where the photos of a folder were taken, and write a scene.
 
@@ -50,9 +53,10 @@ def estimate_poses(
         scene_dir: the folder to write.
         settings: see `PoseSettings`.
         notify: told what the user should know, one sentence at a time.
-        progress: told (stage, done, total); the stages are "read", "extract", "match", "map" and "check", in this
-            order.
+        progress: told (stage, done, total); the stages are "read", "extract", "pair" where look-alikes are sought,
+            "match", "map" and "check", in this order.
         limits: see `Limits`.
+        planned: told the plan before the long work starts.
 
     Raises:
         ValueError: a setting is out of its range.
@@ -65,7 +69,7 @@ def estimate_poses(
     _check_destination(scene_dir, photos_dir)
     for name, why in photos.unreadable.items():
         notify(f"{name} is left out: {why}")
-    notify(plan.describe())
+    planned(plan)
     with workspace(scene_dir) as space:
         work = space.folder
         job = _prepare(photos, settings, pairing=pairing, work=work, notify=notify)
@@ -74,6 +78,8 @@ def estimate_poses(
         result = _read_json(work / "result.json")["content"]
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"]}
+        if settings.pairs_file is not None:
+            matching["pairs_file_key"] = file_key(Path(settings.pairs_file))
         report = make_report(photos, settings, result=result, matching=matching)
         for rung in report.attempts if len(report.attempts) > 1 else ():
             notify(f"{rung['what']}: {_sizes(rung['models'])} of {len(photos.names)} photos placed")
@@ -104,7 +110,10 @@ def plan_poses(
     """
     check_settings(settings)
     photos = find_photos(photos_dir, lambda done, total: progress("read", done, total))
-    pairing = choose_pairs(photos.names, rule=settings.pairing)
+    if settings.pairs_file is None:
+        pairing = choose_pairs(photos.photos, rule=settings.pairing)
+    else:
+        pairing = read_pairs(Path(settings.pairs_file), photos)
     threads = settings.threads if settings.threads > 0 else os.cpu_count() or 1
     return photos, pairing, make_plan(photos, pairing, settings, threads=threads)
 
@@ -115,6 +124,7 @@ def is_same_scene(scene_dir: Path, photos_dir: Path, settings: PoseSettings) -> 
         report = _read_json(scene_dir / "poses_report.json")
         made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
         names = [path.name for path in list_images(photos_dir)]
+        pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
     except (OSError, ValueError, KeyError, UserError):
         return False
     made_with = asdict(PoseSettings()) | report["settings"]  # a setting that it does not know yet had its default
@@ -122,6 +132,7 @@ def is_same_scene(scene_dir: Path, photos_dir: Path, settings: PoseSettings) -> 
     return (
         made.resolve() == photos_dir.resolve()
         and sorted(image["name"] for image in report["images"]) == sorted(names)
+        and report["matching"].get("pairs_file_key") == pairs_key
         and all(made_with[key] == value for key, value in wanted.items())
     )
 

@@ -17,6 +17,7 @@ from nerfcli.poses.settings import Limits
 
 _STAGES = {
     "extract": "finding features",
+    "pair": "choosing pairs",
     "match": "matching photos",
     "map": "placing photos",
     "check": "checking the poses",
@@ -144,7 +145,7 @@ def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:
             OUT_OF_MEMORY,
         )
     return UserError(
-        f"structure from motion was ended while {stage}: the {limits.seconds:.0f} s of --time-limit are over",
+        f"structure from motion was ended while {stage}: the {limits.seconds:.3g} s of --time-limit are over",
         f"allow more time or choose --quality fast; {_GO_ON}",
         GATE_NOT_MET,
     )

@@ -53,7 +53,7 @@ def solve(job: Job, report: Report) -> None:
     with _timed(seconds, "extract"):
         extract(job, report)
     with _timed(seconds, "match"):
-        job = with_neighbours(job)
+        job = with_neighbours(job, report)
         start_matching(job, job.pairs)
         match(job, job.pairs, report)
     result, key = Path(job.folder) / RESULT, mapping_key(job)

@@ -75,6 +75,12 @@ def publish(scene_dir: Path, describe: Callable[[], None]) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
+def database_bytes(scene_dir: Path) -> int:
+    """Size of the database of features and matches, 0 if there is none."""
+    path = database_path(scene_dir / "work")
+    return path.stat().st_size if path.exists() else 0
+
+
 def drop_database(scene_dir: Path) -> None:
     """Remove features, matches and what is known of them. The scene stays; making it again starts from nothing."""
     for path in scene_dir.glob(database_path(scene_dir / "work").name + "*"):

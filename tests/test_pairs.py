@@ -1,0 +1,228 @@
+"""Which photos are compared: the rules, pairs that the user lists, look-alikes, and the estimate of the time."""
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_photos import NO_EXIF
+
+from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.poses.pairs import EXHAUSTIVE_UP_TO, Pairing, capture_order, choose_pairs
+from nerfcli.poses.pairs_file import read_pairs
+from nerfcli.poses.photos import Photo, Photos
+from nerfcli.poses.plan import Outlook, Plan, make_plan
+from nerfcli.poses.retrieval import alike, likeness
+from nerfcli.poses.settings import PoseSettings
+
+
+def named(*names: str) -> list[Photo]:
+    return [Photo(name, 64, 48, NO_EXIF) for name in names]
+
+
+def lettered(count: int) -> list[Photo]:
+    """Photos whose names have no order."""
+    return named(*(f"{chr(97 + k % 26)}{chr(97 + k // 26)}.jpg" for k in range(count)))
+
+
+@pytest.mark.parametrize("names", [["IMG_9.jpg", "IMG_10.jpg", "IMG_8.jpg"], ["0009.png", "0010.png", "0008.png"]])
+def test_names_are_ordered_by_their_number(names: list[str]):
+    assert capture_order(names) == [2, 0, 1]
+
+
+@pytest.mark.parametrize("names", [["a.jpg", "b.jpg"], ["a1.jpg", "b2.jpg"], ["a1.jpg", "a01.jpg"], ["1.jpg", "x.jpg"]])
+def test_names_that_differ_in_more_than_a_number_have_no_order(names: list[str]):
+    assert capture_order(names) is None
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, EXHAUSTIVE_UP_TO])
+def test_small_captures_are_compared_exhaustively(count: int):
+    pairing = choose_pairs(named(*(f"{number:03}.jpg" for number in range(count))))
+    assert (pairing.rule, pairing.neighbours) == ("exhaustive", 0)
+    assert sorted(pairing.pairs) == list(combinations(range(count), 2))
+
+
+def test_large_unordered_captures_are_compared_by_likeness():
+    pairing = choose_pairs(lettered(100))
+    assert (pairing.rule, pairing.pairs) == ("retrieval", ())
+    assert 20 <= pairing.neighbours <= 30
+
+
+def test_large_numbered_captures_compare_neighbours_and_look_for_loops():
+    count = 300
+    pairing = choose_pairs(named(*(f"frame_{number}.jpg" for number in range(count))))
+    pairs = set(pairing.pairs)
+    assert pairing.rule == "sequential"
+    assert pairing.neighbours > 0
+    assert len(pairs) == len(pairing.pairs) < 0.15 * count * (count - 1) / 2
+    assert all(0 <= i < j < count for i, j in pairs)
+    assert all((i, i + step) in pairs for step in (1, 10, 16, 256) for i in range(count - step))
+
+
+@pytest.mark.parametrize(("gap", "rule"), [(2.0, "sequential"), (600.0, "retrieval")])
+def test_the_clock_orders_a_walk_but_not_a_holiday(gap: float, rule: str):
+    photos = lettered(80)
+    # The last by name was taken first.
+    timed = [replace(p, exif=replace(NO_EXIF, taken=1e9 - gap * k)) for k, p in enumerate(photos)]
+    pairing = choose_pairs(timed)
+    assert pairing.rule == rule
+    if rule == "sequential":
+        assert {(i, i + 1) for i in range(79)} <= set(pairing.pairs)
+        # What is far in time is compared only at powers of two.
+        assert (0, 13) not in pairing.pairs
+
+
+def grid(spacing_deg: float) -> list[Photo]:
+    """Ten by ten photos on a grid on the ground, at 60 degrees north, across the antimeridian."""
+    return [
+        replace(
+            photo,
+            exif=replace(NO_EXIF, gps=(60 + spacing_deg * (k // 10), wrapped(180 + 2 * spacing_deg * (k % 10)), None)),
+        )
+        for k, photo in enumerate(lettered(100))
+    ]
+
+
+def wrapped(longitude: float) -> float:
+    return longitude - 360 if longitude > 180 else longitude
+
+
+def test_photos_that_gps_tells_apart_are_compared_with_the_nearest():
+    """On a square grid the 20 nearest of an inner photo are all within 3 steps, and the 8 around it among them."""
+    pairing = choose_pairs(grid(spacing_deg=0.0002))  # 22 metres
+    pairs = set(pairing.pairs)
+    assert pairing.rule == "spatial"
+    around = (44 - 10, 44 + 10, 44 - 1, 44 + 1, 44 - 11, 44 - 9, 44 + 9, 44 + 11)
+    assert all((min(44, j), max(44, j)) in pairs for j in around)
+    assert all(abs(i // 10 - j // 10) <= 5 and abs(i % 10 - j % 10) <= 5 for i, j in pairs)
+
+
+def test_photos_nearer_than_gps_can_tell_are_not_compared_by_it():
+    assert choose_pairs(grid(spacing_deg=0.00001)).rule == "retrieval"
+
+
+def test_spatial_pairing_asks_for_positions():
+    photos = grid(spacing_deg=0.0002)
+    photos[7] = replace(photos[7], exif=NO_EXIF)
+    with pytest.raises(UserError, match=r"1 of 100 photos have no GPS position \(ha.jpg\)"):
+        choose_pairs(photos, rule="spatial")
+
+
+# Pairs that the user lists
+
+SPACED = Photos(Path("my photos"), tuple(named("a.jpg", "b 1.jpg", "b.jpg", "c d.jpg")), {"torn.jpg": "damaged"})
+
+
+def pairs_of(tmp_path: Path, text: str) -> set[tuple[int, int]]:
+    (tmp_path / "pairs.txt").write_text(text, encoding="utf-8")
+    pairing = read_pairs(tmp_path / "pairs.txt", SPACED)
+    assert (pairing.rule, pairing.neighbours) == ("file", 0)
+    return set(pairing.pairs)
+
+
+@pytest.mark.parametrize(
+    ("text", "pairs"),
+    [
+        ("a.jpg b.jpg\n", {(0, 2)}),
+        ("\ufeff# listed by hand\n\nb.jpg  a.jpg\r\na.jpg b.jpg", {(0, 2)}),
+        ("b 1.jpg c d.jpg\nc d.jpg a.jpg", {(1, 3), (0, 3)}),
+        ("\"b 1.jpg\" 'a.jpg'\nb 1.jpg\tb.jpg", {(0, 1), (1, 2)}),
+        ("a.jpg b.jpg\na.jpg torn.jpg", {(0, 2)}),
+    ],
+    ids=["plain", "comment, either order, twice", "spaces", "quotes and tabs", "unreadable"],
+)
+def test_pairs_are_read(tmp_path: Path, text: str, pairs: set[tuple[int, int]]):
+    assert pairs_of(tmp_path, text) == pairs
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a.jpg b.jpg\na.jpg e.jpg", r"pairs.txt, line 2: there is no photo 'e.jpg'"),
+        ("a.jpg", r"line 1: 'a.jpg' holds no two names of photos"),
+        ("x y z", r"line 1: 'x y z' holds no two names of photos"),
+        ("\n\na.jpg a.jpg", r"line 3: a.jpg is paired with itself"),
+        ("# nothing", r"lists no pairs"),
+    ],
+)
+def test_lines_that_are_no_pairs_are_told_with_their_number(tmp_path: Path, text: str, words: str):
+    with pytest.raises(UserError, match=words) as caught:
+        pairs_of(tmp_path, text)
+    assert caught.value.exit_code == BAD_INPUT
+
+
+def test_a_file_of_pairs_that_is_not_there_is_told(tmp_path: Path):
+    with pytest.raises(UserError, match=r"cannot read the pairs in .*none.txt: No such file"):
+        read_pairs(tmp_path / "none.txt", SPACED)
+
+
+# Look-alikes
+
+
+def shared_descriptors(photos: int, *, seed: int = 0) -> tuple[list[np.ndarray], np.ndarray]:
+    """Photos that see windows of one row of things: their features, and how many each two share, which is the truth."""
+    rng = np.random.default_rng(seed)
+    things = rng.integers(0, 256, (20 * photos + 80, 128))
+    noise = rng.integers(-8, 9, (photos, *things.shape))
+    seen = [range(20 * k, 20 * k + 80) for k in range(photos)]
+    descriptors = [np.clip(things[list(s)] + noise[k][list(s)], 0, 255).astype(np.uint8) for k, s in enumerate(seen)]
+    truth = np.array([[len(set(a) & set(b)) if a != b else 0 for b in seen] for a in seen])
+    return [rows[rng.permutation(len(rows))] for rows in descriptors], truth
+
+
+def test_likeness_counts_the_features_that_two_photos_share():
+    """Synthetic truth; random descriptors are far from each other, so no match is wrong and none is missed."""
+    descriptors, truth = shared_descriptors(70)  # more than a block
+    descriptors[5] = descriptors[5][:0]
+    truth[5] = truth[:, 5] = 0
+    np.testing.assert_array_equal(likeness(descriptors, lambda *told: None), truth)
+
+
+def test_look_alikes_are_the_neighbours_that_are_not_known():
+    _, truth = shared_descriptors(30)
+    assert alike(truth, 2, known=()) == sorted(
+        {(min(i, j), max(i, j)) for i in range(30) for j in np.argsort(-truth[i], kind="stable")[:2].tolist()}
+    )
+    known = [(i, i + 1) for i in range(29)]
+    found = alike(truth, 2, known=known)
+    assert not set(found) & set(known)
+    assert {(i, i + 2) for i in range(28)} <= set(found)
+
+
+# The plan
+
+
+def plan_of(pairing: Pairing, *, threads: int = 1, settings: PoseSettings = PoseSettings()) -> Plan:
+    return make_plan(Photos(Path("x"), tuple(lettered(100)), {}), pairing, settings, threads=threads)
+
+
+def test_the_estimate_falls_with_threads_and_features():
+    pairing = choose_pairs(lettered(100), rule="exhaustive")
+    alone, many = plan_of(pairing), plan_of(pairing, threads=4, settings=PoseSettings(max_features=2048))
+    assert alone.pairs == 4950
+    assert many.seconds["match"] == pytest.approx(alone.seconds["match"] / 8, abs=0.1)
+
+
+def test_look_alikes_bound_the_number_of_pairs():
+    assert plan_of(Pairing("retrieval", (), 25)).pairs == 2500
+    assert plan_of(Pairing("retrieval", (), 90)).pairs == 4950
+
+
+def test_the_outlook_measures_and_stretches_what_is_to_come():
+    """At twice the planned time for the first stage, the rest will take twice its time too."""
+    seconds = {"extract": 10.0, "match": 30.0, "map": 10.0}
+    now = 0.0
+    outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
+    assert outlook.update("extract", 0, 10) == (0.0, 50.0)
+    now = 10.0
+    assert outlook.update("extract", 5, 10) == (pytest.approx(0.1), pytest.approx(90.0))
+    now = 20.0
+    assert outlook.update("extract", 10, 10)[1] == pytest.approx(80.0)
+    # Half of it was there already: what is left is measured on the rest alone.
+    outlook.update("match", 20, 40)
+    now = 25.0
+    assert outlook.update("match", 30, 40)[1] == pytest.approx(5.0 + 10.0 * 20 / 30)
+    now = 30.0
+    outlook.update("map", 10, 10)
+    assert outlook.update("map", 10, 10) == (1.0, 0.0)

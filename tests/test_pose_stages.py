@@ -1,0 +1,239 @@
+"""Going on: what a killed or an earlier `poses` left is used, never taken for more than it is, and for nothing else.
+
+The evidence is that models agree to the last bit with one thread, and what pycolmap's database holds at which time.
+"""
+
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from corner import NAMES, write_capture
+
+import nerfcli
+from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
+from nerfcli.poses.memory import default_memory_limit, resident_bytes
+from nerfcli.poses.report import PosesReport
+from nerfcli.poses.settings import Limits, PoseSettings
+from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, plan_poses
+from nerfcli.poses.workspace import database_bytes, drop_database, workspace
+
+ONE_THREAD = PoseSettings(max_features=300, threads=1)
+Progress = Callable[[str, int, int], None]
+
+
+class KilledError(Exception):
+    """The worker was killed."""
+
+
+def estimate(
+    photos: Path,
+    scene: Path,
+    settings: PoseSettings = ONE_THREAD,
+    *,
+    progress: Progress = lambda *told: None,
+    limits: Limits = Limits(),
+) -> PosesReport:
+    return estimate_poses(photos, scene, settings=settings, notify=lambda n: None, progress=progress, limits=limits)
+
+
+def killed_at(stage: str, done: int) -> Progress:
+    """Have the worker killed (SIGKILL) once it tells this much of a stage."""
+
+    def progress(told: str, told_done: int, total: int) -> None:
+        if told == stage and told_done >= done:
+            raise KilledError
+
+    return progress
+
+
+def model(scene: Path) -> dict[str, bytes]:
+    """The files of the model."""
+    return {path.name: path.read_bytes() for path in sorted((scene / "sparse/0").iterdir())}
+
+
+def rows(scene: Path, table: str, column: str = "image_id") -> dict[int, bytes]:
+    """A table of the database: key and what the row holds."""
+    with closing(sqlite3.connect(scene / "database.db")) as database:
+        return dict(database.execute(f"SELECT {column}, data FROM {table}"))
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture") / "my photos"
+    write_capture(folder)
+    (folder / "notes.jpg").unlink()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene of a call that nothing disturbed."""
+    scene = tmp_path_factory.mktemp("whole") / "scene"
+    assert estimate(photos, scene).registered == len(NAMES)
+    return scene
+
+
+@pytest.fixture
+def again(whole: Path, tmp_path: Path) -> Path:
+    """A copy of that scene, to be changed."""
+    return shutil.copytree(whole, tmp_path / "scene")
+
+
+def test_after_kills_in_two_stages_the_result_is_the_same_to_the_last_bit(photos: Path, whole: Path, tmp_path: Path):
+    scene = tmp_path / "scene"
+    for stage, done in (("match", 0), ("map", 3)):
+        with pytest.raises(KilledError):
+            estimate(photos, scene, progress=killed_at(stage, done))
+        assert not (scene / "scene.json").exists()
+    assert estimate(photos, scene).registered == len(NAMES)
+    assert model(scene) == model(whole)
+    assert rows(scene, "two_view_geometries", "pair_id") == rows(whole, "two_view_geometries", "pair_id")
+
+
+def test_another_camera_model_extracts_and_matches_nothing_again(photos: Path, whole: Path, again: Path):
+    stages: dict[str, int] = {}
+    settings = replace(ONE_THREAD, camera_model="SIMPLE_PINHOLE")
+    report = estimate(photos, again, settings, progress=lambda stage, done, total: void(stages.setdefault(stage, done)))
+    assert stages["extract"] == len(NAMES) + 1  # all of them were there from the first
+    assert rows(again, "descriptors") == rows(whole, "descriptors")
+    assert rows(again, "matches", "pair_id") == rows(whole, "matches", "pair_id")
+    assert {camera["model"] for camera in report.cameras} == {"SIMPLE_PINHOLE"}
+    # It went back to the same start: with the first model again, the first result.
+    assert estimate(photos, again).registered == len(NAMES)
+    assert model(again) == model(whole)
+
+
+def void(value: object) -> None:
+    """What a lambda makes of a value."""
+
+
+def test_another_photo_and_other_pairs_do_only_what_is_new(photos: Path, whole: Path, again: Path, tmp_path: Path):
+    """The photo that comes first by name pushes the others' places, but not their numbers in the database."""
+    more = shutil.copytree(photos, tmp_path / "more")
+    shutil.copy(photos / NAMES[2], more / "a first one.png")
+    (tmp_path / "pairs.txt").write_text(f"a first one.png {NAMES[2]}\n" + "\n".join(chain()))
+    settings = replace(ONE_THREAD, pairs_file=str(tmp_path / "pairs.txt"))
+    with pytest.raises(KilledError):
+        estimate(more, again, settings, progress=killed_at("map", 0))
+    assert model(again) == model(whole)  # the scene stands until another takes its place
+    before, after = rows(whole, "descriptors"), rows(again, "descriptors")
+    assert {key: after[key] for key in before} == before
+    assert len(after) == len(before) + 1
+    old, new = rows(whole, "matches", "pair_id"), rows(again, "matches", "pair_id")
+    assert {key: new[key] for key in old} == old
+    assert len(new) == len(old) + 1
+    # The mapper sees the listed pairs and no others.
+    assert len(rows(again, "two_view_geometries", "pair_id")) == len(NAMES)
+
+
+def chain() -> list[str]:
+    return [f"{one} {other}" for one, other in pairwise(NAMES)]
+
+
+def test_a_changed_photo_is_extracted_again_and_no_other(photos: Path, whole: Path, again: Path, tmp_path: Path):
+    changed = shutil.copytree(photos, tmp_path / "changed")
+    shutil.copy(changed / NAMES[3], changed / NAMES[2])
+    with pytest.raises(KilledError):
+        estimate(changed, again, progress=killed_at("match", 0))
+    before, after = rows(whole, "descriptors"), rows(again, "descriptors")
+    assert {key for key in before if before[key] != after[key]} == {3}  # ids count from 1
+    assert after[3] == before[4]
+
+
+def test_a_damaged_database_is_made_anew(photos: Path, whole: Path, again: Path):
+    """As a machine that lost its power may leave it."""
+    content = bytearray((again / "database.db").read_bytes())
+    content[len(content) // 3 : len(content) // 2] = bytes(len(content) // 2 - len(content) // 3)
+    (again / "database.db").write_bytes(content)
+    estimate(photos, again)
+    assert model(again) == model(whole)
+
+
+def test_the_database_is_one_that_colmap_reads_with_the_users_photos(whole: Path, photos: Path):
+    with closing(sqlite3.connect(whole / "database.db")) as database:
+        names = [name for (name,) in database.execute("SELECT name FROM images ORDER BY image_id")]
+    assert names == sorted(path.name for path in photos.iterdir())
+    assert database_bytes(whole) > 100_000
+
+
+def test_without_its_database_a_scene_is_still_a_scene(photos: Path, again: Path):
+    drop_database(again)
+    assert {path.name for path in again.iterdir()} == {"sparse", "scene.json", "poses_report.json"}
+    assert is_same_scene(again, photos, ONE_THREAD)
+    assert not is_same_scene(again, photos, replace(ONE_THREAD, max_features=700))
+
+
+def test_two_calls_on_one_scene_do_not_meet(photos: Path, tmp_path: Path):
+    with workspace(tmp_path / "scene"), pytest.raises(UserError, match="another nerfcli poses is at work on"):
+        estimate(photos, tmp_path / "scene")
+
+
+def test_the_worker_keeps_the_lock_as_long_as_it_lives(tmp_path: Path):
+    with workspace(tmp_path / "scene") as space:
+        code = "import sys; sys.stdin.read()"
+        child = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, pass_fds=(space.lock,))
+    with pytest.raises(UserError, match="another"), workspace(tmp_path / "scene"):
+        pass
+    child.communicate()
+    with workspace(tmp_path / "scene"):
+        pass
+
+
+def test_too_much_memory_ends_the_worker(photos: Path, tmp_path: Path):
+    with pytest.raises(UserError, match=r"was ended while .*: it needed more than the 0.05 GB of --memory") as caught:
+        estimate(photos, tmp_path / "scene", limits=Limits(memory_bytes=50_000_000))
+    assert caught.value.exit_code == OUT_OF_MEMORY
+    assert "--max-size" in caught.value.hint
+
+
+def test_too_much_time_ends_the_worker(photos: Path, tmp_path: Path):
+    with pytest.raises(UserError, match=r"was ended while .*: the 0.2 s of --time-limit are over") as caught:
+        estimate(photos, tmp_path / "scene", limits=Limits(seconds=0.2))
+    assert caught.value.exit_code == GATE_NOT_MET
+    assert "goes on from there" in caught.value.hint
+
+
+def test_memory_is_known_for_this_process_and_machine():
+    limit = default_memory_limit()
+    assert limit is not None
+    assert 10_000_000 < resident_bytes(os.getpid()) < limit
+    assert resident_bytes(2**22 + 1) == 0  # no process has such a number
+
+
+def test_planning_writes_nothing(photos: Path):
+    before = sorted(path.name for path in photos.parent.iterdir())
+    _, pairing, plan = plan_poses(photos, settings=ONE_THREAD, progress=lambda *told: None)
+    assert (plan.photos, plan.rule, plan.pairs) == (8, "exhaustive", 28)
+    assert len(pairing.pairs) == 28
+    assert sorted(path.name for path in photos.parent.iterdir()) == before
+
+
+@pytest.mark.slow
+def test_ten_kills_at_random_moments_change_nothing(photos: Path, whole: Path, tmp_path: Path):
+    """The whole command is killed (SIGKILL); its worker then ends by itself, and the next call waits for neither."""
+    rng = random.Random(0)
+    scene = tmp_path / "scene"
+    command = [sys.executable, "-m", "nerfcli", "poses", str(photos), "-o", str(scene), "--max-features", "300"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(nerfcli.__file__).parent.parent)}
+    for _ in range(10):
+        process = subprocess.Popen([*command, "--threads", "1", "--quiet"], env=environment, stderr=subprocess.PIPE)
+        time.sleep(rng.uniform(0.5, 6.0))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        time.sleep(0.2)  # for the worker to see that its parent has gone
+        if (scene / "scene.json").exists():  # it was quicker: once more from the beginning
+            assert model(scene) == model(whole)
+            shutil.rmtree(scene)
+    estimate(photos, scene)
+    assert model(scene) == model(whole)

@@ -1,0 +1,80 @@
+"""`nerfcli poses` as a user meets it: its options, the plan, and what is refused."""
+
+import json
+from pathlib import Path
+
+import pytest
+import typer
+from test_cli import USAGE, error_of, nerfcli, write_photos
+
+from nerfcli.cli.options import bytes_from_text
+from nerfcli.errors import BAD_INPUT
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("4GB", 4_000_000_000), ("500 MB", 500_000_000), ("1.5GiB", 3 * 2**29), ("2g", 2_000_000_000), ("1024", 1024)],
+)
+def test_amounts_of_memory(text: str, size: int):
+    assert bytes_from_text(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "much", "-4GB", "0", "4 GB RAM", "0.2", "4xb"])
+def test_what_is_no_amount_of_memory(text: str):
+    with pytest.raises(typer.BadParameter, match="is not an amount of memory; write 4GB or 500MB"):
+        bytes_from_text(text)
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("--quality superb", "'superb'; choose fast, default, best"),
+        ("--pairing random", "'random'; choose auto, exhaustive, sequential, retrieval, spatial"),
+        ("--pairing spatial --pairs p.txt", "the pairs come from --pairs"),
+        ("--memory lots", "'lots' is not an amount of memory"),
+        ("--time-limit soon", "'soon' is not a time"),
+    ],
+)
+def test_bad_values_are_usage_errors(line: str, named: str):
+    result = nerfcli("poses", "x", *line.split())
+    assert result.exit_code == USAGE
+    assert named in " ".join(result.stderr.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(
+    ("options", "size", "features"),
+    [
+        ((), 1600, 4096),
+        (("--quality", "fast"), 1000, 2048),
+        (("--quality", "best", "--max-size", "2000"), 2000, 8192),
+        (("--quality", "fast", "--max-features", "500"), 1000, 500),
+    ],
+)
+def test_a_dry_run_tells_the_plan_and_writes_nothing(
+    tmp_path: Path, options: tuple[str, ...], size: int, features: int
+):
+    photos = write_photos(tmp_path / "photos", 5)
+    result = nerfcli("poses", photos, "--dry-run", "--json", *options)
+    plan = json.loads(result.stdout)
+    assert plan["path"] == str(photos)
+    assert (plan["photos"], plan["rule"], plan["pairs"]) == (5, "exhaustive", 10)
+    assert (plan["max_image_size"], plan["max_features"]) == (size, features)
+    assert set(plan["seconds"]) == {"extract", "match", "map"}
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_the_plan_can_be_read(tmp_path: Path):
+    photos = write_photos(tmp_path / "photos", 5)
+    result = nerfcli("poses", photos, "--dry-run")
+    assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to compare (exhaustive), about ")
+
+
+def test_pairs_of_unknown_photos_are_bad_input(tmp_path: Path):
+    photos = write_photos(tmp_path / "photos", 5)
+    (tmp_path / "pairs.txt").write_text("photo 0.jpg photo 1.jpg\nphoto 0.jpg photo 9.jpg\n")
+    result = nerfcli("poses", photos, "--pairs", tmp_path / "pairs.txt")
+    assert result.exit_code == BAD_INPUT
+    error, hint = error_of(result)
+    assert "pairs.txt, line 2: there is no photo 'photo 9.jpg'" in error
+    assert str(photos) in hint
+    assert not (tmp_path / "photos-scene").exists()
