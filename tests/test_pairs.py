@@ -226,3 +226,4 @@ def test_the_outlook_measures_and_stretches_what_is_to_come():
     now = 30.0
     outlook.update("map", 10, 10)
     assert outlook.update("map", 10, 10) == (1.0, 0.0)
+    assert outlook.update("check", 1, 4) == (1.0, 0.0)

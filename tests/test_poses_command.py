@@ -8,7 +8,9 @@ import typer
 from test_cli import USAGE, error_of, nerfcli, write_photos
 
 from nerfcli.cli.options import bytes_from_text
+from nerfcli.cli.poses import _STAGES
 from nerfcli.errors import BAD_INPUT
+from nerfcli.poses import supervise
 
 
 @pytest.mark.parametrize(
@@ -67,6 +69,10 @@ def test_the_plan_can_be_read(tmp_path: Path):
     photos = write_photos(tmp_path / "photos", 5)
     result = nerfcli("poses", photos, "--dry-run")
     assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to compare (exhaustive), about ")
+
+
+def test_progress_has_words_for_every_stage_of_the_worker():
+    assert set(_STAGES) == {"read", *supervise._STAGES}
 
 
 def test_pairs_of_unknown_photos_are_bad_input(tmp_path: Path):

@@ -32,6 +32,7 @@ _STAGES = {
     "pair": "photos looked up",
     "match": "pairs compared",
     "map": "photos placed",
+    "check": "checks of the poses",
 }
 
 

@@ -102,7 +102,8 @@ class Outlook:
         else:
             left = self._stretch * planned * (total - done) / max(total, 1)
         stages = list(self._plan.seconds)
-        later = stages[stages.index(stage) + 1 :] if stage in stages else stages
+        # What is not planned comes last, and is short.
+        later = stages[stages.index(stage) + 1 :] if stage in stages else []
         left += self._stretch * sum(self._plan.seconds[name] for name in later)
         spent = now - self._start
         return (spent / (spent + left) if left > 0 else 1.0), left
