@@ -122,11 +122,11 @@ def save(
         image_folder: the photos; stored relative to the scene folder, so that the two can move together.
         provenance: plain values: versions, command, settings.
         unit: "arbitrary" or "metre"; unit_source says how a metre is known.
-    masks: a folder with a mask for each photo that has one, named as `media.masks.find_mask` says; or the mask of
-        each of these photos by its name.
-    split: by name, "train", "test", "val", or None for a photo that is not to be used; every 8th is held out if
-        this is not given.
-    depth_bounds: nearest and farthest z by name, in scene units, where they are known without points.
+        masks: a folder with a mask for each photo that has one, named as `media.masks.find_mask` says; or the mask of
+            each of these photos by its name.
+        split: by name, "train", "test", "val", or None for a photo that is not to be used; every 8th is held out if
+            this is not given.
+        depth_bounds: nearest and farthest z by name, in scene units, where they are known without points.
 
     Raises:
         UserError: the model is not readable or scene.json cannot be written.
