@@ -11,11 +11,13 @@ from nerfcli.cli.depth_options import DepthFormat, DepthScale, depth_formats, fi
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
 from nerfcli.cli.playing import frame_range, one_of, video_settings
 from nerfcli.cli.rendering import Rgba, SamplesPerPixel, Tolerance, tolerance_of
-from nerfcli.cli.views import Views, chosen_frames, write_frames
+from nerfcli.cli.views import Views, chosen_frames, file_fps, look_of, refuse_z_all_around, write_frames
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
     from nerfcli.export.settings import ExportSettings
+
+DEFAULT_FPS = 24.0
 
 
 @command
@@ -38,7 +40,10 @@ def render(
     depth: Annotated[
         str, typer.Option(help="Which depth: conditional, moment, background, max-weight, median or quantile:0.05.")
     ] = "conditional",
-    depth_axis: Annotated[str, typer.Option(help="ray: along the ray; z: along the optical axis.")] = "z",
+    depth_axis: Annotated[
+        str | None,
+        typer.Option(help="ray: along the ray; z: along the optical axis.  [default: z, ray if equirectangular]"),
+    ] = None,
     min_opacity: Annotated[float, typer.Option(help="Less opaque pixels have no depth (NaN).", min=0, max=1)] = 0.5,
     background_distance: Annotated[
         float | None, typer.Option(help="What --depth background counts for light that passes, scene units.", min=0)
@@ -65,7 +70,10 @@ def render(
         int | None, typer.Option(help="Times a video plays; 0 is for ever, gif only.  [default: 1, gif 0]", min=0)
     ] = None,
     count: Annotated[int, typer.Option(help="Views of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
-    fps: Annotated[float, typer.Option(help="Frames per second of the video.", min=1, max=240)] = 24,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames per second of the video.  [default: 24, or what a camera path says]", min=1, max=240),
+    ] = None,
     frames: Annotated[
         str | None,
         typer.Option(help="START:STOP[:STEP]: render these views alone, counted from 0; assemble nothing."),
@@ -78,6 +86,17 @@ def render(
     max_size: Annotated[
         int | None, typer.Option(help="Longer side of the pictures at most, pixels.  [default: as trained]", min=8)
     ] = None,
+    width: Annotated[
+        int | None, typer.Option(help="Of the pictures, pixels; the lens is scaled with it.", min=1, max=65536)
+    ] = None,
+    height: Annotated[
+        int | None, typer.Option(help="As --width; with both, pictures are cut, never stretched.", min=1, max=65536)
+    ] = None,
+    lens: Annotated[
+        str | None, typer.Option(help="pinhole, fisheye (equidistant) or equirectangular (360 degrees, 2:1).")
+    ] = None,
+    fov: Annotated[float | None, typer.Option(help="Of --lens, degrees between the left and right edge.")] = None,
+    crop: Annotated[str | None, typer.Option(help="Render the part X,Y,WIDTH,HEIGHT of the pictures, pixels.")] = None,
     output: Output = None,
     device: Device = "auto",
     threads: Threads = 0,
@@ -109,6 +128,8 @@ def render(
       nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
       nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
+      nerfcli render photos-scene-run --cameras orbit --lens equirectangular --width 2048 --video
+      nerfcli render photos-scene-run --cameras test --width 1920 --height 1080 --crop 480,270,960,540
     """
     from nerfcli.export.settings import OUTPUTS, ExportSettings
     from nerfcli.media.colour_maps import COLOUR_MAPS
@@ -123,7 +144,7 @@ def render(
     if not is_convention(depth):
         known = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
         raise typer.BadParameter(f"{depth!r}; choose {known}", param_hint="--depth")
-    if depth_axis not in ("ray", "z"):
+    if depth_axis not in (None, "ray", "z"):
         raise typer.BadParameter(f"{depth_axis!r}; choose ray or z", param_hint="--depth-axis")
     formats = depth_formats(depth_format, outputs=chosen, convention=depth)
     scale = level_scale(depth_scale, formats=formats)
@@ -131,9 +152,16 @@ def render(
     finite(min_opacity, "--min-opacity")
     console = Console(quiet=quiet, json_lines=json)
     request = DepthRequest(
-        convention=depth, axis=depth_axis, min_opacity=min_opacity, background_distance=background_distance
+        convention=depth,
+        axis=depth_axis or ("ray" if lens == "equirectangular" else "z"),
+        min_opacity=min_opacity,
+        background_distance=background_distance,
     )
     one_of(colour_map, COLOUR_MAPS, "--colour-map")
+    if max_size is not None and (width is not None or height is not None):
+        raise typer.BadParameter("give it or --width and --height", param_hint="--max-size")
+    look = look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
+    fps = fps or file_fps(cameras) or DEFAULT_FPS
     part = None if frames is None else frame_range(frames)
     videos = None
     if video or video_format is not None:
@@ -152,7 +180,7 @@ def render(
     )
     if rgba and videos is not None:
         raise typer.BadParameter("a video has no alpha; leave out --rgba or the video", param_hint="--rgba")
-    views = Views(cameras, count, through, nerfstudio_frame, max_size)
+    views = Views(cameras, count, through, nerfstudio_frame, max_size, look)
 
     def work(folder: Path, one_of_many: bool) -> None:
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
@@ -232,6 +260,8 @@ def render_run(
     # The unit of the training frame is about the distance between the cameras and what they look at.
     depth_hint = 1.0 / model.training_from_scene.scale
     frames = chosen_frames(run, views, depth_hint=depth_hint)
+    if "depth" in settings.outputs and settings.depth.axis == "z":
+        refuse_z_all_around(frames, notify=console.note)
     provenance: dict[str, Any] = {
         "cameras": views.cameras,
         "run": run.name,

@@ -1,9 +1,13 @@
 """The views that `nerfcli render --cameras` names: those of the run, a path through or around them, or of a file."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import typer
 
 from nerfcli.atomic import cannot_write
 from nerfcli.cli.console import Console
@@ -14,8 +18,76 @@ if TYPE_CHECKING:
     from nerfcli.cameras.frame import Frame
 
 PATHS = ("orbit", "ellipse", "spiral", "interpolate")
+# From this field of view on, a lens sees behind the camera.
+BEHIND_FROM_DEG = 180.0
 # Formats whose folders `nerfcli train` takes.
 SCENES = ("nerfcli", "colmap", "transforms", "blender", "llff")
+
+
+@dataclass(frozen=True)
+class Look:
+    """What pictures of the views are like, where it is not as trained or as the file of cameras says.
+
+    Args:
+        width, height: in pixels; with one of them the other follows, and with both the picture is cut, never stretched.
+        lens: "pinhole", "fisheye" or "equirectangular" instead of the camera's own.
+        fov_deg: of that lens, between the left and the right edge.
+        crop: X,Y,WIDTH,HEIGHT of the part to render, in pixels of the picture that the others give.
+    """
+
+    width: int | None = None
+    height: int | None = None
+    lens: str | None = None
+    fov_deg: float | None = None
+    crop: tuple[int, int, int, int] | None = None
+
+    @property
+    def words(self) -> list[str]:
+        """For the names of folders, so that pictures of two kinds do not meet."""
+        size = [] if self.width is None and self.height is None else [f"{self.width or ''}x{self.height or ''}"]
+        lens = [] if self.lens is None else [self.lens + ("" if self.fov_deg is None else f"{self.fov_deg:g}")]
+        return [*size, *lens, *([] if self.crop is None else ["crop", *map(str, self.crop)])]
+
+    def of(self, camera: "Camera") -> "Camera":
+        """The camera that takes such a picture where another one stands.
+
+        Raises:
+            UserError: a part outside of the picture, or a size or an angle that the lens does not have.
+        """
+        from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
+
+        if self.lens == "equirectangular" and self.fov_deg is None and (self.width or self.height):
+            width = self.width or 2 * (self.height or 0)
+            camera = equirectangular(width, self.height or width // 2)
+        else:
+            camera = sized(camera, self.width, self.height)
+            if self.lens is not None:
+                camera = with_lens(camera, self.lens, self.fov_deg)
+        return camera if self.crop is None else cropped(camera, Window(*self.crop))
+
+
+def look_of(
+    width: int | None, height: int | None, *, lens: str | None, fov_deg: float | None, crop: str | None
+) -> Look:
+    """What --width, --height, --lens, --fov and --crop ask for.
+
+    Raises:
+        typer.BadParameter: a lens that does not exist, --fov without --lens, or a part that is none.
+    """
+    from nerfcli.cameras.framing import LENSES
+
+    if lens is not None and lens not in LENSES:
+        raise typer.BadParameter(f"{lens!r}; choose {', '.join(LENSES)}", param_hint="--lens")
+    if fov_deg is not None and lens is None:
+        raise typer.BadParameter("it is the angle of --lens; give both", param_hint="--fov")
+    window = None
+    if crop is not None:
+        match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", crop.replace(" ", ""))
+        if match is None:
+            raise typer.BadParameter(f"{crop!r}; write X,Y,WIDTH,HEIGHT in pixels", param_hint="--crop")
+        x, y, crop_width, crop_height = (int(part) for part in match.groups())
+        window = (x, y, crop_width, crop_height)
+    return Look(width, height, lens, fov_deg, window)
 
 
 @dataclass(frozen=True)
@@ -28,6 +100,7 @@ class Views:
         through: names of photos, with commas between them, that a path is made from; all training photos if None.
         nerfstudio_frame: dataparser_transforms.json of the nerfstudio run in whose world the file's cameras are.
         max_size: of the longer side of the pictures, in pixels; as trained if None.
+        look: size, lens and part of the pictures.
     """
 
     cameras: str
@@ -35,11 +108,13 @@ class Views:
     through: str | None = None
     nerfstudio_frame: Path | None = None
     max_size: int | None = None
+    look: Look = Look()
 
     @property
     def name(self) -> str:
         """A name for files of these views."""
-        return self.cameras if self.cameras in ("test", "train", *PATHS) else Path(self.cameras).absolute().stem
+        name = self.cameras if self.cameras in ("test", "train", *PATHS) else Path(self.cameras).absolute().stem
+        return "-".join([name, *self.look.words])
 
 
 def chosen_frames(run: Path, views: Views, *, depth_hint: float) -> "list[Frame]":
@@ -81,9 +156,37 @@ def chosen_frames(run: Path, views: Views, *, depth_hint: float) -> "list[Frame]
         chosen = _frames_of(Path(cameras), views.nerfstudio_frame)
         factor = 1
     chosen = [replace(frame, camera=downscaled_camera(frame.camera, factor)) for frame in chosen]
-    if views.max_size is None:
-        return chosen
-    return [replace(frame, camera=_within(frame.camera, views.max_size)) for frame in chosen]
+    if views.max_size is not None:
+        chosen = [replace(frame, camera=_within(frame.camera, views.max_size)) for frame in chosen]
+    # Frames that share a camera share the new one too, and with it its rays.
+    look = lru_cache(views.look.of)
+    return [replace(frame, camera=look(frame.camera)) for frame in chosen]
+
+
+def refuse_z_all_around(frames: "Sequence[Frame]", *, notify: Callable[[str], None]) -> None:
+    """z is the distance along the optical axis, and half of a picture of all directions lies behind the camera.
+
+    Raises:
+        UserError: a picture is equirectangular. Of lenses that see a little behind, it is only told.
+    """
+    if any(frame.camera.is_spherical for frame in frames):
+        raise UserError(
+            "--depth-axis z of an equirectangular picture: half of its directions are behind the camera",
+            "add --depth-axis ray: the distance along each ray",
+            exit_code=2,
+        )
+    if any(max(camera.fov_deg) > BEHIND_FROM_DEG for camera in {frame.camera for frame in frames}):
+        notify("pixels that look 90 degrees aside or behind have no z (NaN); --depth-axis ray has them")
+
+
+def file_fps(cameras: str) -> float | None:
+    """The frame rate that a nerfstudio camera path gives; None of anything else."""
+    from nerfcli.cameras.formats.camera_path import read_path
+    from nerfcli.convert.finding import find_camera_path
+
+    path = Path(cameras)
+    found = find_camera_path(path) if path.is_file() else None
+    return None if found is None else read_path(found).fps
 
 
 def write_frames(frames: "Sequence[Frame]", target: Path, *, fps: float, overwrite: bool, console: Console) -> None:

@@ -127,10 +127,13 @@ def _frame_to_json(frame: Frame, run: Path) -> dict[str, Any]:
 
 
 def _frame_from_json(entry: dict[str, Any], run: Path) -> Frame:
+    pose = np.array(entry["world_from_cam"], dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"world_from_cam of {entry['name']} is not 4 rows of 4 finite numbers")
     return Frame(
         name=entry["name"],
         camera=Camera.from_json(entry["camera"]),
-        world_from_cam=np.array(entry["world_from_cam"], dtype=np.float64),
+        world_from_cam=pose,
         image=None if entry["image"] is None else run / entry["image"],
         mask=None if entry["mask"] is None else run / entry["mask"],
     )

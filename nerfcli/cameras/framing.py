@@ -1,0 +1,134 @@
+"""Pictures of another size, part or lens than a camera's own: nothing is ever stretched.
+
+Letters: a camera of a picture w x h; the new picture W x H.
+"""
+
+import math
+from dataclasses import dataclass
+
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.errors import UserError
+
+LENSES = ("pinhole", "fisheye", "equirectangular")
+
+# More on a side than any picture has.
+MOST_PIXELS = 65536
+
+_FISHEYE_FOV_DEG = 180.0
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a picture in its pixels: the left and upper edge, width and height."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
+    """The camera of the picture at another size; with one of the two given, the other follows the picture's shape.
+
+    Where the shape differs, the scaled picture covers the new one and is cut off evenly on two sides: scale
+    s = max(W / w, H / h), and the principal point moves by (s w - W) / 2 and (s h - H) / 2.
+
+    Raises:
+        UserError: an equirectangular picture that would not be twice as wide as high.
+    """
+    if width is None and height is None:
+        return camera
+    if width is None:
+        assert height is not None
+        width = max(1, round(camera.width * height / camera.height))
+    elif height is None:
+        height = max(1, round(camera.height * width / camera.width))
+    if camera.is_spherical:
+        return equirectangular(width, height)
+    scale = max(width / camera.width, height / camera.height)
+    scaled = _changed(camera, dict.fromkeys(("f", "fx", "fy", "cx", "cy"), scale), (width, height))
+    return _shifted(scaled, (width - scale * camera.width) / 2, (height - scale * camera.height) / 2)
+
+
+def cropped(camera: Camera, window: Window) -> Camera:
+    """The camera of a part of the picture.
+
+    Raises:
+        UserError: the part is empty or reaches out of the picture, or the picture is equirectangular.
+    """
+    if camera.is_spherical:
+        raise UserError("a part of an equirectangular picture has no camera model", "leave --crop out", exit_code=2)
+    inside = window.x >= 0 and window.y >= 0 and window.width >= 1 and window.height >= 1
+    inside = inside and window.x + window.width <= camera.width and window.y + window.height <= camera.height
+    if not inside:
+        raise UserError(
+            f"--crop {window.x},{window.y},{window.width},{window.height} is not inside a picture of "
+            f"{camera.width}x{camera.height}",
+            "expected X,Y,WIDTH,HEIGHT in pixels, counted from the upper left corner, after --width and --height",
+            exit_code=2,
+        )
+    smaller = _changed(camera, {}, (window.width, window.height))
+    return _shifted(smaller, -window.x, -window.y)
+
+
+def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
+    """A camera of another lens for the picture's size, its axis through the middle.
+
+    pinhole: focal length (w / 2) / tan(fov / 2), or the camera's own. fisheye: equidistant, radius = focal length *
+    angle, focal length w / fov with fov in radians, 180 degrees if not given. equirectangular: the whole sphere, at the
+    picture's width where that is an even number twice its height, else at twice its height.
+
+    Args:
+        camera: of the picture.
+        lens: one of `LENSES`.
+        fov_deg: between the left and the right edge.
+
+    Raises:
+        UserError: an angle that the lens cannot have.
+    """
+    width, height = camera.width, camera.height
+    if lens == "equirectangular":
+        if fov_deg is not None:
+            raise UserError(
+                "--fov with an equirectangular picture, which shows all around", "leave it out", exit_code=2
+            )
+        return equirectangular(2 * height, height)
+    most = 179.0 if lens == "pinhole" else 360.0
+    if fov_deg is not None and not 0 < fov_deg <= most:  # True at NaN
+        raise UserError(
+            f"--fov {fov_deg:g} of a {lens} lens", f"expected degrees above 0 and up to {most:g}", exit_code=2
+        )
+    if lens == "fisheye":
+        focal_px = width / math.radians(_FISHEYE_FOV_DEG if fov_deg is None else fov_deg)
+        return Camera("SIMPLE_FISHEYE", width, height, (focal_px, width / 2, height / 2))
+    if fov_deg is not None:
+        return Camera.pinhole(width, height, width / 2 / math.tan(math.radians(fov_deg) / 2))
+    return camera.undistorted()
+
+
+def equirectangular(width: int, height: int) -> Camera:
+    """The camera of a picture of all directions.
+
+    Raises:
+        UserError: it is not twice as wide as high, so that it would be stretched.
+    """
+    if width != 2 * height:
+        raise UserError(
+            f"an equirectangular picture of {width}x{height}",
+            "it shows 360 by 180 degrees and is twice as wide as high; give --width or --height alone",
+            exit_code=2,
+        )
+    return Camera("EQUIRECTANGULAR", width, height, (width, height))
+
+
+def _shifted(camera: Camera, x: float, y: float) -> Camera:
+    """The camera with its principal point moved, for a picture that was cut off at its left or upper edge."""
+    values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
+    values["cx"] += x
+    values["cy"] += y
+    return Camera(camera.model, camera.width, camera.height, tuple(values.values()))
+
+
+def _changed(camera: Camera, factors: dict[str, float], size: tuple[int, int]) -> Camera:
+    values = zip(parameter_names(camera.model), camera.params, strict=True)
+    return Camera(camera.model, *size, tuple(factors.get(name, 1.0) * value for name, value in values))

@@ -1,0 +1,133 @@
+"""`nerfcli render` of other sizes, parts and lenses, and of files of cameras that are wrong."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from test_cli import capture as capture
+from test_cli import error_of, nerfcli
+from test_cli import finished as finished
+
+from nerfcli.cli.views import file_fps
+from nerfcli.errors import BAD_INPUT
+from nerfcli.media.float_tiff import read_tiff
+
+USAGE = 2
+ONE = ("--cameras", "orbit", "--count", "2", "--threads", "1")
+
+
+def rendered(run: Path, *options: str | Path, outputs: str = "rgb") -> Path:
+    result = nerfcli("render", run, *ONE, "--outputs", outputs, *options)
+    assert result.exit_code == 0, result.stderr
+    return Path(result.stdout.splitlines()[0])
+
+
+def pixels(folder: Path) -> np.ndarray:
+    return np.asarray(Image.open(min(folder.glob("*.png"))))
+
+
+def test_a_part_is_cut_out_of_the_whole_picture(finished):
+    whole = pixels(rendered(finished, "--width", "40", "--height", "30"))
+    assert whole.shape == (30, 40, 3)
+    assert whole.std() > 1  # there is something in it
+    part = pixels(rendered(finished, "--width", "40", "--height", "30", "--crop", "5,7,20,10"))
+    np.testing.assert_array_equal(part, whole[7:17, 5:25])
+
+
+def test_depth_of_all_directions_is_along_the_rays(finished):
+    refused = nerfcli("render", finished, *ONE, "--lens", "equirectangular", "--width", "32", "--depth-axis", "z")
+    assert refused.exit_code == USAGE
+    assert "half of its directions are behind the camera" in error_of(refused)[0]
+    folder = rendered(finished, "--lens", "equirectangular", "--width", "32", outputs="depth")
+    depth, meta = read_tiff(min(folder.glob("*.tiff")))
+    assert (depth.shape, meta.axis) == ((16, 32), "ray")
+    # The fog stands in front of the camera, in the middle; behind it, at the left and right edge, is nothing.
+    assert np.isfinite(depth[8, 16])
+    assert np.isnan(depth[8, [0, 1, -2, -1]]).all()
+
+
+def test_pixels_without_a_ray_are_invalid(finished):
+    folder = rendered(finished, "--lens", "fisheye", "--fov", "360", "--width", "17", "--height", "17", outputs="depth")
+    depth, _ = read_tiff(min(folder.glob("*.tiff")))
+    assert np.isnan(depth[[0, 0, -1, -1], [0, -1, 0, -1]]).all()
+    assert np.isfinite(depth[8, 8])
+
+
+def test_a_fisheye_that_sees_behind_has_no_z_there_and_says_so(finished):
+    result = nerfcli("render", finished, *ONE, "--lens", "fisheye", "--fov", "200", "--width", "16", "--height", "16")
+    assert result.exit_code == 0
+    assert "have no z (NaN)" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--width", "0"),
+        ("--lens", "plenoptic"),
+        ("--fov", "90"),
+        ("--lens", "pinhole", "--fov", "180"),
+        ("--lens", "equirectangular", "--width", "100", "--height", "60"),
+        ("--crop", "1,2,3"),
+        ("--crop", "0,0,0,5"),
+        ("--crop", "0,0,5000,5"),
+        ("--max-size", "100", "--width", "50"),
+    ],
+    ids=" ".join,
+)
+def test_values_that_say_nothing(options, finished):
+    result = nerfcli("render", finished, *ONE, *options)
+    assert result.exit_code == USAGE
+    assert not (finished / "renders").exists()
+
+
+def transforms(**changes: Any) -> dict[str, Any]:
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    return {"w": 64, "h": 48, "fl_x": 50.0, "frames": [frame], **changes}
+
+
+def camera_path(**changes: Any) -> dict[str, Any]:
+    view = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50}
+    return {"render_width": 64, "render_height": 48, "camera_path": [view], **changes}
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (transforms(w=0), "w and h are 0"),
+        (transforms(h=float("nan")), "h is nan"),
+        (transforms(fl_x=float("nan")), "fl_x is nan"),
+        (camera_path(render_width=0), "render_width is 0"),
+        (camera_path(render_height=float("nan")), "render_height is nan"),
+        (camera_path(camera_path=[{"camera_to_world": [float("nan")] * 16, "fov": 50}]), "camera_to_world"),
+        (camera_path(camera_path=[{"camera_to_world": np.eye(4).ravel().tolist(), "fov": float("nan")}]), "fov is nan"),
+    ],
+)
+def test_a_file_of_cameras_with_a_size_of_nothing_or_nan(content, told, finished, tmp_path):
+    path = tmp_path / "views.json"
+    path.write_text(json.dumps(content))
+    result = nerfcli("render", finished, "--cameras", path)
+    assert result.exit_code == BAD_INPUT
+    assert told in error_of(result)[0]
+    assert not (finished / "renders").exists()
+
+
+@pytest.mark.parametrize("value", [float("nan"), None])
+def test_a_run_whose_cameras_are_damaged(value, finished):
+    content = json.loads((finished / "cameras.json").read_text())
+    content["test"][0]["world_from_cam"][0][3] = value
+    (finished / "cameras.json").write_text(json.dumps(content))
+    result = nerfcli("render", finished)
+    assert result.exit_code == BAD_INPUT
+    assert "cameras.json cannot be read" in error_of(result)[0]
+
+
+def test_the_frame_rate_of_a_camera_path_is_the_default(tmp_path):
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(camera_path(fps=12)))
+    assert file_fps(str(path)) == 12
+    path.write_text(json.dumps(transforms()))
+    assert file_fps(str(path)) is None
+    assert file_fps("orbit") is None
