@@ -149,38 +149,53 @@ def _run(
     settings = fitting.settings
     last_saved = totals.seconds
     psnr: float | None = None
+    loss = 0.0
     logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
+
+    def speeds() -> tuple[float, float]:
+        seconds = max(totals.seconds - logged_seconds, 1e-9)
+        return (totals.samples - logged_samples) / seconds, (totals.rays - logged_rays) / seconds
+
+    def log(**measured: float) -> None:
+        nonlocal logged_samples, logged_rays, logged_seconds
+        samples_per_second, rays_per_second = speeds()
+        entry: dict[str, Any] = {
+            "step": fitting.step,
+            "seconds": round(totals.seconds, 3),
+            "loss": loss,
+            "samples": totals.samples,
+            "rays": totals.rays,
+            "samples_per_second": round(samples_per_second),
+            "rays_per_second": round(rays_per_second),
+            "peak_memory_bytes": peak_memory_bytes(),
+        }
+        append_log(run, entry | measured)
+        logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
+
     checks = [share for share in HELDOUT_SHARES if share > _share(settings, fitting.step, totals.seconds)]
-    while (share := _share(settings, fitting.step, totals.seconds)) < 1.0:
-        began = time.perf_counter()
-        result = fitting.advance(share)
-        totals.seconds += time.perf_counter() - began
-        totals.samples += result.samples
-        totals.rays += result.rays
-        speed = (totals.samples - logged_samples) / max(totals.seconds - logged_seconds, 1e-9)
-        share = _share(settings, fitting.step, totals.seconds)
-        on_progress(Progress(share, fitting.step, totals.seconds, result.loss, speed, psnr))
-        checked = bool(checks) and share >= checks[0]
-        if checked:
-            checks = [later for later in checks if later > share]
-            psnr = heldout.psnr(model()) if heldout is not None else None
-        if checked or totals.seconds - logged_seconds >= 1.0:
-            rays_speed = (totals.rays - logged_rays) / max(totals.seconds - logged_seconds, 1e-9)
-            entry: dict[str, Any] = {
-                "step": fitting.step,
-                "seconds": round(totals.seconds, 3),
-                "loss": result.loss,
-                "samples": totals.samples,
-                "rays": totals.rays,
-                "samples_per_second": round(speed),
-                "rays_per_second": round(rays_speed),
-                "peak_memory_bytes": peak_memory_bytes(),
-            }
-            append_log(run, entry | ({"heldout_psnr": psnr} if checked and psnr is not None else {}))
-            logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
-        if totals.seconds - last_saved >= CHECKPOINT_SECONDS:
-            checkpoint()
-            last_saved = totals.seconds
+    try:
+        while (share := _share(settings, fitting.step, totals.seconds)) < 1.0:
+            began = time.perf_counter()
+            result = fitting.advance(share)
+            totals.seconds += time.perf_counter() - began
+            totals.samples += result.samples
+            totals.rays += result.rays
+            loss = result.loss
+            share = _share(settings, fitting.step, totals.seconds)
+            on_progress(Progress(share, fitting.step, totals.seconds, loss, speeds()[0], psnr))
+            if checks and share >= checks[0]:
+                checks = [later for later in checks if later > share]
+                psnr = heldout.psnr(model()) if heldout is not None else None
+                log(**({"heldout_psnr": psnr} if psnr is not None else {}))
+            elif totals.seconds - logged_seconds >= 1.0:
+                log()
+            if totals.seconds - last_saved >= CHECKPOINT_SECONDS:
+                checkpoint()
+                last_saved = totals.seconds
+    finally:
+        # An interruption may come before the last steps are in the log, and nothing be left to do when it goes on.
+        if totals.seconds > logged_seconds:
+            log()
 
 
 def _share(settings: TrainSettings, step: int, seconds: float) -> float:
