@@ -33,6 +33,7 @@ MODEL_FOLDER = "sparse/0"
 HELD_OUT_EVERY = 8
 
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+_FOREIGN_FILES = ("transforms.json", "transforms_train.json", "poses_bounds.npy")
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,17 @@ class Scene:
         return tuple(frame for frame in self.frames if frame.name in self.test_names)
 
 
+def is_scene(path: Path) -> bool:
+    """Whether a folder holds the files of a scene, well-formed or not."""
+    files = (SCENE_FILE, *_FOREIGN_FILES)
+    return any((path / name).is_file() for name in files) or model_folder(path) is not None
+
+
+def model_folder(path: Path) -> Path | None:
+    """The folder of the COLMAP model in a scene's folder; None where there is none."""
+    return next((path / name for name in _MODEL_FOLDERS if is_model(path / name)), None)
+
+
 def load(path: Path) -> Scene:
     """The scene in a folder, whatever its format; a scene.json or transforms.json itself may be named too.
 
@@ -91,10 +103,10 @@ def load(path: Path) -> Scene:
         path = path.parent
     if (path / SCENE_FILE).is_file():
         return _load_own(path)
-    for name in _MODEL_FOLDERS:
-        if is_model(path / name):
-            model = read_model(path / name)
-            return _scene(path, colmap_on_disk(model, _image_folder(path, path / name, model), _measure, path / name))
+    model_dir = model_folder(path)
+    if model_dir is not None:
+        model = read_model(model_dir)
+        return _scene(path, colmap_on_disk(model, _image_folder(path, model_dir, model), _measure, model_dir))
     if (path / "transforms.json").is_file():
         return _scene(path, read_transforms(path / "transforms.json", _measure))
     if (path / "transforms_train.json").is_file():

@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "scene": {"cameras", "media"},
     "poses": {"scene", "cameras", "media"},
     "scale": {"cameras", "media"},
+    "doctor": {"poses", "scale", "scene", "cameras", "media"},
     "convert": {"scale", "scene", "cameras", "media"},
     "render": {"field", "kernels", "cameras"},
     "train": {"render", "field", "kernels", "scene", "cameras", "media"},

@@ -26,7 +26,7 @@ from nerfcli import cli, scene
 from nerfcli.atomic import write_json
 from nerfcli.cli import poses as poses_command
 from nerfcli.cli.options import seconds_from_text, thread_count
-from nerfcli.errors import BAD_INPUT, INTERRUPTED, OUT_OF_MEMORY, TOO_FEW_PHOTOS
+from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TOO_FEW_PHOTOS
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.render.model import save_model
 from nerfcli.train import loop
@@ -35,7 +35,7 @@ from nerfcli.train.normalisation import training_frame
 from nerfcli.train.run_folder import append_log, describe_run, write_cameras
 from nerfcli.train.settings import TrainSettings
 
-COMMANDS = ("poses", "train", "evaluate", "render", "run", "info", "convert")
+COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert")
 USAGE = 2
 README = Path(__file__).parent.parent / "README.md"
 # Enough for a command that trains to do everything that it does.
@@ -381,6 +381,26 @@ def test_info_of_a_scene(capture):
     plain = nerfcli("info", capture).stdout
     assert plain.splitlines()[0] == str(capture)
     assert "  kind: blender" in plain
+
+
+def test_the_doctor_writes_a_page_beside_the_photos_and_holds_it_against_a_gate(tmp_path):
+    folder = write_photos(tmp_path / "photos", 3)
+    before = listing(folder)
+    result = nerfcli("doctor", folder, "--json")
+    assert (result.exit_code, listing(folder)) == (0, before)
+    told = json.loads(result.stdout)
+    assert told["path"] == str(tmp_path / "photos-doctor.html")
+    assert {finding["check"]: finding["verdict"] for finding in told["findings"]}["count"] == "bad"
+    gated = nerfcli("doctor", folder, "--require", "look")  # its own page is replaced
+    assert (gated.exit_code, gated.stdout.strip()) == (GATE_NOT_MET, told["path"])
+    assert "count (bad)" in error_of(gated)[0]
+    assert nerfcli("doctor", folder, "--require", "fine").exit_code == USAGE
+    Path(told["path"]).write_text("mine")
+    refused = nerfcli("doctor", folder)
+    assert (refused.exit_code, Path(told["path"]).read_text()) == (BAD_INPUT, "mine")
+    error_of(refused)
+    assert nerfcli("doctor", "-", "-o", tmp_path / "pages", "-q", stdin=f"{folder}\n").exit_code == 0
+    assert (tmp_path / "pages" / "photos-doctor.html").exists()
 
 
 def test_a_batch_goes_on_after_a_bad_path(capture, tmp_path):

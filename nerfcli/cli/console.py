@@ -5,7 +5,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -19,6 +19,7 @@ R = TypeVar("R")
 
 # Without a terminal, progress is a plain line at most this often.
 PLAIN_LINE_SECONDS = 10.0
+PLAIN_TABLE_WIDTH = 140
 
 
 class Console:
@@ -46,6 +47,21 @@ class Console:
     def warn(self, text: str) -> None:
         """A line for the user to mind."""
         _stderr(f"Warning: {text}")
+
+    def table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str]) -> None:
+        """A table for the user to read; a cell that is a key of `styles` is coloured so."""
+        if self.quiet:
+            return
+        from rich.box import SIMPLE
+        from rich.console import Console as RichConsole
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(*columns, box=SIMPLE, pad_edge=False)
+        for row in rows:
+            table.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+        # A file or a pipe has no width of its own.
+        RichConsole(stderr=True, width=None if sys.stderr.isatty() else PLAIN_TABLE_WIDTH).print(table)
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float, str], None]]:

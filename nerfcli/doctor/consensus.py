@@ -1,0 +1,69 @@
+"""One number per photo from differences between pairs of photos, as heights from a levelling survey."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+_ROUNDS = 10
+# Differences between photos are off by about this much; larger residuals weigh less.
+_TYPICAL_ERROR = 0.1
+
+
+def potentials(
+    count: int, pairs: Sequence[tuple[int, int]], differences: np.ndarray, *, trust: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers v of the photos with v_j - v_i near the differences (weighted least absolute deviations).
+
+    They are fixed up to a constant for each set of connected photos: its median is 0.
+
+    Args:
+        count: of the photos.
+        pairs: (i, j) of the differences.
+        differences: (len(pairs),) second minus first; NaN where a pair tells nothing.
+        trust: (len(pairs),) positive, how much a pair counts.
+
+    Returns:
+        v (count,), NaN for photos without any pair that tells; and for each the number of pairs that tell.
+    """
+    known = ~np.isnan(differences)
+    i, j = np.array([pair for pair, told in zip(pairs, known, strict=True) if told], dtype=np.int64).reshape(-1, 2).T
+    differences, trust = differences[known], trust[known]
+    backing = np.bincount(np.concatenate([i, j]), minlength=count)
+    values = np.zeros(count)
+    weights = trust / max(trust.mean(), 1e-9) if len(trust) else trust
+    for _ in range(_ROUNDS):
+        laplacian = np.zeros((count, count))
+        np.add.at(laplacian, (i, i), weights)
+        np.add.at(laplacian, (j, j), weights)
+        np.add.at(laplacian, (i, j), -weights)
+        np.add.at(laplacian, (j, i), -weights)
+        right = np.bincount(j, weights * differences, minlength=count)
+        right -= np.bincount(i, weights * differences, minlength=count)
+        # A trace of pull to 0 fixes the constant of each connected set.
+        values = np.linalg.solve(laplacian + 1e-6 * np.eye(count), right)
+        residuals = np.abs(values[j] - values[i] - differences)
+        weights = trust / trust.mean() / np.maximum(residuals, _TYPICAL_ERROR) if len(trust) else trust
+    values[backing == 0] = np.nan
+    for members in connected(count, list(zip(i.tolist(), j.tolist(), strict=True))):
+        told = [member for member in members if backing[member]]
+        if told:
+            values[told] -= np.median(values[told])
+    return values, backing
+
+
+def connected(count: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
+    """Sets of photos that pairs connect, the largest first, each in rising order."""
+    label = list(range(count))
+
+    def root(photo: int) -> int:
+        while label[photo] != photo:
+            label[photo] = label[label[photo]]
+            photo = label[photo]
+        return photo
+
+    for i, j in pairs:
+        label[max(root(i), root(j))] = min(root(i), root(j))
+    sets: dict[int, list[int]] = {}
+    for photo in range(count):
+        sets.setdefault(root(photo), []).append(photo)
+    return sorted(sets.values(), key=lambda members: (-len(members), members[0]))

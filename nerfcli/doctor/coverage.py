@@ -1,0 +1,190 @@
+"""How the cameras of a scene stand: how far apart for the depth they see, from which sides, and whether all belong."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.formats.colmap import read_model
+from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction, views_of
+from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
+from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
+from nerfcli.doctor.photos import PhotoFacts
+from nerfcli.scale.gps import east_north_up
+from nerfcli.scene import Scene, model_folder
+
+# Cameras that look at one thing go around it from this span on; below, they look at it from the front.
+_AROUND_DEG = 180.0
+_GAP_LOOK, _GAP_BAD = 45.0, 100.0
+_SPAN_LOOK, _SPAN_BAD = 20.0, 6.0
+# So many times the median distance of the cameras from their middle is far off.
+_FAR_OFF = 8.0
+_POINTS_LOOK = 100
+# GPS of phones is off by 5 m under open sky and by tens indoors; a scale in metres needs a wider capture.
+_GPS_NOISE = 5.0
+_GPS_WIDE = 100.0
+
+
+def spread(scene: Scene) -> Finding:
+    """How far apart the cameras are, against the distance of what they see; and cameras far off the others."""
+    centres = centres_of(scene.frames)
+    depths = _depths(scene)
+    middle = np.median(centres, axis=0)
+    distances = np.linalg.norm(centres - middle, axis=1)
+    ratio = float(np.sqrt(np.mean(distances**2)) / np.median(depths))
+    typical = float(np.median(distances))
+    far = [i for i in np.argsort(-distances) if distances[i] > _FAR_OFF * typical and typical > 0]
+    nearest = np.linalg.norm(centres[:, None] - centres, axis=2)
+    np.fill_diagonal(nearest, np.inf)
+    step = float(np.median(nearest.min(axis=1) / depths)) if len(centres) > 1 else 0.0
+    verdict = worst([verdict_below(ratio, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if far else GOOD])
+    summary = f"spread over depth {ratio:.2f}, to the nearest camera {step:.3f}"
+    advice = "" if verdict == GOOD else "step sideways between photos: depth shows only where the camera moves"
+    if far:
+        summary += f"; {several(len(far), 'camera')} far off the others"
+        advice = "look at these poses; wrong ones ruin the training: find poses again without these photos"
+    return Finding(
+        "camera spread",
+        verdict,
+        summary,
+        ratio,
+        f"spread over depth: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}; "
+        f"a camera: look from {_FAR_OFF:g} times the median distance",
+        advice,
+        tuple((scene.frames[i].name, f"{distances[i] / typical:.0f} times the median distance") for i in far),
+    )
+
+
+def directions(scene: Scene) -> Finding:
+    """From which sides the cameras see the place that they look at."""
+    up = up_direction(scene.frames)
+    east, north = horizontal_axes(up)
+    centres, views = centres_of(scene.frames), views_of(scene.frames)
+    focus = focus_point(scene.frames, depth_hint=float(np.median(_depths(scene))))
+    inward = (focus - centres) / np.maximum(np.linalg.norm(focus - centres, axis=1, keepdims=True), 1e-300)
+    looks_in = float(np.mean((inward * views).sum(axis=1) > 0.5)) > 0.7
+    rays = -inward if looks_in else views
+    azimuth = np.sort(np.degrees(np.arctan2(rays @ north, rays @ east)))
+    elevation = np.degrees(np.arcsin(np.clip(rays @ up, -1, 1)))
+    gaps = np.diff(np.append(azimuth, azimuth[0] + 360))
+    span = 360 - float(gaps.max())
+    high = f"elevation {elevation.min():.0f} to {elevation.max():.0f} degrees"
+    if looks_in and span < _AROUND_DEG:
+        span = max(span, float(np.ptp(elevation)))
+        verdict = verdict_below(span, look=_SPAN_LOOK, bad=_SPAN_BAD)
+        return Finding(
+            "directions",
+            verdict,
+            f"seen from the front, within {span:.0f} degrees; {high}",
+            span,
+            f"span: look below {_SPAN_LOOK:g} degrees, bad below {_SPAN_BAD:g}",
+            "" if verdict == GOOD else "take photos from farther left, right, above and below",
+        )
+    widest = float(gaps.max())
+    verdict = BAD if looks_in and widest >= _GAP_BAD else LOOK if looks_in and widest >= _GAP_LOOK else GOOD
+    return Finding(
+        "directions",
+        verdict,
+        f"{'around' if looks_in else 'looking outwards'}, widest gap {widest:.0f} degrees; {high}",
+        widest,
+        f"gap around something: look from {_GAP_LOOK:g} degrees, bad from {_GAP_BAD:g}",
+        "" if verdict == GOOD else "fill the gap: from there nothing is known of the scene",
+    )
+
+
+def points(scene: Scene) -> Finding | None:
+    """How many points of the model each photo shows; None where the format does not say."""
+    model = model_folder(scene.root)
+    if scene.kind not in ("nerfcli", "colmap") or model is None:
+        return None
+    counts = {image.name: int((image.point_ids >= 0).sum()) for image in read_model(model).images}
+    few = sorted((count, name) for name, count in counts.items() if count < _POINTS_LOOK)
+    middle = float(np.median(list(counts.values()))) if counts else 0.0
+    return Finding(
+        "points",
+        LOOK if few else GOOD,
+        f"{middle:.0f} points of the model in the middle photo" + (f", {len(few)} photos with few" if few else ""),
+        middle,
+        f"a photo: look below {_POINTS_LOOK}",
+        "their poses are uncertain: look at renders from there before trusting them" if few else "",
+        tuple((name, several(count, "point")) for count, name in few),
+    )
+
+
+def belongings(scene: Scene) -> list[Finding]:
+    """Photos that the scene lists and that are not there, masks, and the unit of length."""
+    missing = scene.missing
+    total = len(missing) + len(scene.frames)
+    masked = [frame.name for frame in scene.frames if frame.mask is not None]
+    unmasked = [(frame.name, "no mask") for frame in scene.frames if frame.mask is None] if masked else []
+    metres = scene.unit == "metre"
+    return [
+        Finding(
+            "missing photos",
+            BAD if len(missing) > 0.5 * total else LOOK if missing else GOOD,
+            f"{len(missing)} of {several(total, 'listed photo')} not on disk" if missing else "none",
+            len(missing),
+            "look from 1, bad from half of them",
+            "put them back, or leave it: the others are used" if missing else "",
+            tuple((name, "not on disk") for name in missing),
+        ),
+        Finding(
+            "masks",
+            LOOK if unmasked else GOOD,
+            f"{len(masked)} of {several(len(scene.frames), 'photo')} have one" if masked else "none",
+            len(masked),
+            "look where some photos have one and others not",
+            "give every photo its mask, or none" if unmasked else "",
+            tuple(unmasked),
+        ),
+        Finding(
+            "unit",
+            GOOD,
+            "lengths are metres" if metres else "lengths are arbitrary: depth maps are in scene units, not metres",
+            None,
+            "told, not judged",
+            "" if metres else "for metres: nerfcli convert with --scale gps, --distance or --markers",
+        ),
+    ]
+
+
+def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
+    """What the photos' GPS says of the place; None without."""
+    positions = [photo.exif.gps for photo in photos if photo.exif.gps is not None and photo.exif.gps[:2] != (0.0, 0.0)]
+    if not positions:
+        return None
+    metres, _ = east_north_up(positions)
+    extent = np.ptp(metres[:, :2], axis=0)
+    widest = float(extent.max())
+    use = "may do for a scale in metres" if widest > _GPS_WIDE else "too near each other for a scale in metres"
+    return Finding(
+        "GPS",
+        GOOD,
+        f"{several(len(positions), 'photo')} within {extent[0]:.0f} m x {extent[1]:.0f} m: {use}",
+        widest,
+        "told, not judged",
+        ""
+        if widest > _GPS_WIDE
+        else f"GPS is off by {_GPS_NOISE:g} m outdoors and by tens indoors; give a known distance for metres",
+    )
+
+
+def _depths(scene: Scene) -> np.ndarray:
+    """The median distance along the axis of what each camera sees, (frames,)."""
+    frames = scene.frames
+    if scene.depth_bounds is not None:
+        # Half of the inverse depths lie nearer.
+        return 2 / (1 / scene.depth_bounds).sum(axis=1)
+    if len(scene.points):
+        depths = np.full(len(frames), np.nan)
+        for index, frame in enumerate(frames):
+            local = rigid.apply(rigid.inverse(frame.world_from_cam), scene.points)
+            pixels, valid = frame.camera.project(local)
+            inside = valid & (local[:, 2] > 0) & (pixels >= 0).all(axis=1)
+            inside &= (pixels <= (frame.camera.width, frame.camera.height)).all(axis=1)
+            if inside.any():
+                depths[index] = np.median(local[inside, 2])
+        if not np.isnan(depths).all():
+            return np.where(np.isnan(depths), np.nanmedian(depths), depths)
+    to_focus = np.linalg.norm(focus_point(frames) - centres_of(frames), axis=1)
+    return np.maximum(to_focus, 1e-9 * max(float(to_focus.max()), 1e-300))

@@ -1,0 +1,201 @@
+"""The whole examination of a folder of photos or of a scene."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.doctor import coverage, geometry, graph, inventory, quality
+from nerfcli.doctor.findings import Finding, as_json, worst
+from nerfcli.doctor.matching import Pair, compare, focal_px
+from nerfcli.doctor.photos import MOST_FEATURES, PhotoFacts, read_all
+from nerfcli.doctor.subject import Subject
+
+# Measured on one core of a 2-core server; within a factor of two on other CPUs.
+_SECONDS_PER_PHOTO = 0.45
+_SECONDS_PER_PAIR = 0.03
+# Photos that hang on nothing get a second look if there are this many at most, or a tenth of the capture.
+_FEW_APART = 3
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found.
+
+    Args:
+        subject: what was examined.
+        findings: of all checks that could be made, in their order.
+        not_checked: names of the others, with the reason.
+        photos: the readable photos.
+        lack: (photos,) log2 of the detail that each lacks against the others, NaN without texture.
+        lighter: (photos,) stops by which each shows the same places lighter than the median photo, NaN where unknown.
+        pairs: the pairs that were compared.
+    """
+
+    subject: Subject
+    findings: tuple[Finding, ...]
+    not_checked: tuple[tuple[str, str], ...]
+    photos: tuple[PhotoFacts, ...]
+    lack: np.ndarray
+    lighter: np.ndarray
+    pairs: tuple[Pair, ...]
+
+    @property
+    def verdict(self) -> str:
+        """The worst of the findings' verdicts."""
+        return worst(finding.verdict for finding in self.findings)
+
+
+def estimated_seconds(count: int, threads: int) -> float:
+    """About how long the examination of so many photos takes."""
+    return (count * _SECONDS_PER_PHOTO + graph.pair_count(count) * _SECONDS_PER_PAIR) / threads
+
+
+def examine(subject: Subject, *, threads: int, progress: Callable[[float, str], None]) -> Diagnosis:
+    """Examine a capture: read every photo once, compare pairs, and judge.
+
+    Deterministic: the same photos give the same findings.
+    """
+    count = len(subject.sources)
+    reading = count * _SECONDS_PER_PHOTO
+    share = reading / (reading + graph.pair_count(count) * _SECONDS_PER_PAIR)
+
+    def on_photo(done: int) -> None:
+        progress(share * done / count, f"photo {done} of {count}")
+
+    facts, unreadable = read_all(subject.sources, threads=threads, progress=on_photo)
+    if not facts:
+        findings = [inventory.readable(unreadable, 0), inventory.enough(0)]
+        nothing = np.zeros(0)
+        return Diagnosis(subject, tuple(findings), (("all else", "no readable photo"),), (), nothing, nothing, ())
+    places = graph.choose_pairs(facts)
+
+    def on_pair(done: int) -> None:
+        progress(share + (1 - share) * done / max(len(places), 1), f"pair {done} of {len(places)}")
+
+    focals = _focals(subject, facts)
+    pairs = compare_all(facts, places, focals, threads=threads, progress=on_pair)
+    pairs = _second_look(facts, pairs, focals)
+    return judged(subject, facts, pairs, unreadable=unreadable)
+
+
+def compare_all(
+    photos: Sequence[PhotoFacts],
+    places: Sequence[tuple[int, int]],
+    focals_px: Sequence[float],
+    *,
+    threads: int,
+    progress: Callable[[int], None],
+) -> list[Pair]:
+    """Compare the photos of each place (i, j), in this order; progress is told how many are done."""
+
+    def work(place: tuple[int, int]) -> Pair:
+        i, j = place
+        return compare((photos[i], photos[j]), place, (focals_px[i], focals_px[j]))
+
+    pairs = []
+    with ThreadPoolExecutor(threads) as workers:
+        for pair in workers.map(work, places):
+            pairs.append(pair)
+            progress(len(pairs))
+    return pairs
+
+
+def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Sequence[float]) -> list[Pair]:
+    """The pairs with those of a few photos that hang on nothing compared once more, by all of their features."""
+    apart = graph.apart(len(photos), pairs)
+    if not 0 < len(apart) <= max(_FEW_APART, len(photos) // 10):
+        return pairs
+    again = []
+    for pair in pairs:
+        i, j = pair.first, pair.second
+        if (i in apart) != (j in apart):
+            both = (photos[i], photos[j])
+            pair = compare(both, (i, j), (focals_px[i], focals_px[j]), most_features=MOST_FEATURES)
+        again.append(pair)
+    return again
+
+
+def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unreadable: dict[str, str]) -> Diagnosis:
+    """All findings on photos that were read and compared; unreadable tells by name why others could not be read."""
+    lack = quality.lacking_detail(photos, pairs)
+    lighter, redder = quality.stops(photos, pairs)
+    found: list[Finding | None] = [
+        inventory.readable(unreadable, len(photos)),
+        inventory.enough(len(photos)),
+        inventory.size(photos),
+        inventory.cameras(photos),
+        inventory.orientation(photos),
+        inventory.duplicates(photos, pairs),
+        quality.sharpness(photos, lack),
+        quality.texture(photos),
+        quality.exposure(photos, lighter),
+        quality.white_balance(photos, redder),
+        quality.clipping(photos),
+    ]
+    not_checked: list[tuple[str, str]] = []
+    if len(photos) > 1:
+        found += [graph.connectivity(photos, pairs), geometry.moving_content(photos, pairs)]
+        for name, finding in (
+            ("movement", geometry.movement(photos, pairs)),
+            ("depth relief", geometry.flatness(pairs)),
+        ):
+            found.append(finding)
+            if finding is None:
+                not_checked.append((name, "too few pairs with enough matches tell"))
+    else:
+        not_checked.append(("connectivity, movement, moving content", "one photo cannot tell"))
+    found.append(coverage.gps(photos))
+    if subject.scene is None:
+        not_checked.append(("directions", "needs poses: find them with nerfcli poses, then examine the scene"))
+    else:
+        found += [coverage.spread(subject.scene), coverage.directions(subject.scene), coverage.points(subject.scene)]
+        found += coverage.belongings(subject.scene)
+    findings = tuple(finding for finding in found if finding is not None)
+    return Diagnosis(subject, findings, tuple(not_checked), tuple(photos), lack, lighter, tuple(pairs))
+
+
+def _focals(subject: Subject, photos: Sequence[PhotoFacts]) -> list[float]:
+    """Focal lengths at the features' size: of the scene's cameras, of EXIF, or a usual one."""
+    cameras = {} if subject.scene is None else {frame.name: frame.camera for frame in subject.scene.frames}
+    focals = []
+    for photo in photos:
+        camera = cameras.get(photo.name)
+        if camera is None:
+            focals.append(focal_px(photo.features, photo.exif.focal_35mm))
+        else:
+            focals.append(camera.focal_px * max(photo.features.size) / max(camera.width, camera.height))
+    return focals
+
+
+def content(diagnosis: Diagnosis) -> dict[str, object]:
+    """The diagnosis as plain values, for JSON."""
+    photos = []
+    for index, photo in enumerate(diagnosis.photos):
+        lack, lighter = float(diagnosis.lack[index]), float(diagnosis.lighter[index])
+        photos.append(
+            {
+                "name": photo.name,
+                "width": photo.exif.width,
+                "height": photo.exif.height,
+                "features": len(photo.features.pixels),
+                "lacking_detail": None if np.isnan(lack) else round(lack, 3),
+                "stops": None if np.isnan(lighter) else round(lighter, 3),
+                "mean": None if np.isnan(photo.exposure.mean) else round(photo.exposure.mean, 4),
+                "white": round(photo.exposure.white, 4),
+                "black": round(photo.exposure.black, 4),
+            }
+        )
+    return {
+        "kind": diagnosis.subject.kind,
+        "verdict": diagnosis.verdict,
+        "findings": [as_json(finding) for finding in diagnosis.findings],
+        "not_checked": [{"check": check, "reason": reason} for check, reason in diagnosis.not_checked],
+        "photos": photos,
+        "pairs": [
+            [diagnosis.photos[pair.first].name, diagnosis.photos[pair.second].name, pair.inliers]
+            for pair in diagnosis.pairs
+            if pair.linked
+        ],
+    }

@@ -1,0 +1,63 @@
+"""How light a photo is: clipped pixels, and the light around single pixels, which matches compare between photos."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+# Levels of 255 from which on, and up to which, a channel holds nothing that could be told apart.
+WHITE_LEVEL = 253
+BLACK_LEVEL = 3
+
+# Linear light of the levels of sRGB, IEC 61966-2-1.
+_LEVELS = np.arange(256) / 255
+_LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
+_WINDOW_PX = 4.0
+_CLIPPED_WINDOW_PX = 15
+# Linear light below which noise and black level decide.
+_DARKEST = 4e-3
+# The weakest channel against the strongest: from here on a colour is pale.
+_PALE = 0.3
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How light a photo is by itself.
+
+    Args:
+        mean: of all channels, sRGB in [0, 1].
+        white, black: share of pixels in which all channels are clipped there.
+    """
+
+    mean: float
+    white: float
+    black: float
+
+
+def measure(rgb: np.ndarray, used: np.ndarray) -> Exposure:
+    """The exposure of a photo (H, W, 3) uint8 where `used` (H, W) is True."""
+    pixels = rgb[used]
+    if not len(pixels):
+        return Exposure(float("nan"), 0.0, 0.0)
+    white, black = (pixels >= WHITE_LEVEL).all(axis=1).mean(), (pixels <= BLACK_LEVEL).all(axis=1).mean()
+    return Exposure(float(pixels.mean() / 255), float(white), float(black))
+
+
+def local_light(rgb: np.ndarray) -> np.ndarray:
+    """Light and colour around each pixel, (H, W, 2) float32; NaN where they are not known.
+
+    First log2 of the linear luminance, to which a stop of exposure adds 1; NaN where it is clipped or nearly so.
+    Second log2 of red over blue, which white balance shifts; NaN also where the colour is strong, since a little shine
+    on it then shifts the ratio by more than white balances do.
+
+    Args:
+        rgb: (H, W, 3) uint8 sRGB.
+    """
+    light = np.maximum(cv2.GaussianBlur(cv2.LUT(rgb, _LINEAR), (0, 0), _WINDOW_PX), 1e-6)
+    clipped = 255 * np.any((rgb >= WHITE_LEVEL) | (rgb <= BLACK_LEVEL), axis=2).astype(np.uint8)
+    unsure = (cv2.blur(clipped, (_CLIPPED_WINDOW_PX, _CLIPPED_WINDOW_PX)) > 0.05 * 255) | (light.min(axis=2) < _DARKEST)
+    luminance = np.log2(light @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32))
+    redness = np.log2(light[..., 0] / light[..., 2])
+    luminance[unsure] = np.nan
+    redness[unsure | (light.min(axis=2) < _PALE * light.max(axis=2))] = np.nan
+    return np.stack([luminance, redness], axis=-1)

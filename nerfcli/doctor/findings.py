@@ -1,0 +1,70 @@
+"""What a check comes to: a number, the threshold that it was held against, a verdict, and what to do."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+GOOD, LOOK, BAD = "good", "look", "bad"
+VERDICTS = (GOOD, LOOK, BAD)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one check.
+
+    Args:
+        check: its name.
+        verdict: good; look: it can be used, but expect less; bad: mend it before any long work.
+        summary: what was found, in words.
+        number: what was measured, None where that is no number.
+        threshold: what the number was held against, in words.
+        advice: what to do; empty where there is nothing to do.
+        photos: what to say of each photo concerned, by name, the worst first.
+    """
+
+    check: str
+    verdict: str
+    summary: str
+    number: float | None
+    threshold: str
+    advice: str = ""
+    photos: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The photos concerned."""
+        return tuple(name for name, _ in self.photos)
+
+
+def verdict_above(number: float, *, look: float, bad: float) -> str:
+    """The verdict on a number that should be small: look from one value on, bad from another."""
+    return BAD if number >= bad else LOOK if number >= look else GOOD
+
+
+def verdict_below(number: float, *, look: float, bad: float) -> str:
+    """The verdict on a number that should be large: look below one value, bad below another."""
+    return BAD if number < bad else LOOK if number < look else GOOD
+
+
+def worst(verdicts: Iterable[str]) -> str:
+    """The worst of the verdicts; good if there is none."""
+    return max(verdicts, key=VERDICTS.index, default=GOOD)
+
+
+def as_json(finding: Finding) -> dict[str, object]:
+    """The finding as plain values; a number that is not finite is left out."""
+    number = finding.number
+    return {
+        "check": finding.check,
+        "verdict": finding.verdict,
+        "summary": finding.summary,
+        "number": None if number is None or not math.isfinite(number) else round(number, 4),
+        "threshold": finding.threshold,
+        "advice": finding.advice,
+        "photos": [{"name": name, "what": what} for name, what in finding.photos],
+    }
+
+
+def several(count: int, singular: str, plural: str = "") -> str:
+    """A count with its noun: 1 photo, 2 photos."""
+    return f"{count} {singular if count == 1 else plural or singular + 's'}"

@@ -1,0 +1,123 @@
+"""Whether the camera moved enough for depth to be seen, and whether there is any depth: from pairs, without poses."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
+from nerfcli.doctor.matching import Pair
+from nerfcli.doctor.moving import Patch
+from nerfcli.doctor.photos import PhotoFacts
+
+# Baseline over depth: 0.1 is an angle of 6 degrees between the rays that meet in a point.
+BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03
+# Pairs that moved at least this far must show depth, or what they show is flat.
+_MOVED = 0.1
+_FLAT_LOOK = 0.8
+_LEAST_PAIRS = 3
+# A patch counts where two pairs find it at the same place of a photo.
+_PAIRS_FOR_PATCH = 2
+
+
+def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
+    """For each photo the largest baseline over depth to another one, the very largest left out where there are three.
+
+    (count,); NaN for photos of which no pair tells.
+    """
+    found: list[list[float]] = [[] for _ in range(count)]
+    for pair in pairs:
+        if pair.views is not None:
+            for photo in (pair.first, pair.second):
+                found[photo].append(pair.views.baseline_over_depth)
+    # One wrong pair must not speak for a photo.
+    return np.array([sorted(values)[-min(2, 1 + len(values) // 3)] if values else np.nan for values in found])
+
+
+def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | None:
+    """Whether the camera moved sideways between the photos, or only turned; None where no pair tells."""
+    largest = baselines(len(photos), pairs)
+    known = ~np.isnan(largest)
+    if not known.any():
+        return None
+    middle = float(np.median(largest[known]))
+    standing = [i for i in np.argsort(np.where(known, largest, np.inf)) if known[i] and largest[i] < BASELINE_BAD]
+    share = len(standing) / int(known.sum())
+    verdict = worst([verdict_below(middle, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if share > 0.1 else GOOD])
+    summary = f"baseline over depth {middle:.2f} in the middle"
+    if verdict == BAD:
+        summary = f"the camera only turned, or hardly moved: baseline over depth {middle:.3f}"
+    elif share > 0.1:
+        summary += f"; {several(len(standing), 'photo')} without sideways movement to any other"
+    return Finding(
+        "movement",
+        verdict,
+        summary,
+        middle,
+        f"baseline over depth with the best partner: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}",
+        "" if verdict == GOOD else "step sideways between photos by a tenth of the distance; turning shows no depth",
+        tuple((photos[i].name, f"baseline over depth {largest[i]:.3f}") for i in standing) if verdict != GOOD else (),
+    )
+
+
+def flatness(pairs: Sequence[Pair]) -> Finding | None:
+    """Whether all that is seen is flat; None where too few pairs moved far enough to tell."""
+    moved = [pair.views for pair in pairs if pair.views is not None and pair.views.baseline_over_depth > _MOVED]
+    if len(moved) < _LEAST_PAIRS:
+        return None
+    share = float(np.mean([views.flat for views in moved]))
+    verdict = LOOK if share >= _FLAT_LOOK else GOOD
+    return Finding(
+        "depth relief",
+        verdict,
+        f"{100 * share:.0f} % of {len(moved)} pairs that moved show nothing but one plane",
+        share,
+        f"look from {_FLAT_LOOK:g}",
+        "what is flat leaves the focal length open: bring things at other distances into view, or give intrinsics"
+        if verdict == LOOK
+        else "",
+    )
+
+
+def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
+    """Photos in which something moved by itself: in the same place for at least two of their pairs."""
+    seen: dict[int, list[tuple[tuple[float, float, float, float], Patch]]] = {}
+    for pair in pairs:
+        for patch in pair.patches:
+            seen.setdefault(pair.first, []).append((patch.box, patch))
+            seen.setdefault(pair.second, []).append((patch.other_box, patch))
+    said = []
+    still = False
+    for photo, boxes in seen.items():
+        confirmed = [
+            (box, patch) for box, patch in boxes if sum(_overlap(box, other) for other, _ in boxes) >= _PAIRS_FOR_PATCH
+        ]
+        if confirmed or (len(pairs) == 1 and boxes):
+            (left, top, right, bottom), patch = max(confirmed or boxes, key=lambda item: item[1].matches)
+            still = still or patch.still
+            width, height = photos[photo].features.size
+            across, down = 100 * (left + right) / 2 / width, 100 * (top + bottom) / 2 / height
+            stays = ", stays in its place in the picture" if patch.still else ""
+            said.append(
+                (patch.matches, photos[photo].name, f"at {across:.0f} % across, {down:.0f} % down{stays}"),
+            )
+    share = len(said) / len(photos)
+    advice = "mask it, or remove these photos: what moves becomes fog and pulls poses"
+    if still:
+        advice += "; what stays in its place is a watermark, a strap, or the background of a turntable"
+    return Finding(
+        "moving content",
+        BAD if share > 0.5 else LOOK if said else GOOD,
+        f"something moves by itself in {several(len(said), 'photo')}" if said else "none found",
+        share,
+        "look from 1 photo, bad from half of them",
+        advice if said else "",
+        tuple((name, what) for _, name, what in sorted(said, reverse=True)),
+    )
+
+
+def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    """Whether two boxes share at least a third of the smaller one."""
+    width = min(one[2], other[2]) - max(one[0], other[0])
+    height = min(one[3], other[3]) - max(one[1], other[1])
+    smaller = min((box[2] - box[0]) * (box[3] - box[1]) for box in (one, other))
+    return width > 0 and height > 0 and width * height >= smaller / 3

@@ -1,0 +1,90 @@
+"""Which photos are compared, and whether their matches hold the capture together."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from nerfcli.doctor.consensus import connected
+from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, worst
+from nerfcli.doctor.matching import Pair
+from nerfcli.doctor.photos import PhotoFacts
+from nerfcli.poses.retrieval import alike, likeness
+
+# Up to here every photo is compared with every other one.
+EXHAUSTIVE_UP_TO = 60
+# Beyond, each with the next ones by name and with the ones that look most like it.
+NEXT_BY_NAME = 5
+LOOK_ALIKES = 6
+# They are found by this many features of each photo, the largest ones; fewer miss some, more take longer.
+_COARSEST = 96
+
+# A photo hangs on by little with less than this many matches in its best pair, or with a single partner.
+WEAK_MATCHES = 35
+_FEWEST_PARTNERS = 2
+
+
+def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
+    """The pairs (i, j), i < j, of photos to compare: all of a small capture, about 11 a photo of a large one."""
+    count = len(photos)
+    if count <= EXHAUSTIVE_UP_TO:
+        return list(combinations(range(count), 2))
+    near = {(i, i + step) for step in range(1, NEXT_BY_NAME + 1) for i in range(count - step)}
+    coarsest = [
+        photo.features.descriptors[np.argsort(-photo.features.scales, kind="stable")[:_COARSEST]] for photo in photos
+    ]
+    shared = likeness(coarsest, lambda stage, done, total: None)
+    return sorted(near | set(alike(shared, LOOK_ALIKES, known=near)))
+
+
+def pair_count(count: int) -> int:
+    """About how many pairs `choose_pairs` chooses."""
+    if count <= EXHAUSTIVE_UP_TO:
+        return count * (count - 1) // 2
+    return count * (NEXT_BY_NAME + LOOK_ALIKES)
+
+
+def apart(count: int, pairs: Sequence[Pair]) -> set[int]:
+    """The photos that are not in the largest set that matches hold together."""
+    parts = connected(count, [(pair.first, pair.second) for pair in pairs if pair.linked])
+    return {photo for part in parts[1:] for photo in part}
+
+
+def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
+    """Whether all photos hang together by matches, and which do so by little."""
+    linked = [pair for pair in pairs if pair.linked]
+    parts = connected(len(photos), [(pair.first, pair.second) for pair in linked])
+    loose = [photo for part in parts[1:] for photo in part]
+    best, partners = np.zeros(len(photos), dtype=int), np.zeros(len(photos), dtype=int)
+    for pair in linked:
+        for photo in (pair.first, pair.second):
+            best[photo] = max(best[photo], pair.inliers)
+            partners[photo] += 1
+    said = [(photos[i].name, _apart_text(i, parts)) for i in loose]
+    weak = [
+        i
+        for i in sorted(parts[0], key=lambda photo: (best[photo], partners[photo]))
+        if len(photos) > 2 and (best[i] < WEAK_MATCHES or partners[i] < _FEWEST_PARTNERS) and i not in loose
+    ]
+    said += [(photos[i].name, f"{several(partners[i], 'partner')}, best {best[i]} matches") for i in weak]
+    share = len(parts[0]) / len(photos)
+    verdict = worst([GOOD if len(parts) == 1 else BAD if share < 0.9 else LOOK, LOOK if weak else GOOD])
+    sizes = " + ".join(str(len(part)) for part in parts[:6]) + (" + ..." if len(parts) > 6 else "")
+    summary = f"{len(parts)} parts without common matches: {sizes}" if len(parts) > 1 else "all photos hang together"
+    if weak:
+        summary += f"; {several(len(weak), 'photo')} by little"
+    return Finding(
+        "connectivity",
+        verdict,
+        summary,
+        share,
+        f"share of photos in the largest part: look below 1, bad below 0.9; a photo: look below {WEAK_MATCHES} matches "
+        f"with its best partner or with less than {_FEWEST_PARTNERS} partners",
+        "" if verdict == GOOD else "take photos in between, so that each overlaps its neighbours by two thirds",
+        tuple(said),
+    )
+
+
+def _apart_text(photo: int, parts: Sequence[Sequence[int]]) -> str:
+    mine = next(part for part in parts if photo in part)
+    return "matches no other photo" if len(mine) == 1 else f"in a part of {len(mine)} photos"

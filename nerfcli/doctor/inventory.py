@@ -1,0 +1,166 @@
+"""What the files alone tell: which can be read, how many, how large, from which cameras, and which are the same."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below
+from nerfcli.doctor.matching import Pair
+from nerfcli.doctor.photos import PhotoFacts
+
+FEWEST_PHOTOS = 4
+ENOUGH_PHOTOS = 20
+SMALL_PX = 640
+_TINY_PX = 320
+# Focal lengths that differ by less belong to one lens: autofocus moves them a little.
+_SAME_FOCAL = 0.02
+# Two pictures that are this alike when tiny, and whose matches moved by less than this share of the diagonal, show the
+# same from the same place.
+_ALIKE = 0.985
+_SAME_PLACE = 0.004
+# The same picture stored once more, in another format or quality.
+_SAME_PICTURE = 0.999
+_SAME_PIXELS = 0.0003
+
+
+def readable(unreadable: Mapping[str, str], count: int) -> Finding:
+    """Whether the files can be read; count is the number of those that can."""
+    bad = len(unreadable)
+    total = max(bad + count, 1)
+    return Finding(
+        "files",
+        BAD if bad >= 0.1 * total and bad else LOOK if bad else GOOD,
+        f"{bad} of {several(total, 'photo')} cannot be read" if bad else f"all {several(count, 'photo')} can be read",
+        bad,
+        "look from 1, bad from a tenth of the photos",
+        "copy these files again, or remove them" if bad else "",
+        tuple(unreadable.items()),
+    )
+
+
+def enough(count: int) -> Finding:
+    """Whether there are enough photos for a reconstruction that can be checked."""
+    verdict = verdict_below(count, look=ENOUGH_PHOTOS, bad=FEWEST_PHOTOS)
+    advice = {
+        GOOD: "",
+        LOOK: "more photos that overlap by two thirds give more to learn from and to check against",
+        BAD: "take more photos from other places: 20 or more that overlap by two thirds work well",
+    }
+    return Finding(
+        "count",
+        verdict,
+        several(count, "readable photo"),
+        count,
+        f"look below {ENOUGH_PHOTOS}, bad below {FEWEST_PHOTOS}",
+        advice[verdict],
+    )
+
+
+def size(photos: Sequence[PhotoFacts]) -> Finding:
+    """Whether the photos have enough pixels."""
+    longer = [max(photo.exif.width, photo.exif.height) for photo in photos]
+    smallest = min(longer)
+    sizes = Counter(f"{photo.exif.width} x {photo.exif.height}" for photo in photos)
+    told = ", ".join(f"{text} ({number})" for text, number in sizes.most_common(3))
+    verdict = verdict_below(smallest, look=SMALL_PX, bad=_TINY_PX)
+    small = [(photo.name, f"{side} px") for photo, side in zip(photos, longer, strict=True) if side < SMALL_PX]
+    return Finding(
+        "size",
+        verdict,
+        told + (f" and {len(sizes) - 3} other sizes" if len(sizes) > 3 else ""),
+        smallest,
+        f"longer side: look below {SMALL_PX} px, bad below {_TINY_PX} px",
+        "" if verdict == GOOD else "use the original files, not previews or downloads from a messenger",
+        tuple(sorted(small, key=lambda item: item[1])),
+    )
+
+
+def cameras(photos: Sequence[PhotoFacts]) -> Finding:
+    """Whether one camera with one lens at one zoom took all photos, as far as EXIF tells."""
+    groups = _camera_groups(photos)
+    largest = max(groups.values(), key=len)
+    others = [(name, optics) for optics, names in groups.items() if names is not largest for name in names]
+    verdict = GOOD if len(groups) == 1 else BAD if len(groups) > max(2, len(photos) / 4) else LOOK
+    main = next(optics for optics, names in groups.items() if names is largest)
+    summary = f"one camera: {main}" if len(groups) == 1 else f"{len(groups)} kinds of camera, lens, zoom or shape"
+    return Finding(
+        "cameras",
+        verdict,
+        summary if len(groups) == 1 else f"{summary}; most photos: {main}",
+        len(groups),
+        "kinds: look from 2, bad from one in four photos",
+        "" if verdict == GOOD else "keep one lens and one zoom, without crops; each kind is calibrated by itself",
+        tuple(others),
+    )
+
+
+def orientation(photos: Sequence[PhotoFacts]) -> Finding:
+    """Whether the photos are all upright or all on their side."""
+    portrait = [photo.name for photo in photos if photo.exif.height > photo.exif.width]
+    landscape = [photo.name for photo in photos if photo.exif.height < photo.exif.width]
+    turned = Counter(photo.exif.orientation for photo in photos)
+    fewer = min(portrait, landscape, key=len)
+    kind = "portrait" if fewer is portrait else "landscape"
+    tags = ", ".join(f"{tag} ({number})" for tag, number in sorted(turned.items()))
+    return Finding(
+        "orientation",
+        LOOK if fewer else GOOD,
+        f"{len(portrait)} portrait, {len(landscape)} landscape; EXIF orientation {tags}",
+        len(fewer),
+        "look from 1 photo that is held otherwise",
+        "nothing need be done: photos are turned upright here; other programs may ignore the tag" if fewer else "",
+        tuple((name, kind) for name in fewer),
+    )
+
+
+def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
+    """Photos that are there twice, or were taken twice from one place."""
+    said: dict[str, str] = {}
+    exact = 0
+    first_of: dict[str, str] = {}
+    for photo in photos:
+        if photo.digest in first_of:
+            said[photo.name] = f"same file as {first_of[photo.digest]}"
+            exact += 1
+        first_of.setdefault(photo.digest, photo.name)
+    for pair in pairs:
+        one, other = photos[pair.first], photos[pair.second]
+        likeness = float((one.tiny * other.tiny).sum())
+        if not pair.linked or other.name in said:
+            continue
+        if pair.shift < _SAME_PIXELS and likeness > _SAME_PICTURE:
+            said[other.name] = f"same picture as {one.name}"
+            exact += 1
+        elif pair.shift < _SAME_PLACE and likeness > _ALIKE:
+            said[other.name] = f"nearly the same as {one.name}"
+    share = len(said) / len(photos)
+    return Finding(
+        "duplicates",
+        verdict_above(share, look=1e-9, bad=0.3) if exact or share > 0.1 else GOOD,
+        f"{exact} twice, {len(said) - exact} taken from the place of another" if said else "none",
+        len(said),
+        "look from one file twice or a tenth from the same place, bad from 0.3 of the photos",
+        "remove them: they cost time, and a held-out photo is no test where its double is learned from" if said else "",
+        tuple(said.items()),
+    )
+
+
+def _camera_groups(photos: Sequence[PhotoFacts]) -> dict[str, list[str]]:
+    """Names by camera, lens, focal length and shape, held upright or not."""
+    groups: dict[str, list[str]] = {}
+    focals: list[float] = []
+    for photo in photos:
+        exif = photo.exif
+        longer, shorter = max(exif.width, exif.height), min(exif.width, exif.height)
+        body = " ".join(text for text in (exif.make, exif.model) if text)
+        parts = [body, exif.lens] if body or exif.lens else ["unknown (no EXIF)"]
+        focal = exif.focal_mm or exif.focal_35mm
+        if focal:
+            focal = next((known for known in focals if abs(math.log(focal / known)) < _SAME_FOCAL), focal)
+            focals.append(focal)
+            parts.append(f"{focal:.3g} mm")
+        if exif.focal_mm and exif.focal_35mm:  # also tells digital zoom
+            parts.append(f"({exif.focal_35mm:.3g} mm on film)")
+        parts.append(f"{longer} x {shorter}")
+        groups.setdefault(", ".join(dict.fromkeys(part for part in parts if part)), []).append(photo.name)
+    return groups

@@ -1,0 +1,134 @@
+"""What two photos tell together: which points they share, whether the camera moved between them, and what else did.
+
+Everything is found at `photos.LONGER_SIDE_PX` without poses. Letters: x and y are the pixels of a match in the first
+and the second photo, F their fundamental matrix, H a homography between them, K the matrix of a camera.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.doctor import two_views
+from nerfcli.doctor.moving import Patch, moving_patches
+from nerfcli.doctor.photos import Features, PhotoFacts
+
+# Of each photo so many features are compared at first; all of them where these link it to nothing.
+QUICK_FEATURES = 1000
+# A match is kept if the second-best feature is this much farther away. Source: Lowe 2004, section 7.1.
+_RATIO = 0.8
+# How far a match may be from what a geometry says, pixels.
+EPIPOLAR_PX = 2.0
+# Fewer matches than these agree on a common geometry by chance.
+LEAST_MATCHES = 20
+# The fewest whose geometry is looked into.
+_LEAST_FOR_GEOMETRY = 40
+# Light and detail are compared where both photos show a thing about as large: their ratio is within this many octaves.
+_SAME_SIZE_OCTAVES = 0.4
+_LEAST_COMPARED = 12
+
+
+@dataclass(frozen=True)
+class Pair:
+    """What was found of two photos. Differences are second minus first.
+
+    Args:
+        first, second: numbers of the photos, first < second.
+        matches: features that choose each other.
+        inliers: those of them that agree on one geometry of two views.
+        shift: median distance between x and y of the inliers, as a share of the picture's diagonal.
+        detail: median difference of log2 detail where both show a thing at the same size; NaN where too few tell.
+        stops: median difference of log2 light; NaN where too few tell.
+        stops_spread: median distance from that median: small where all that is seen became lighter alike.
+        redder: median difference of log2 red over blue; NaN where too few tell.
+        views: how the camera moved between the photos; None where too few inliers tell.
+        patches: what else moved.
+    """
+
+    first: int
+    second: int
+    matches: int
+    inliers: int
+    shift: float
+    detail: float
+    stops: float
+    stops_spread: float
+    redder: float
+    views: two_views.TwoViews | None
+    patches: tuple[Patch, ...]
+
+    @property
+    def linked(self) -> bool:
+        """Whether the photos certainly show the same things."""
+        return self.inliers >= LEAST_MATCHES
+
+
+def compare(
+    photos: tuple[PhotoFacts, PhotoFacts],
+    numbers: tuple[int, int],
+    focals_px: tuple[float, float],
+    *,
+    most_features: int = QUICK_FEATURES,
+) -> Pair:
+    """Match two photos and look at what their matches say.
+
+    Args:
+        numbers: of the photos.
+        focals_px: at the size in which features were sought, as well as they are known.
+        most_features: of each photo, the clearest ones.
+    """
+    one, other = (photo.features for photo in photos)
+    a, b = mutual_matches(one.descriptors[:most_features], other.descriptors[:most_features])
+    x, y = one.pixels[a], other.pixels[b]
+    _, agree = two_views.fundamental_matrix(x, y, EPIPOLAR_PX)
+    count = int(agree.sum())
+    if count < LEAST_MATCHES:
+        unknown = float("nan")
+        return Pair(*numbers, len(a), count, unknown, unknown, unknown, unknown, unknown, None, ())
+    same_size = np.abs(np.log2(other.scales[b] / one.scales[a])) < _SAME_SIZE_OCTAVES
+    chosen = agree & same_size
+    lighter, redder = (other.light[b[agree]] - one.light[a[agree]]).T
+    stops = _median(lighter)
+    views, patches = None, ()
+    if count >= _LEAST_FOR_GEOMETRY:
+        centres = [np.array(features.size) / 2 for features in (one, other)]
+        views = two_views.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px)
+        patches = moving_patches(x, y, agree, within_px=EPIPOLAR_PX)
+    return Pair(
+        *numbers,
+        matches=len(a),
+        inliers=count,
+        shift=float(np.median(np.linalg.norm(y[agree] - x[agree], axis=1)) / np.hypot(*one.size)),
+        detail=_median(other.detail[b[chosen]] - one.detail[a[chosen]]),
+        stops=stops,
+        stops_spread=_median(np.abs(lighter - stops)),
+        redder=_median(redder),
+        views=views,
+        patches=patches,
+    )
+
+
+def mutual_matches(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of features that are each other's nearest and nearer by `_RATIO` than the second-nearest."""
+    if min(len(one), len(other)) < 2:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    a, b = (descriptors.astype(np.float32) for descriptors in (one, other))
+    distances = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)  # squared; (one, other)
+    back = distances.argmin(axis=0)
+    rows = np.arange(len(a))
+    nearest = distances.argmin(axis=1)
+    best = distances[rows, nearest].copy()
+    distances[rows, nearest] = np.inf
+    clear = best < _RATIO**2 * distances.min(axis=1)
+    kept = clear & (back[nearest] == rows)
+    return rows[kept], nearest[kept]
+
+
+def focal_px(features: Features, focal_35mm: float | None) -> float:
+    """The focal length at the features' size: as EXIF tells it, else as most phones and cameras have it."""
+    longer = max(features.size)
+    return longer * (focal_35mm / 36 if focal_35mm else 1.0)
+
+
+def _median(values: np.ndarray) -> float:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) >= _LEAST_COMPARED else float("nan")

@@ -1,0 +1,115 @@
+"""What moved between two photos by itself: a patch whose matches agree with each other, but with no camera's motion.
+
+Sought with care, since a false alarm costs more trust than a miss: a patch counts only if its matches move together,
+if hardly any match in it follows the camera, and if no single geometry of two views explains it together with the rest.
+What moves along the epipolar lines cannot be told from what stands nearer, and is missed.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from nerfcli.doctor.two_views import fundamental_matrix
+
+# A match that is this many times the tolerance from its epipolar line does not follow the camera.
+_FAR = 3.0
+# Matches of a patch are neighbours within this distance, and their motion differs by less than a share of it.
+_REACH_PX = 60.0
+_MOTION_PER_DISTANCE = 0.25
+_MOTION_PX = 3.0
+_LEAST_IN_PATCH = 10
+# Share of the matches in a patch that must not follow the camera.
+_DOMINANT = 0.7
+# Largest share of the picture's matches that one patch may hold: beyond, one cannot say which of the two moved.
+_LARGEST_SHARE = 0.35
+# A geometry that explains this share of the patch and of the rest makes it no patch.
+_EXPLAINED = 0.8
+_STILL_PX = 1.5
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A part of the first photo that moved by itself.
+
+    Args:
+        box: left, top, right, bottom in the first photo, pixels at `photos.LONGER_SIDE_PX`.
+        other_box: the same in the second photo.
+        matches: in it.
+        still: whether it stays at its place in the picture, as a watermark or the background of a turntable does.
+    """
+
+    box: tuple[float, float, float, float]
+    other_box: tuple[float, float, float, float]
+    matches: int
+    still: bool
+
+
+def moving_patches(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, within_px: float) -> tuple[Patch, ...]:
+    """The patches of matches (N, 2) that moved by themselves, where `agree` (N,) follow the camera."""
+    fundamental, _ = cv2.findFundamentalMat(x[agree], y[agree], cv2.FM_8POINT)
+    if fundamental is None or fundamental.shape != (3, 3):
+        return ()
+    away = np.flatnonzero(~agree & (_epipolar_px(x, y, fundamental) > _FAR * within_px))
+    found = []
+    for group in _moving_together(x[away], y[away]):
+        members = away[group]
+        if len(members) <= _LARGEST_SHARE * len(x) and _is_patch(x, y, agree, members=members, within_px=within_px):
+            shift = np.median(np.linalg.norm(y[members] - x[members], axis=1))
+            found.append(Patch(_box(x[members]), _box(y[members]), len(members), bool(shift < _STILL_PX)))
+    return tuple(found)
+
+
+def _moving_together(x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+    """Groups of matches, connected by neighbours that move alike; the small ones are left out."""
+    count = len(x)
+    if count < _LEAST_IN_PATCH:
+        return []
+    apart = np.linalg.norm(x[:, None] - x, axis=2)
+    motion = y - x
+    differs = np.linalg.norm(motion[:, None] - motion, axis=2)
+    alike = (apart < _REACH_PX) & (differs < _MOTION_PX + _MOTION_PER_DISTANCE * apart)
+    label = np.arange(count)
+    for _ in range(count):  # the smallest label spreads through each group
+        spread = np.where(alike, label, count).min(axis=1)
+        if (spread == label).all():
+            break
+        label = spread
+    groups = [np.flatnonzero(label == which) for which in np.unique(label)]
+    # A feature may have been found several times in one place, with several orientations.
+    return [group for group in groups if len(np.unique(np.rint(x[group]), axis=0)) >= _LEAST_IN_PATCH]
+
+
+def _is_patch(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, members: np.ndarray, within_px: float) -> bool:
+    left, top, right, bottom = _box(x[members])
+    inside = (x[:, 0] >= left) & (x[:, 0] <= right) & (x[:, 1] >= top) & (x[:, 1] <= bottom)
+    if len(members) < _DOMINANT * (len(members) + (inside & agree).sum()):
+        return False
+    # As many of the rest as of the patch, so that neither outvotes the other.
+    rest = np.flatnonzero(agree)
+    chosen = rest[np.linspace(0, len(rest) - 1, min(len(rest), max(3 * len(members), 40))).astype(int)]
+    both = np.concatenate([members, chosen])
+    voted, _ = fundamental_matrix(x[both], y[both], within_px)
+    median, _ = cv2.findFundamentalMat(x[both], y[both], cv2.FM_LMEDS)
+    for matrix in (voted, median):
+        if matrix is None or matrix.shape != (3, 3) or np.isnan(matrix).any():
+            continue
+        error = _epipolar_px(x, y, matrix)
+        if min(np.mean(error[members] < 2 * within_px), np.mean(error[chosen] < 2 * within_px)) > _EXPLAINED:
+            return False
+    return True
+
+
+def _epipolar_px(x: np.ndarray, y: np.ndarray, fundamental: np.ndarray) -> np.ndarray:
+    """The larger of the two distances of each match from its epipolar lines, pixels."""
+    ones = np.ones((len(x), 1))
+    first, second = np.hstack([x, ones]), np.hstack([y, ones])
+    lines, back = first @ fundamental.T, second @ fundamental
+    products = np.abs((second * lines).sum(axis=1))
+    lengths = np.minimum(np.linalg.norm(lines[:, :2], axis=1), np.linalg.norm(back[:, :2], axis=1))
+    return products / np.maximum(lengths, 1e-12)
+
+
+def _box(points: np.ndarray) -> tuple[float, float, float, float]:
+    (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
+    return float(left), float(top), float(right), float(bottom)

@@ -1,0 +1,240 @@
+"""The diagnosis as one HTML page that needs nothing else: findings, thumbnails, charts, and which photos match."""
+
+import base64
+import hashlib
+import re
+from html import escape
+from pathlib import Path
+from string import Template
+
+import cv2
+import numpy as np
+
+from nerfcli.atomic import atomic_path
+from nerfcli.doctor.charts import bars, match_matrix
+from nerfcli.doctor.examination import Diagnosis
+from nerfcli.doctor.findings import BAD, GOOD, LOOK, VERDICTS, Finding, several, worst
+from nerfcli.doctor.photos import PhotoFacts
+from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
+from nerfcli.errors import UserError
+
+# Thumbnails of large captures are smaller, so that a page of a thousand photos has about 5 MB.
+_SMALL_THUMBNAILS_FROM, _SMALL_THUMBNAIL_PX = 200, 120
+# Photos shown beside a finding; the others are named only.
+_SHOWN_PER_FINDING = 12
+_MARK = '<meta name="nerfcli-doctor" content="{}">'
+_WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "mend this first"}
+
+
+def write_page(diagnosis: Diagnosis, path: Path) -> None:
+    """Write the page, atomically.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    with atomic_path(path) as partial:
+        partial.write_text(page_html(diagnosis), encoding="utf-8")
+
+
+def refuse_foreign(path: Path, capture: Path) -> None:
+    """Raise unless a page of this capture may be written at a path: nothing stands there, or an earlier such page.
+
+    Raises:
+        UserError: something else stands there.
+    """
+    if not path.exists():
+        return
+    if path.is_file():
+        with path.open("rb") as file:
+            if _MARK.format(_identity(capture)).encode() in file.read(4096):
+                return
+    raise UserError(
+        f"{path} exists and is no page of this capture", "add --overwrite to replace it, or choose another file with -o"
+    )
+
+
+def page_html(diagnosis: Diagnosis) -> str:
+    """The page's text."""
+    photos, verdict = diagnosis.photos, diagnosis.verdict
+    number = {photo.name: index for index, photo in enumerate(photos)}
+    order = sorted(diagnosis.findings, key=lambda finding: -VERDICTS.index(finding.verdict))
+    counts = {which: sum(finding.verdict == which for finding in order) for which in VERDICTS}
+    return _PAGE.substitute(
+        mark=_MARK.format(_identity(diagnosis.subject.path)),
+        title=escape(_title(diagnosis.subject.path)),
+        kind=diagnosis.subject.kind,
+        count=several(len(photos), "photo"),
+        verdict=verdict,
+        words=_WORDS[verdict],
+        counts=", ".join(f"{counts[which]} {which}" for which in (BAD, LOOK, GOOD) if counts[which]),
+        thumbnails="\n".join(_thumbnail_rule(index, photo, len(photos)) for index, photo in enumerate(photos)),
+        findings="\n".join(_finding_html(finding, number) for finding in order),
+        not_checked="".join(
+            f"<li><b>{escape(check)}</b>: {escape(reason)}</li>" for check, reason in diagnosis.not_checked
+        )
+        or "<li>everything was checked</li>",
+        charts=_charts_html(diagnosis),
+        grid="\n".join(_photo_html(index, diagnosis) for index in range(len(photos))),
+    )
+
+
+def _identity(capture: Path) -> str:
+    """Tells captures apart without telling where they are."""
+    return hashlib.sha256(str(capture.resolve()).encode()).hexdigest()[:16]
+
+
+def _title(capture: Path) -> str:
+    folder = capture.resolve()
+    return f"{folder.parent.name}/{folder.name}" if folder.name in ("images", "photos") else folder.name
+
+
+def _thumbnail_rule(index: int, photo: PhotoFacts, count: int) -> str:
+    """A CSS rule with the picture in it, so that a photo that is shown twice is stored once."""
+    data = photo.thumbnail
+    if count > _SMALL_THUMBNAILS_FROM:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        scale = _SMALL_THUMBNAIL_PX / max(picture.shape[:2])
+        size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
+        smaller = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if scale < 1 else picture
+        data = cv2.imencode(".jpg", smaller, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
+    return f".p{index}{{background-image:url(data:image/jpeg;base64,{base64.b64encode(data).decode()})}}"
+
+
+def _finding_html(finding: Finding, number: dict[str, int]) -> str:
+    shown = "".join(
+        _figure(number.get(name), name, what, link=True) for name, what in finding.photos[:_SHOWN_PER_FINDING]
+    )
+    rest = finding.photos[_SHOWN_PER_FINDING:]
+    more = ""
+    if rest:
+        names = "".join(f"<li>{escape(name)} <span>{escape(what)}</span></li>" for name, what in rest)
+        more = f"<details><summary>{several(len(rest), 'more photo')}</summary><ul>{names}</ul></details>"
+    advice = f'<p class="advice">{escape(_sentence(finding.advice))}</p>' if finding.advice else ""
+    photos = f'<div class="row">{shown}</div>{more}' if shown else ""
+    return (
+        f'<article class="{finding.verdict}"><header><span class="dot"></span><h3>{escape(finding.check)}</h3>'
+        f"<p>{escape(_sentence(finding.summary))}</p></header>{advice}{photos}"
+        f'<p class="threshold">{escape(finding.threshold)}</p></article>'
+    )
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "."
+
+
+def _figure(index: int | None, name: str, what: str, *, link: bool) -> str:
+    picture = '<span class="picture none"></span>' if index is None else f'<span class="picture p{index}"></span>'
+    if link and index is not None:
+        picture = f'<a href="#photo{index}">{picture}</a>'
+    short = re.split(r"[/\\]", name)[-1]
+    return (
+        f'<figure><div class="frame">{picture}</div>'
+        f'<figcaption title="{escape(name)}"><b>{escape(short)}</b> {escape(what)}</figcaption></figure>'
+    )
+
+
+def _photo_html(index: int, diagnosis: Diagnosis) -> str:
+    photo = diagnosis.photos[index]
+    concerned = [finding for finding in diagnosis.findings if photo.name in finding.names and finding.verdict != GOOD]
+    state = worst(finding.verdict for finding in concerned)
+    badges = " ".join(f'<span class="badge {f.verdict}">{escape(f.check)}</span>' for f in concerned)
+    figure = _figure(index, photo.name, "", link=False)
+    return f'<div class="photo {state}" id="photo{index}">{figure}{badges}</div>'
+
+
+def _charts_html(diagnosis: Diagnosis) -> str:
+    photos = diagnosis.photos
+    if len(photos) < 2:
+        return ""
+    names = [photo.name for photo in photos]
+    linked = [(pair.first, pair.second, pair.inliers) for pair in diagnosis.pairs if pair.linked]
+    charts = [
+        (
+            "Detail against the capture",
+            "Each bar is a photo, in the order of names. Below 0: it shows less detail than the others; "
+            f"coloured from {-BLURRED:g} down (half an octave is about a blur of 1 px at 1600 px).",
+            bars(names, -diagnosis.lack, marked=diagnosis.lack > BLURRED, unit="octaves"),
+        ),
+        (
+            "Light at the same places",
+            "Stops by which a photo shows the same places lighter or darker than the others.",
+            bars(names, diagnosis.lighter, marked=np.abs(diagnosis.lighter) > STOPS_LOOK / 2, unit="stops"),
+        ),
+        (
+            "Which photos match",
+            "Rows and columns are photos in the order of names; the stronger, the more matches. "
+            "An even band along the diagonal is a walk, a corner far from it a closed loop, separate blocks are parts.",
+            match_matrix(len(photos), linked),
+        ),
+    ]
+    return "".join(
+        f'<section class="chart"><h3>{title}</h3><p>{text}</p>{chart}</section>' for title, text, chart in charts
+    )
+
+
+_PAGE = Template("""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+$mark
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>$title: nerfcli doctor</title>
+<style>
+:root{--bg:#f6f7f9;--card:#fff;--ink:#1b2026;--soft:#5b6672;--line:#e2e6eb;--good:#2c8a57;--look:#b7791f;--bad:#c0392b;
+--tint-look:#fdf6e7;--tint-bad:#fdeeec;--bar:#7d93ab}
+@media (prefers-color-scheme:dark){:root{--bg:#14171b;--card:#1d2126;--ink:#e7eaee;--soft:#98a3af;--line:#2e343b;
+--good:#4fbf85;--look:#e0a94a;--bad:#ef6f61;--tint-look:#29241a;--tint-bad:#2d1f1e;--bar:#7c93ad}}
+*{box-sizing:border-box}
+body{margin:0;background:var(--bg);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
+main{max-width:1120px;margin:0 auto;padding:32px 20px 64px}
+h1{font-size:30px;margin:0;line-height:1.2;overflow-wrap:anywhere}
+h2{font-size:19px;margin:40px 0 12px}h3{font-size:15px;margin:0}
+.top{display:flex;gap:20px;align-items:center;justify-content:space-between;flex-wrap:wrap;margin-bottom:24px}
+.top p{margin:4px 0 0;color:var(--soft)}
+.pill{color:#fff;border-radius:999px;padding:8px 18px;font-weight:600;white-space:nowrap}
+.pill.good{background:var(--good)}.pill.look{background:var(--look)}.pill.bad{background:var(--bad)}
+article{background:var(--card);border:1px solid var(--line);border-left:4px solid var(--good);border-radius:8px;
+padding:12px 16px;margin:8px 0}
+article.look{border-left-color:var(--look);background:var(--tint-look)}
+article.bad{border-left-color:var(--bad);background:var(--tint-bad)}
+article header{display:grid;grid-template-columns:12px 140px 1fr;gap:10px;align-items:baseline}
+article header p{margin:0}.dot{width:10px;height:10px;border-radius:50%;background:var(--good)}
+.look .dot{background:var(--look)}.bad .dot{background:var(--bad)}
+.advice{margin:6px 0 0 172px;font-weight:600}
+.threshold{margin:4px 0 0 172px;color:var(--soft);font-size:12.5px}
+.row{display:flex;flex-wrap:wrap;gap:10px;margin:10px 0 2px 172px}
+details{margin:4px 0 0 172px;font-size:13px}details ul{columns:3 220px;padding-left:18px}details span{color:var(--soft)}
+figure{margin:0;width:132px}.frame{height:100px;background:var(--line);border-radius:6px;overflow:hidden}
+.picture{display:block;width:100%;height:100%;background-size:contain;background-repeat:no-repeat;background-position:center}
+.none{background:repeating-linear-gradient(45deg,var(--line) 0 8px,transparent 8px 16px)}
+figcaption{font-size:12px;line-height:1.35;margin-top:4px;color:var(--soft);overflow-wrap:anywhere}
+figcaption b{color:var(--ink);font-weight:600;display:block}
+.charts{display:grid;gap:12px}
+.chart{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:14px 16px}
+.chart p{margin:2px 0 10px;color:var(--soft);font-size:13px}.chart svg{display:block;width:100%;height:auto}
+.chart text{fill:var(--soft);font-size:11px}.matrix{width:min(100%,520px);image-rendering:pixelated;border-radius:4px}
+.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(140px,1fr));gap:14px}
+.photo{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:8px}
+.photo figure{width:100%}.photo.look{border-color:var(--look)}.photo.bad{border-color:var(--bad)}
+.photo:target{outline:3px solid var(--look)}
+.badge{display:inline-block;font-size:11px;border-radius:4px;padding:0 6px;margin-top:4px;color:#fff;
+background:var(--look)}
+.badge.bad{background:var(--bad)}
+footer{margin-top:40px;color:var(--soft);font-size:13px}
+@media (max-width:640px){.advice,.threshold,.row,details{margin-left:0}article header{grid-template-columns:12px 1fr}
+article header p{grid-column:1/-1}}
+$thumbnails
+</style></head><body><main>
+<div class="top"><div><h1>$title</h1><p>nerfcli doctor: $kind, $count; checks: $counts</p></div>
+<span class="pill $verdict">$words</span></div>
+<h2>Findings</h2>
+$findings
+<h2>Not checked</h2><ul>$not_checked</ul>
+<h2>Photo by photo</h2>
+<div class="charts">$charts</div>
+<h2>All photos</h2>
+<div class="grid">$grid</div>
+<footer>Photos were judged at 1600 px and matched at 800 px. Blur that vanishes at that size, movement along the line of
+sight, and things that move towards or away from the camera cannot be seen this way; repeated patterns may look like
+matches.</footer>
+</main></body></html>
+""")

@@ -1,0 +1,193 @@
+"""What one photo tells by itself. It is read once, and what is kept of it is small: a thousand fit into memory."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from nerfcli.doctor import exposure, sharpness
+from nerfcli.errors import UserError
+from nerfcli.media.images import Exif, downscale, read_exif, read_image
+
+# The longer side of the pictures in which features are sought; every threshold in pixels is meant at this size.
+LONGER_SIDE_PX = 800
+MOST_FEATURES = 2000
+# Of a capture of many photos fewer are kept, so that all fit into memory.
+MANY_PHOTOS = 200
+_FEATURES_OF_MANY = 1000
+
+_THUMBNAIL_PX = 240
+_THUMBNAIL_QUALITY = 72
+# The side of the tiny grey picture by which duplicates are found.
+_TINY_PX = 32
+
+
+@dataclass(frozen=True)
+class Features:
+    """Points of a photo that can be found again in another one, at `LONGER_SIDE_PX`, the clearest first.
+
+    Args:
+        size: (width, height) of the picture in which they were sought.
+        pixels: (N, 2) float32, pixel centres at 0.5.
+        scales: (N,) float32, how large what was found is, in pixels.
+        descriptors: (N, 128) uint8.
+        detail: (N,) float32, see `sharpness.measure`; NaN without texture.
+        light: (N, 2) float32, see `exposure.local_light`; NaN where not known.
+    """
+
+    size: tuple[int, int]
+    pixels: np.ndarray
+    scales: np.ndarray
+    descriptors: np.ndarray
+    detail: np.ndarray
+    light: np.ndarray
+
+
+@dataclass(frozen=True)
+class PhotoFacts:
+    """All that is kept of a photo.
+
+    Args:
+        name: as the capture lists it.
+        exif: with the upright size.
+        digest: SHA-256 of the file.
+        thumbnail: a small JPEG.
+        tiny: (32, 32) float32, grey, of mean 0 and norm 1; all 0 for an even picture.
+        transparent: whether the file has transparent pixels.
+    """
+
+    name: str
+    exif: Exif
+    digest: str
+    thumbnail: bytes
+    tiny: np.ndarray
+    transparent: bool
+    sharpness: sharpness.Sharpness
+    exposure: exposure.Exposure
+    features: Features
+
+
+@dataclass(frozen=True)
+class Source:
+    """A photo to read: its name in the capture, its file, and the file of its mask."""
+
+    name: str
+    path: Path
+    mask: Path | None = None
+
+
+def read_all(
+    sources: Sequence[Source], *, threads: int, progress: Callable[[int], None]
+) -> tuple[list[PhotoFacts], dict[str, str]]:
+    """What the photos tell, in their order, and by name why the others cannot be read.
+
+    Args:
+        threads: photos that are held at full size at a time.
+        progress: told how many are read.
+    """
+    facts: list[PhotoFacts] = []
+    unreadable: dict[str, str] = {}
+    most_features = MOST_FEATURES if len(sources) <= MANY_PHOTOS else _FEATURES_OF_MANY
+    with ThreadPoolExecutor(threads) as readers:
+        for index, found in enumerate(readers.map(lambda source: _examine(source, most_features), sources)):
+            if isinstance(found, PhotoFacts):
+                facts.append(found)
+            else:
+                unreadable[sources[index].name] = found
+            progress(index + 1)
+    return facts, unreadable
+
+
+def read_photo(source: Source, most_features: int) -> PhotoFacts:
+    """What a photo tells, with so many features at most.
+
+    Raises:
+        UserError: the photo or its mask cannot be read.
+    """
+    image = read_image(source.path)
+    exif = read_exif(source.path)
+    digest = hashlib.sha256(source.path.read_bytes()).hexdigest()
+    large = _shrunk(image, sharpness.LONGER_SIDE_PX)
+    del image
+    rgb, used = _opaque(large)
+    if source.mask is not None:
+        mask = cv2.resize(read_image(source.mask)[..., :3].max(axis=2), used.shape[::-1], interpolation=cv2.INTER_AREA)
+        used = used & (mask > 127)
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    sharp, local_detail = sharpness.measure(np.where(used, grey, grey[used].mean() if used.any() else 0).astype("f4"))
+    small = _shrunk(rgb, LONGER_SIDE_PX)
+    small_grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+    seen = cv2.resize(used.astype(np.uint8), small_grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return PhotoFacts(
+        name=source.name,
+        exif=exif,
+        digest=digest,
+        thumbnail=_jpeg(_shrunk(small, _THUMBNAIL_PX)),
+        tiny=_tiny(small_grey),
+        transparent=large.shape[2] == 4 and bool((large[..., 3] < 255).any()),
+        sharpness=sharp,
+        exposure=exposure.measure(rgb, used),
+        features=_features(small, seen, local_detail=local_detail, most_features=most_features),
+    )
+
+
+def _examine(source: Source, most_features: int) -> PhotoFacts | str:
+    try:
+        return read_photo(source, most_features)
+    except UserError as error:
+        return error.message.replace(str(source.path), "").removeprefix(" is ").strip(" :")
+
+
+def _shrunk(image: np.ndarray, longer_side_px: int) -> np.ndarray:
+    return downscale(image, max(1.0, max(image.shape[:2]) / longer_side_px))
+
+
+def _opaque(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The picture (H, W, 3) on white, and where it is opaque (H, W)."""
+    if image.shape[2] == 3:
+        return image, np.ones(image.shape[:2], dtype=bool)
+    alpha = image[..., 3:].astype(np.float32) / 255
+    on_white = np.rint(image[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
+    return on_white, image[..., 3] > 127
+
+
+def _features(rgb: np.ndarray, seen: np.ndarray, *, local_detail: np.ndarray, most_features: int) -> Features:
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    # Without the precise upscaling, OpenCV's keypoints lie a quarter of a pixel off.
+    sift = cv2.SIFT.create(nfeatures=most_features, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(grey, seen)
+    height, width = grey.shape
+    if descriptors is None:
+        keypoints, descriptors = [], np.zeros((0, 128), dtype=np.float32)
+    # At equal response there may be a few more than were asked for.
+    clearest = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")[:most_features]
+    keypoints, descriptors = [keypoints[i] for i in clearest], descriptors[clearest]
+    # OpenCV's positions have pixel centres at whole numbers.
+    pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float32).reshape(-1, 2) + 0.5
+    column, row = (np.clip(pixels[:, i].astype(int), 0, (width, height)[i] - 1) for i in (0, 1))
+    rows, columns = local_detail.shape
+    return Features(
+        size=(width, height),
+        pixels=pixels,
+        scales=np.array([keypoint.size for keypoint in keypoints], dtype=np.float32),
+        descriptors=descriptors.astype(np.uint8),
+        detail=local_detail[row * rows // height, column * columns // width],
+        light=exposure.local_light(rgb)[row, column],
+    )
+
+
+def _tiny(grey: np.ndarray) -> np.ndarray:
+    tiny = cv2.resize(grey, (_TINY_PX, _TINY_PX), interpolation=cv2.INTER_AREA).astype(np.float32)
+    tiny -= tiny.mean()
+    norm = float(np.linalg.norm(tiny))
+    return tiny / norm if norm > _TINY_PX else np.zeros_like(tiny)
+
+
+def _jpeg(rgb: np.ndarray) -> bytes:
+    encoded, data = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])
+    assert encoded
+    return data.tobytes()

@@ -1,0 +1,200 @@
+"""Which photos are blurred, too light or too dark, judged within their capture and by what their neighbours show."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nerfcli.doctor.consensus import potentials
+from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below, worst
+from nerfcli.doctor.matching import Pair
+from nerfcli.doctor.photos import PhotoFacts
+
+# log2 of detail that a photo lacks against the others: 0.3 is what a Gaussian blur of about 0.8 px takes from a sharp
+# photo of 1600 px, 0.7 one of 1.5 px.
+BLURRED, VERY_BLURRED = 0.3, 0.7
+# By itself, without neighbours that show the same, a photo must lack more, since what it shows plays a part.
+_ALONE = 0.1
+_NEIGHBOURS_TELL = 3
+# Smeared in one direction: this many times the capture's median ratio of directions; it counts from a smaller lack on.
+_SMEARED, _SMEARED_LACK = 1.25, 0.2
+# The whole capture: a Gaussian blur of about 2 px and of 4 px at 1600 px.
+SOFT, VERY_SOFT = -1.15, -1.75
+
+# Stops between photos.
+STOPS_LOOK, STOPS_BAD = 1.0, 2.5
+# Stops between red and blue.
+_BALANCE_LOOK, _BALANCE_BAD = 0.5, 1.5
+CLIPPED_LOOK, CLIPPED_BAD = 0.1, 0.5
+_DARK, _VERY_DARK = 0.15, 0.05
+
+
+def lacking_detail(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> np.ndarray:
+    """log2 of the detail that each photo lacks against the rest of the capture, (photos,); NaN without texture.
+
+    What a photo shows by itself, and what it shows of the same places as its neighbours, count alike where there are
+    enough neighbours.
+    """
+    own = np.array([photo.sharpness.detail for photo in photos])
+    reference = np.nanmedian(own) if not np.isnan(own).all() else 0.0
+    linked = [pair for pair in pairs if pair.linked]
+    places = [(pair.first, pair.second) for pair in linked]
+    trust = np.array([pair.inliers for pair in linked], dtype=np.float64)
+    matched, backing = potentials(len(photos), places, np.array([pair.detail for pair in linked]), trust=trust)
+    alone = reference - own
+    both = (alone - matched) / 2
+    return np.where((backing >= _NEIGHBOURS_TELL) & ~np.isnan(both), both, alone - _ALONE)
+
+
+def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
+    """Photos that are blurred against the others; and whether all of them are."""
+    own = np.array([photo.sharpness.detail for photo in photos])
+    ratios = np.array([photo.sharpness.direction_ratio for photo in photos])
+    usual = float(np.median(ratios))
+    blank = np.isnan(own)
+    smeared = (ratios > _SMEARED * usual) & (lack > _SMEARED_LACK)
+    blurred = ~blank & ((lack > BLURRED) | smeared)
+    very = ~blank & (lack > VERY_BLURRED)
+    order = [int(i) for i in np.argsort(-np.nan_to_num(lack, nan=-9)) if blurred[i]]
+    said = [
+        (photos[i].name, f"{100 * 2 ** -lack[i]:.0f} % of the usual detail{', smeared' if smeared[i] else ''}")
+        for i in order
+    ]
+    middle = float(np.median(own[~blank])) if (~blank).any() else float("nan")
+    whole = GOOD if np.isnan(middle) else verdict_below(middle, look=SOFT, bad=VERY_SOFT)
+    share = float(blurred.mean())
+    verdict = worst([whole, BAD if share > 0.3 or very.mean() > 0.1 else LOOK if blurred.any() else GOOD])
+    parts = []
+    if blurred.any():
+        parts.append(f"{blurred.sum()} of {several(len(photos), 'photo')} blurred")
+    if whole != GOOD:
+        parts.append("all photos are soft, as if enlarged or badly focused")
+    if not parts:
+        parts.append("no photo is blurred against the others")
+    advice = []
+    if blurred.any():
+        advice.append("remove them where others show the same, or take them again with a shorter exposure")
+    if whole != GOOD:
+        advice.append("train with --downscale 2 or use sharper originals")
+    return Finding(
+        "sharpness",
+        verdict,
+        "; ".join(parts),
+        share,
+        f"detail: look below {100 * 2**-BLURRED:.0f} % of the capture's, bad where 0.3 of the photos are",
+        "; ".join(advice),
+        tuple(said),
+    )
+
+
+def texture(photos: Sequence[PhotoFacts]) -> Finding:
+    """Whether the photos show enough to find again in other photos."""
+    poor = [
+        (photo.name, f"{len(photo.features.pixels)} features, texture on {100 * photo.sharpness.textured:.0f} %")
+        for photo in photos
+        if len(photo.features.pixels) < 150
+    ]
+    share = len(poor) / len(photos)
+    return Finding(
+        "texture",
+        verdict_above(share, look=1e-9, bad=0.3),
+        f"{several(len(poor), 'photo')} with hardly anything to find again" if poor else "enough in every photo",
+        share,
+        "look from one photo with less than 150 features, bad from 0.3 of them",
+        "step back, or bring things with texture into the picture" if poor else "",
+        tuple(sorted(poor, key=lambda item: int(item[1].split()[0]))),
+    )
+
+
+def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
+    """How many stops lighter than the capture's median each photo shows the same places, and how much redder.
+
+    Returns:
+        stops (photos,) and stops of red over blue (photos,); NaN for photos without matches that tell.
+    """
+    linked = [pair for pair in pairs if pair.linked]
+    places = [(pair.first, pair.second) for pair in linked]
+    # A pair in which everything became lighter alike tells of the camera; shine and shade tell of the scene.
+    trust = np.array([pair.inliers / (0.05 + np.nan_to_num(pair.stops_spread)) for pair in linked])
+    lighter, _ = potentials(len(photos), places, np.array([pair.stops for pair in linked]), trust=trust)
+    redder, _ = potentials(len(photos), places, np.array([pair.redder for pair in linked]), trust=trust)
+    return lighter, redder
+
+
+def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
+    """Whether the same places are about as light in all photos; and what EXIF says of it."""
+    known = ~np.isnan(lighter)
+    spread = float(np.ptp(lighter[known])) if known.any() else float("nan")
+    settings = [
+        float(np.log2(photo.exif.exposure_seconds * photo.exif.iso))
+        for photo in photos
+        if photo.exif.exposure_seconds and photo.exif.iso
+    ]
+    told = f"; EXIF: {np.ptp(settings):.1f} stops in time and ISO" if len(settings) > 1 else ""
+    off = [i for i in np.argsort(-np.abs(np.nan_to_num(lighter))) if known[i] and abs(lighter[i]) > STOPS_LOOK / 2]
+    verdict = verdict_above(spread, look=STOPS_LOOK, bad=STOPS_BAD) if known.any() else GOOD
+    if not known.any() and len(settings) > 1:
+        verdict = verdict_above(float(np.ptp(settings)), look=STOPS_LOOK, bad=STOPS_BAD)
+    fixed = len(settings) == len(photos) and np.ptp(settings) < 0.1
+    seen = f"the same places differ by up to {spread:.1f} stops" if known.any() else "no matches to compare light by"
+    advice = (
+        "the camera's settings are fixed: it is the light or shiny surfaces; keep lamps and your shadow away"
+        if fixed
+        else "fix exposure in the camera, or take the photos in one go; shine and shadows that move do the same"
+    )
+    return Finding(
+        "exposure",
+        verdict,
+        seen + told,
+        spread,
+        f"look from {STOPS_LOOK:g} stop, bad from {STOPS_BAD:g}",
+        "" if verdict == GOOD else advice,
+        tuple((photos[i].name, f"{lighter[i]:+.1f} stops") for i in off) if verdict != GOOD else (),
+    )
+
+
+def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
+    """Whether the same places have the same colour in all photos."""
+    known = ~np.isnan(redder)
+    spread = float(np.ptp(redder[known])) if known.any() else float("nan")
+    verdict = verdict_above(spread, look=_BALANCE_LOOK, bad=_BALANCE_BAD) if known.any() else GOOD
+    off = [i for i in np.argsort(-np.abs(np.nan_to_num(redder))) if known[i] and abs(redder[i]) > _BALANCE_LOOK / 2]
+    seen = f"red against blue differs by up to {spread:.2f} stops at the same places"
+    return Finding(
+        "white balance",
+        verdict,
+        seen if known.any() else "no matches to compare colours by",
+        spread,
+        f"look from {_BALANCE_LOOK:g} stops, bad from {_BALANCE_BAD:g}",
+        "" if verdict == GOOD else "fix the white balance in the camera; keep coloured light out",
+        tuple((photos[i].name, f"{redder[i]:+.2f} stops redder") for i in off) if verdict != GOOD else (),
+    )
+
+
+def clipping(photos: Sequence[PhotoFacts]) -> Finding:
+    """Photos with much pure white or pure black, or that are dark as a whole."""
+    said: list[tuple[float, str, str]] = []
+    verdicts = [GOOD]
+    for photo in photos:
+        light = photo.exposure
+        clipped = max(light.white, light.black)
+        verdict = verdict_above(clipped, look=CLIPPED_LOOK, bad=CLIPPED_BAD)
+        if verdict != GOOD:
+            kind = "white" if light.white >= light.black else "black"
+            said.append((clipped, photo.name, f"{100 * clipped:.0f} % pure {kind}"))
+        elif light.mean < _DARK:
+            verdict = verdict_below(light.mean, look=_DARK, bad=_VERY_DARK)
+            said.append((_DARK - light.mean, photo.name, f"dark: mean level {255 * light.mean:.0f} of 255"))
+        verdicts.append(verdict)
+    share = len(said) / len(photos)
+    return Finding(
+        "clipping",
+        BAD if verdicts.count(BAD) > 0.3 * len(photos) else LOOK if said else GOOD,
+        f"{several(len(said), 'photo')} of {len(photos)} with much pure white or black, or dark" if said else "little",
+        share,
+        f"a photo: look from {CLIPPED_LOOK:g} of its pixels, bad from {CLIPPED_BAD:g}; "
+        "all: bad where 0.3 of the photos are",
+        "expose so that what matters is neither; nothing can be seen or matched there; a background may stay so"
+        if said
+        else "",
+        tuple((name, what) for _, name, what in sorted(said, key=lambda item: -item[0])),
+    )

@@ -1,0 +1,89 @@
+"""How sharp a photo is, told so that what it shows matters little.
+
+Natural pictures have about as much energy in every octave of detail, whatever they show; blur takes it from the finest
+octaves and leaves the coarse ones. So `detail` compares two neighbouring octaves: near 0 in a sharp photo of anything
+with texture, and one lower for every halving of the fine octave's amplitude against the coarse one's. Photos are judged
+at `LONGER_SIDE_PX`: blur that vanishes there is not seen.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+LONGER_SIDE_PX = 1600
+
+# Standard deviations in pixels of the smoothings whose differences are the two octaves.
+_SMOOTHINGS = (0.8, 1.6, 3.2)
+# Tiles per side; the sharpest quarter of those with texture tells, since a photo may be out of focus in the background.
+_TILES = 12
+_SHARPEST_QUARTILE = 75
+# Root mean square of the coarse octave, in levels of 255, from which on a tile has texture to judge by.
+_TEXTURE_LEVELS = 1.2
+_LEAST_TEXTURED_TILES = 6
+# Noise of the sensor and of JPEG, in levels: it is fine detail that is none.
+_NOISE_LEVELS = 0.35
+_WINDOW_PX = 12.0
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    """How sharp a photo is by itself.
+
+    Args:
+        detail: log2 of fine against coarse amplitude in the sharpest quarter of the tiles; NaN without texture.
+        direction_ratio: of `detail`'s amplitudes along and across the direction in which they differ most, >= 1: it is
+            large where the photo is smeared in one direction.
+        textured: share of the tiles with enough texture to judge by.
+    """
+
+    detail: float
+    direction_ratio: float
+    textured: float
+
+
+def octaves(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The fine and the coarse octave of a grey picture (H, W) in levels of 255, float32."""
+    fine, middle, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in _SMOOTHINGS)
+    return fine - middle, middle - coarse
+
+
+def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
+    """The sharpness of a photo, and the same around each of its pixels.
+
+    Args:
+        grey: (H, W) float32 in levels of 255, of `LONGER_SIDE_PX` at most.
+
+    Returns:
+        The photo's sharpness, and `detail` around each pixel, (H, W) float32, NaN where there is no texture.
+    """
+    fine, coarse = octaves(grey)
+    fine_power, coarse_power = (cv2.GaussianBlur(band * band, (0, 0), _WINDOW_PX) for band in (fine, coarse))
+    textured = coarse_power > _TEXTURE_LEVELS**2
+    local = 0.5 * np.log2(np.maximum(fine_power - _NOISE_LEVELS**2, 1e-3) / np.maximum(coarse_power, 1e-3))
+    local[~textured] = np.nan
+    tiles = [
+        (float(np.median(tile[~np.isnan(tile)])), row, column)
+        for row, line in enumerate(np.array_split(local, _TILES, axis=0))
+        for column, tile in enumerate(np.array_split(line, _TILES, axis=1))
+        if tile.size and np.mean(~np.isnan(tile)) > 0.3
+    ]
+    share = len(tiles) / _TILES**2
+    if len(tiles) < _LEAST_TEXTURED_TILES:
+        return Sharpness(float("nan"), 1.0, share), local
+    detail = float(np.percentile([tile[0] for tile in tiles], _SHARPEST_QUARTILE))
+    return Sharpness(detail, _direction_ratio(fine, coarse, textured), share), local
+
+
+def _direction_ratio(fine: np.ndarray, coarse: np.ndarray, textured: np.ndarray) -> float:
+    """How much more the fine octave has kept of the coarse one's gradients in its best direction than in its worst.
+
+    The square root of the ratio of the generalised eigenvalues of the two octaves' summed structure tensors: what the
+    photo shows has its directions in both octaves alike, smear only in the fine one.
+    """
+    tensors = []
+    for band in (fine, coarse):
+        x, y = cv2.Sobel(band, cv2.CV_32F, 1, 0)[textured], cv2.Sobel(band, cv2.CV_32F, 0, 1)[textured]
+        tensors.append(np.array([[np.mean(x * x), np.mean(x * y)], [np.mean(x * y), np.mean(y * y)]], dtype=np.float64))
+    ratios = np.linalg.eigvals(np.linalg.solve(tensors[1] + 1e-9 * np.eye(2), tensors[0])).real
+    return float(np.sqrt(max(ratios.max(), 1e-9) / max(ratios.min(), 1e-9)))

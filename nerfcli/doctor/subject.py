@@ -1,0 +1,56 @@
+"""What is examined: a folder of photos, or a scene."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerfcli import scene as scenes
+from nerfcli.doctor.photos import Source
+from nerfcli.errors import UserError
+from nerfcli.media.images import IMAGE_SUFFIXES, list_images
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A capture to examine.
+
+    Args:
+        path: as the user gave it.
+        sources: its photos.
+        scene: their poses, where there are any.
+    """
+
+    path: Path
+    sources: tuple[Source, ...]
+    scene: scenes.Scene | None
+
+    @property
+    def kind(self) -> str:
+        """photos or scene."""
+        return "photos" if self.scene is None else "scene"
+
+
+def find_subject(path: Path) -> Subject:
+    """The photos of a folder, or those of a scene.
+
+    A folder that holds photos and the poses of a scene is a scene.
+
+    Raises:
+        UserError: nothing there, no photos, or a scene whose files are malformed.
+    """
+    if not path.exists():
+        raise UserError(f"there is no {path}", "give a folder of photos, or a scene")
+    if path.is_file() or scenes.is_scene(path):
+        return _of_scene(path)
+    photos = list_images(path)
+    if not photos:
+        below = next((child for child in sorted(path.iterdir()) if child.is_dir() and list_images(child)), None)
+        where = f"there are photos in {below}: give that folder" if below else ""
+        hint = where or f"expected a scene, or files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
+        raise UserError(f"no photos and no scene in {path}", hint)
+    return Subject(path, tuple(Source(photo.name, photo) for photo in photos), None)
+
+
+def _of_scene(path: Path) -> Subject:
+    scene = scenes.load(path)
+    sources = tuple(Source(f.name, f.image, f.mask) for f in scene.frames if f.image is not None)
+    return Subject(path, sources, scene)

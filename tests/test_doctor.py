@@ -1,0 +1,397 @@
+"""What the doctor says of captures with known faults: each is found and named, and a clean capture gets no alarm.
+
+The photos are drawn by `walks`: boards with known textures at known distances, seen by a camera on a known path.
+"""
+
+import hashlib
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from walks import BOARDS, FOCAL_PX, view, walk, write
+
+from nerfcli.cameras import rigid
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.doctor import consensus, coverage, graph, inventory, quality, two_views
+from nerfcli.doctor.examination import Diagnosis, compare_all, content, estimated_seconds, examine, judged
+from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding
+from nerfcli.doctor.matching import Pair, mutual_matches
+from nerfcli.doctor.page import page_html, refuse_foreign
+from nerfcli.doctor.photos import PhotoFacts, Source, read_photo
+from nerfcli.doctor.sharpness import measure
+from nerfcli.doctor.subject import Subject, find_subject
+from nerfcli.errors import UserError
+from nerfcli.media.images import Exif
+from nerfcli.scene import Scene
+
+ONE = 3  # the number of the photo that is spoilt
+FEATURES = 500
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A capture that was read and compared, so that one photo can be spoilt without doing all again."""
+
+    folder: Path
+    photos: tuple[np.ndarray, ...]
+    facts: tuple[PhotoFacts, ...]
+    pairs: tuple[Pair, ...]
+
+    def diagnosis(self) -> Diagnosis:
+        subject = Subject(self.folder, tuple(Source(fact.name, self.folder / fact.name) for fact in self.facts), None)
+        return judged(subject, list(self.facts), list(self.pairs), unreadable={})
+
+    def spoilt(self, photo: np.ndarray, tmp_path: Path) -> Diagnosis:
+        """The findings with another photo in the place of `ONE`."""
+        path = tmp_path / self.facts[ONE].name
+        Image.fromarray(photo).save(path, quality=93)
+        facts = list(self.facts)
+        facts[ONE] = read_photo(Source(path.name, path), FEATURES)
+        pairs = {(pair.first, pair.second): pair for pair in self.pairs}
+        again = [place for place in pairs if ONE in place]
+        for pair in compare_all(facts, again, [FOCAL_PX] * len(facts), threads=2, progress=lambda done: None):
+            pairs[pair.first, pair.second] = pair
+        return replace(self, facts=tuple(facts), pairs=tuple(pairs.values())).diagnosis()
+
+
+def examined(folder: Path, photos: list[np.ndarray]) -> Examined:
+    write(folder, photos)
+    facts = [read_photo(Source(path.name, path), FEATURES) for path in sorted(folder.iterdir())]
+    places = graph.choose_pairs(facts)
+    pairs = compare_all(facts, places, [FOCAL_PX] * len(facts), threads=2, progress=lambda done: None)
+    return Examined(folder, tuple(photos), tuple(facts), tuple(pairs))
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Examined:
+    return examined(tmp_path_factory.mktemp("doctor") / "clean", walk())
+
+
+def finding(diagnosis: Diagnosis, check: str) -> Finding:
+    return next(found for found in diagnosis.findings if found.check == check)
+
+
+def alarms(diagnosis: Diagnosis) -> dict[str, tuple[str, ...]]:
+    """The names of photos by checks that are not good. The captures here are small on purpose."""
+    found = {f.check: f.names for f in diagnosis.findings if f.verdict != GOOD}
+    return {check: names for check, names in found.items() if check not in ("count", "size")}
+
+
+# One fault at a time
+
+
+def test_a_clean_capture_gets_no_alarm(clean):
+    diagnosis = clean.diagnosis()
+    assert alarms(diagnosis) == {}
+    # The camera stepped aside by 0.9 to either side, at distances of 2.6 to 6.
+    assert 0.15 < (finding(diagnosis, "movement").number or 0) < 0.7
+
+
+def test_a_photo_out_of_focus_is_named(clean, tmp_path):
+    diagnosis = clean.spoilt(cv2.GaussianBlur(clean.photos[ONE], (0, 0), 1.5), tmp_path)
+    assert alarms(diagnosis) == {"sharpness": ("03.jpg",)}
+    assert "smeared" not in finding(diagnosis, "sharpness").photos[0][1]
+
+
+def test_a_smeared_photo_is_named_and_told_from_one_out_of_focus(clean, tmp_path):
+    smear = np.zeros((9, 9), np.float32)
+    smear[4] = 1 / 9
+    found = finding(clean.spoilt(cv2.filter2D(clean.photos[ONE], -1, smear), tmp_path), "sharpness")
+    assert found.names == ("03.jpg",)
+    assert "smeared" in found.photos[0][1]
+
+
+@pytest.mark.parametrize("stops", [-2.0, 1.2])
+def test_the_stops_of_a_photo_that_is_lighter_or_darker_are_measured(clean, stops, tmp_path):
+    linear = (clean.photos[ONE] / 255) ** 2.2 * 2**stops
+    photo = np.rint(255 * linear.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+    diagnosis = clean.spoilt(photo, tmp_path)
+    assert finding(diagnosis, "exposure").names == ("03.jpg",)
+    np.testing.assert_allclose(diagnosis.lighter[ONE], stops, atol=0.15)  # gamma 2.2 is not quite sRGB's
+    assert finding(diagnosis, "white balance").verdict == GOOD
+
+
+def test_another_white_balance_is_named_and_is_no_exposure(clean, tmp_path):
+    photo = (clean.photos[ONE] * (1.15, 1.0, 0.85)).clip(0, 255).astype(np.uint8)
+    diagnosis = clean.spoilt(photo, tmp_path)
+    assert list(alarms(diagnosis)) == ["white balance"]
+    assert finding(diagnosis, "white balance").names == ("03.jpg",)
+
+
+def test_a_photo_of_nothing_is_no_blurred_photo(clean, tmp_path):
+    found = alarms(clean.spoilt(np.full_like(clean.photos[ONE], 140), tmp_path))
+    assert found == {"texture": ("03.jpg",), "connectivity": ("03.jpg",)}
+
+
+def test_a_photo_of_another_place_hangs_on_nothing(clean, tmp_path):
+    diagnosis = clean.spoilt(view(seed=70), tmp_path)
+    assert alarms(diagnosis) == {"connectivity": ("03.jpg",)}
+    np.testing.assert_allclose(finding(diagnosis, "connectivity").number or 0, 6 / 7)
+
+
+def test_doubles_are_named_whether_the_file_is_the_same_or_not(clean, tmp_path):
+    again = clean.spoilt(clean.photos[ONE + 1], tmp_path)
+    assert finding(again, "duplicates").photos == (("04.jpg", "same file as 03.jpg"),)
+    lighter = clean.spoilt((clean.photos[ONE + 1] * 0.97).astype(np.uint8), tmp_path)
+    assert finding(lighter, "duplicates").photos == (("04.jpg", "same picture as 03.jpg"),)
+
+
+def test_mixed_lenses_and_zooms_are_told_but_not_a_phone_on_its_side(clean):
+    exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
+
+    def cameras(*odd: Exif) -> Finding:
+        return inventory.cameras([replace(f, exif=e) for f, e in zip(clean.facts, [*odd, *[exif] * 6], strict=True)])
+
+    assert cameras(exif).verdict == GOOD
+    assert cameras(replace(exif, focal_mm=4.05)).verdict == GOOD  # autofocus
+    assert cameras(replace(exif, width=exif.height, height=exif.width)).verdict == GOOD
+    for odd in ({"focal_35mm": 56.0}, {"model": "Two"}, {"lens": "Wide"}, {"focal_mm": 6.0}, {"width": 300}):
+        found = cameras(replace(exif, **odd))
+        assert (found.verdict, found.names) == (LOOK, ("00.jpg",)), odd
+
+
+# Whole captures
+
+
+def test_a_camera_that_only_turns_is_told_from_one_that_moves(tmp_path):
+    turning = examined(tmp_path / "turning", [view(pan_deg=angle) for angle in np.linspace(-15, 15, 6)]).diagnosis()
+    assert list(alarms(turning)) == ["movement"]
+    found = finding(turning, "movement")
+    assert (found.verdict, len(found.names)) == (BAD, 6)
+    assert (found.number or 0) < 0.03
+
+
+def test_two_halves_without_common_places_are_told_apart(clean, tmp_path):
+    halves = examined(tmp_path / "halves", [*clean.photos[:3], *walk(3, seed=50)]).diagnosis()
+    assert list(alarms(halves)) == ["connectivity"]
+    found = finding(halves, "connectivity")
+    assert (found.verdict, found.names) == (BAD, ("03.jpg", "04.jpg", "05.jpg"))
+
+
+def test_something_that_moves_by_itself_is_found_where_it_is(tmp_path):
+    def with_mover(step: float) -> np.ndarray:
+        mover = (0.2 + 0.5 * step, 0.25 + 0.5 * np.cos(4 * step), 2.5, 0.9)
+        return view((0.9 * step, 0.1 * step**2, 0.0), pan_deg=-6 * step, boards=(*BOARDS, mover))
+
+    diagnosis = examined(tmp_path / "moving", [with_mover(step) for step in np.linspace(-1, 1, 5)]).diagnosis()
+    assert list(alarms(diagnosis)) == ["moving content"]
+    found = finding(diagnosis, "moving content")
+    middle = dict(found.photos)["02.jpg"]  # the mover is at x 0.2, y 0.75 and distance 2.5 of it
+    across, down = (int(word) for word in middle.replace(",", "").split() if word.isdigit())
+    assert abs(across - 100 * (0.5 + 0.2 / 2.5 * FOCAL_PX / 560)) < 6
+    assert abs(down - 100 * (0.5 + 0.75 / 2.5 * FOCAL_PX / 420)) < 8
+
+
+def test_a_flat_world_is_told_from_a_camera_that_only_turns(tmp_path):
+    places = [((0.9 * s, 0.4 * s * s, 0.5 * s), -14 * s) for s in np.linspace(-1.5, 1.5, 5)]
+    flat = examined(tmp_path / "flat", [view(c, pan_deg=a, boards=BOARDS[:1]) for c, a in places]).diagnosis()
+    assert list(alarms(flat)) == ["depth relief"]
+
+
+# Parts
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_detail_falls_with_blur_and_not_with_content_or_contrast(seed):
+    photo = cv2.cvtColor(view(seed=100 * seed), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    blurred = [photo, *(cv2.GaussianBlur(photo, (0, 0), sigma) for sigma in (0.5, 1, 1.5, 2, 3))]
+    details = np.array([measure(picture)[0].detail for picture in blurred])
+    assert (np.diff(details) < -0.05).all()
+    assert abs(measure(128 + 0.5 * (photo - 128))[0].detail - details[0]) < 0.05
+    assert abs(measure(np.ascontiguousarray(photo[:, ::-1].T))[0].detail - details[0]) < 0.02
+
+
+@cache
+def two_view_points() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-2, 2, 300), rng.uniform(-1.5, 1.5, 300), rng.uniform(4, 8, 300)])
+    return points, rng.normal(scale=0.3, size=(2, 300, 2))
+
+
+def seen(points: np.ndarray, turn_deg: float, centre: tuple[float, float, float]) -> np.ndarray:
+    rotation = cv2.Rodrigues(np.radians([0.3, 1.0, 0.1]) * turn_deg)[0]
+    local = (points - centre) @ rotation.T
+    return 700 * local[:, :2] / local[:, 2:]
+
+
+@pytest.mark.parametrize("focal_px", [700.0, 500.0])
+def test_turning_is_known_whatever_the_focal_length(focal_px):
+    points, noise = two_view_points()
+    x, y = seen(points, 0, (0, 0, 0)) + noise[0], seen(points, 12, (0, 0, 0)) + noise[1]
+    views = two_views.estimate(x, y, (focal_px, focal_px))
+    assert views is not None
+    assert views.flat
+    assert views.baseline_over_depth < 0.02
+
+
+@pytest.mark.parametrize("baseline", [0.3, 0.6, 1.2])
+def test_the_baseline_over_the_depth_is_measured(baseline):
+    points, noise = two_view_points()
+    x, y = seen(points, 0, (0, 0, 0)) + noise[0], seen(points, 5, (baseline, 0, 0)) + noise[1]
+    views = two_views.estimate(x, y, (700.0, 700.0))
+    assert views is not None
+    assert not views.flat
+    np.testing.assert_allclose(views.baseline_over_depth, baseline / np.median(points[:, 2]), rtol=0.1)
+    np.testing.assert_allclose(views.rotation_deg, 5 * np.linalg.norm([0.3, 1.0, 0.1]), atol=0.5)
+
+
+def test_a_plane_gives_no_more_than_its_baseline_over_its_distance():
+    """It is 0.2; where the focal length may be 1.45 times the given, 0.2 / 1.45 explains the same pixels."""
+    points, _ = two_view_points()
+    flat = np.column_stack([points[:, :2], np.full(len(points), 5.0)])
+    views = two_views.estimate(seen(flat, 0, (0, 0, 0)), seen(flat, 0, (1.0, 0, 0)), (700.0, 700.0))
+    assert views is not None
+    assert views.flat
+    assert 0.2 / 1.46 < views.baseline_over_depth < 0.201
+
+
+def test_matches_are_those_of_a_double_loop():
+    rng = np.random.default_rng(0)
+    one = rng.integers(0, 150, (40, 128)).astype(np.uint8)
+    other = np.concatenate([one[:20] + rng.integers(0, 40, (20, 128)).astype(np.uint8), one[30:] // 2])
+    distances = np.array([[np.linalg.norm(a.astype(float) - b) for b in other] for a in one])
+    expected = []
+    for i, row in enumerate(distances):
+        j = int(row.argmin())
+        if distances[:, j].argmin() == i and row[j] < 0.8 * np.delete(row, j).min():
+            expected.append((i, j))
+    assert [(int(i), int(j)) for i, j in zip(*mutual_matches(one, other), strict=True)] == expected
+    assert len(expected) > 15
+
+
+def test_heights_come_back_from_differences_of_which_some_are_wrong():
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=12)
+    pairs = [(i, j) for i in range(11) for j in range(i + 1, 11)]  # the last one stands alone
+    differences = np.array([truth[j] - truth[i] for i, j in pairs])
+    differences[::9] += 5
+    differences[4] = np.nan
+    values, backing = consensus.potentials(12, pairs, differences, trust=np.ones(len(pairs)))
+    np.testing.assert_allclose(values[:11], truth[:11] - np.median(truth[:11]), atol=0.1)  # below 0.1 it is squares
+    assert np.isnan(values[11])
+    assert backing[11] == 0
+
+
+def test_sets_of_connected_photos():
+    assert consensus.connected(6, [(4, 1), (1, 5), (0, 3)]) == [[1, 4, 5], [0, 3], [2]]
+
+
+def test_large_captures_are_not_compared_exhaustively(clean):
+    few = replace(clean.facts[0].features, descriptors=clean.facts[0].features.descriptors[:20], scales=np.ones(20))
+    photos = [replace(clean.facts[0], features=few)] * 70
+    pairs = graph.choose_pairs(photos)
+    assert len(pairs) <= graph.pair_count(70) < 1000
+    assert {(i, i + 1) for i in range(69)} <= set(pairs)
+    # Linear in the photos from here on: the time for a thousand is told before it starts.
+    np.testing.assert_allclose(estimated_seconds(1000, 2), 4 * estimated_seconds(250, 2))
+
+
+# Scenes
+
+
+def ring(count: int, *, span_deg: float, radius: float = 3.0) -> Scene:
+    camera = Camera.pinhole(640, 480, 600.0)
+    up = np.array([0.0, 0.0, 1.0])
+    angles = np.radians(np.linspace(0, span_deg, count, endpoint=False))
+    centres = [np.array([radius * np.cos(a), radius * np.sin(a), 0.8]) for a in angles]
+    frames = tuple(
+        Frame(f"{i}.jpg", camera, rigid.look_at(centre, np.zeros(3), up), mask=Path("m.png") if i else None)
+        for i, centre in enumerate(centres)
+    )
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3))
+    return Scene(Path("."), "transforms", frames, frozenset(), points, ("gone.jpg",))
+
+
+@pytest.mark.parametrize(("span_deg", "gap_deg", "verdict"), [(360, 15, GOOD), (300, 72.5, LOOK), (240, 130, BAD)])
+def test_the_gap_in_a_ring_of_cameras_is_measured(span_deg, gap_deg, verdict):
+    found = coverage.directions(ring(24, span_deg=span_deg))
+    assert found.verdict == verdict
+    np.testing.assert_allclose(found.number or 0, gap_deg, atol=1.0)
+
+
+def test_cameras_in_front_have_a_span():
+    found = coverage.directions(ring(24, span_deg=10))
+    assert found.verdict == LOOK
+    np.testing.assert_allclose(found.number or 0, 10 * 23 / 24, atol=0.6)
+
+
+def test_cameras_at_one_place_and_one_far_off_are_told():
+    scene = ring(24, span_deg=360)
+    assert coverage.spread(scene).verdict == GOOD
+    near = tuple(replace(f, world_from_cam=scene.frames[0].world_from_cam) for f in scene.frames)
+    assert coverage.spread(replace(scene, frames=near)).verdict == BAD
+    pose = scene.frames[5].world_from_cam.copy()
+    pose[:3, 3] *= 40
+    off = (*scene.frames[:5], replace(scene.frames[5], world_from_cam=pose), *scene.frames[6:])
+    assert coverage.spread(replace(scene, frames=off)).names == ("5.jpg",)
+
+
+def test_missing_photos_and_masks_that_only_some_have_are_named():
+    found = {finding.check: finding for finding in coverage.belongings(ring(24, span_deg=360))}
+    assert found["missing photos"].names == ("gone.jpg",)
+    assert found["masks"].names == ("0.jpg",)
+    assert "arbitrary" in found["unit"].summary
+
+
+# Files and the page
+
+
+def test_damaged_files_are_named_and_the_rest_is_examined(tmp_path):
+    folder = write(tmp_path / "photos", [view((0.2 * step, 0, 0)) for step in range(3)])
+    (folder / "cut <b>.jpg").write_bytes((folder / "00.jpg").read_bytes()[:3000])
+    (folder / "empty.png").touch()
+    diagnosis = examine(find_subject(folder), threads=2, progress=lambda share, detail: None)
+    found = finding(diagnosis, "files")
+    assert (found.verdict, found.names) == (BAD, ("cut <b>.jpg", "empty.png"))
+    assert finding(diagnosis, "count").verdict == BAD
+    assert "<b>.jpg" not in page_html(diagnosis)
+    assert content(diagnosis)["verdict"] == BAD
+
+
+def test_nothing_readable_is_a_finding_too(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"no picture")
+    diagnosis = examine(find_subject(tmp_path), threads=1, progress=lambda share, detail: None)
+    assert [f.verdict for f in diagnosis.findings] == [BAD, BAD]
+    assert "a.jpg" in page_html(diagnosis)
+
+
+def test_the_page_needs_nothing_else_and_shows_each_photo_once(clean):
+    html = page_html(clean.diagnosis())
+    assert html.count("data:image/jpeg") == len(clean.facts)
+    assert not [word for word in ("http://", "https://", "<script", 'src="/') if word in html]
+    assert str(clean.folder) not in html
+
+
+def test_only_a_page_of_the_same_capture_is_replaced(clean, tmp_path):
+    page = tmp_path / "page.html"
+    page.write_text(page_html(clean.diagnosis()), encoding="utf-8")
+    refuse_foreign(page, clean.folder)
+    with pytest.raises(UserError, match="no page of this capture"):
+        refuse_foreign(page, tmp_path)
+    page.write_text("mine")
+    with pytest.raises(UserError, match="no page of this capture"):
+        refuse_foreign(page, clean.folder)
+
+
+def test_the_same_photos_give_the_same_findings(clean, tmp_path):
+    folder = write(tmp_path / "again", list(clean.photos[:3]))
+    runs = [content(examine(find_subject(folder), threads=t, progress=lambda share, detail: None)) for t in (1, 3)]
+    assert runs[0] == runs[1]
+
+
+def test_photos_keep_their_digest(clean):
+    path = clean.folder / "00.jpg"
+    assert clean.facts[0].digest == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_quality_thresholds_are_those_of_the_docstring():
+    """0.3 octaves are about a blur of 0.8 px of a sharp photo, 0.7 about 1.5 px."""
+    photo = cv2.cvtColor(view(seed=3), cv2.COLOR_RGB2GRAY).astype(np.float32)
+    sharp = measure(photo)[0].detail
+    lack = [sharp - measure(cv2.GaussianBlur(photo, (0, 0), sigma))[0].detail for sigma in (0.8, 1.5)]
+    np.testing.assert_allclose(lack, (quality.BLURRED, quality.VERY_BLURRED), rtol=0.35)
