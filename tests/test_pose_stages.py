@@ -213,7 +213,7 @@ def test_memory_is_known_for_this_process_and_machine():
 
 def test_planning_writes_nothing(photos: Path):
     before = sorted(path.name for path in photos.parent.iterdir())
-    _, pairing, plan = plan_poses(photos, settings=ONE_THREAD, progress=lambda *told: None)
+    _, _, pairing, plan = plan_poses(photos, settings=ONE_THREAD, progress=lambda *told: None)
     assert (plan.photos, plan.rule, plan.pairs) == (8, "exhaustive", 28)
     assert len(pairing.pairs) == 28
     assert sorted(path.name for path in photos.parent.iterdir()) == before

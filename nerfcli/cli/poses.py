@@ -22,6 +22,7 @@ from nerfcli.cli.options import (
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
+    from nerfcli.poses.cameras import GivenIntrinsics
     from nerfcli.poses.plan import Plan
     from nerfcli.poses.settings import Limits, PoseSettings
 
@@ -58,6 +59,14 @@ def poses(
         Path | None, typer.Option(help="A file with the pairs to compare, two names per line.", dir_okay=False)
     ] = None,
     camera_model: Annotated[str, typer.Option(help="auto, or a COLMAP model such as SIMPLE_RADIAL, OPENCV.")] = "auto",
+    intrinsics: Annotated[
+        Path | None,
+        typer.Option(help="A file with the photos' cameras: COLMAP's cameras.txt or .bin, a scene, transforms.json..."),
+    ] = None,
+    intrinsics_as: Annotated[
+        str | None,
+        typer.Option(help="fixed: the intrinsics are exact; prior: the adjustment starts there.  [default: fixed]"),
+    ] = None,
     min_registered: Annotated[float, typer.Option(help="Share of photos that must register.", min=0, max=1)] = 0.5,
     memory: Annotated[
         str | None, typer.Option(help="Memory it may use: 4GB, 500MB.  [default: 4/5 of the machine's]")
@@ -91,8 +100,10 @@ def poses(
       nerfcli poses photos/kitchen --dry-run --json
       nerfcli poses kitchen.mp4 --frames 200
       nerfcli poses statue/ --masks statue-masks/
+      nerfcli poses photos/kitchen --intrinsics calibration/cameras.txt
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
+    from nerfcli.poses.cameras import USES
     from nerfcli.poses.memory import default_memory_limit
     from nerfcli.poses.pairs import PAIRINGS
     from nerfcli.poses.settings import CAMERA_MODELS, QUALITIES, Limits, PoseSettings
@@ -101,11 +112,18 @@ def poses(
         (camera_model, CAMERA_MODELS, "--camera-model"),
         (pairing, PAIRINGS, "--pairing"),
         (quality, tuple(QUALITIES), "--quality"),
+        (intrinsics_as or "fixed", USES, "--intrinsics-as"),
     ):
         if value not in choices:
             raise typer.BadParameter(f"{value!r}; choose {', '.join(choices)}", param_hint=option)
     if pairs is not None and pairing != "auto":
         raise typer.BadParameter("the pairs come from --pairs; leave out --pairing", param_hint="--pairing")
+    if intrinsics_as is not None and intrinsics is None:
+        raise typer.BadParameter("there are no intrinsics to use so; add --intrinsics", param_hint="--intrinsics-as")
+    if intrinsics is not None and camera_model != "auto":
+        raise typer.BadParameter(
+            "the camera models come from --intrinsics; leave out --camera-model", param_hint="--camera-model"
+        )
     console = Console(quiet=quiet, json_lines=json)
     usual_size, usual_features = QUALITIES[quality]
     settings = PoseSettings(
@@ -127,23 +145,39 @@ def poses(
     def work(source: Path, one_of_many: bool) -> None:
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
         if dry_run:
-            plan_scene(source, scene, settings=settings, console=console)
+            folder = frames_there(source, scene)
+            given = given_intrinsics(intrinsics, folder, use=intrinsics_as or "fixed")
+            plan_scene(source, folder, settings=settings, given=given, console=console)
             return
         folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
-        estimate_scene(folder, scene, settings=settings, limits=limits, overwrite=overwrite, console=console)
+        given = given_intrinsics(intrinsics, folder, use=intrinsics_as or "fixed")
+        estimate_scene(
+            folder, scene, settings=settings, limits=limits, overwrite=overwrite, console=console, given=given
+        )
         tell_of_database(scene, drop=drop_database, console=console)
         console.result(scene)
 
     for_each_input(photos, work)
 
 
-def plan_scene(source: Path, scene: Path, *, settings: "PoseSettings", console: Console) -> None:
-    """Print what would be done with a folder of photos, or with the frames of a video that are there already.
+def given_intrinsics(file: Path | None, photos: Path, *, use: str) -> "GivenIntrinsics | None":
+    """The intrinsics of a file, for the photos of a folder; None without a file.
 
     Raises:
-        UserError: see `plan_poses`; or a video's frames are not there.
+        UserError: see `read_calibration`.
     """
-    from nerfcli.poses.structure_from_motion import plan_poses
+    from nerfcli.convert.intrinsics import read_calibration
+    from nerfcli.poses.cameras import GivenIntrinsics
+
+    return None if file is None else GivenIntrinsics(read_calibration(file, images=photos), use)
+
+
+def frames_there(source: Path, scene: Path) -> Path:
+    """The folder of photos, `source` itself, or the one with the frames of a video that were written before.
+
+    Raises:
+        UserError: a video's frames are not there.
+    """
     from nerfcli.poses.video_frames import frames_folder
 
     folder = frames_folder(scene) if source.is_file() else source
@@ -152,10 +186,28 @@ def plan_scene(source: Path, scene: Path, *, settings: "PoseSettings", console: 
             f"--dry-run: the frames of {source} are not in {folder} yet, and a dry run writes nothing",
             "call it without --dry-run, or give a folder of photos",
         )
+    return folder
+
+
+def plan_scene(
+    source: Path, folder: Path, *, settings: "PoseSettings", given: "GivenIntrinsics | None", console: Console
+) -> None:
+    """Print what would be done with a folder of photos, which may hold the frames of the video `source`.
+
+    Raises:
+        UserError: see `plan_poses`.
+    """
+    from nerfcli.poses.structure_from_motion import plan_poses
+
     with console.progress(f"poses {folder.name}") as update:
-        _, _, plan = plan_poses(
-            folder, settings=settings, progress=lambda stage, done, total: update(done / max(total, 1), _STAGES[stage])
+        _, grouped, _, plan = plan_poses(
+            folder,
+            settings=settings,
+            progress=lambda stage, done, total: update(done / max(total, 1), _STAGES[stage]),
+            given=given,
         )
+    for note in grouped.notes:
+        console.note(note)
     if console.json_lines:
         console.result(source, plan.to_json())
     else:
@@ -170,6 +222,7 @@ def estimate_scene(
     limits: "Limits",
     overwrite: bool,
     console: Console,
+    given: "GivenIntrinsics | None" = None,
 ) -> None:
     """Estimate one scene, or keep the one that was made from the same photos with the same settings.
 
@@ -181,7 +234,7 @@ def estimate_scene(
     from nerfcli.scene import SCENE_FILE
 
     if (scene / SCENE_FILE).exists() and not overwrite:
-        if is_same_scene(scene, folder, settings):
+        if is_same_scene(scene, folder, settings, given=given):
             console.note(f"{scene} is kept: it was made from these photos; --overwrite makes it again")
             return
         raise UserError(f"{scene} exists", "add --overwrite to replace it, or choose another place with -o")
@@ -200,7 +253,14 @@ def estimate_scene(
             update(share, f"({done} of {total} {_STAGES[stage]}{about})")
 
         report = estimate_poses(
-            folder, scene, settings=settings, notify=console.note, progress=progress, limits=limits, planned=planned
+            folder,
+            scene,
+            settings=settings,
+            notify=console.note,
+            progress=progress,
+            limits=limits,
+            planned=planned,
+            given=given,
         )
     left_out = [image for image in report.images if not image.registered]
     for image in left_out[:NAMES_SHOWN]:

@@ -1,37 +1,85 @@
-"""One camera out of a file, for captures whose format has no cameras."""
+"""Cameras out of a file: one, for captures whose format has none, or those of a whole capture, for its photos."""
 
 from pathlib import Path
 
+from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.colmap_text import cameras_from_text
+from nerfcli.cameras.formats.colmap import read_cameras
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.convert.formats import Given, recognise
+from nerfcli.convert.pixels import UPRIGHT
 from nerfcli.errors import UserError
+from nerfcli.scene import MODEL_FOLDER, SCENE_FILE
+
+# Formats of poses alone: their cameras were given, or are those of views that nobody photographed.
+_WITHOUT_CAMERAS = ("tum", "kitti", "camera-path")
+_CAMERAS_FILES = ("cameras.bin", "cameras.txt")
 
 
 def read_intrinsics(path: Path) -> Camera:
-    """The camera in a file: as JSON {"model", "width", "height", "params"}, COLMAP's cameras.txt, or any capture.
+    """The camera in a file, see `read_calibration`.
 
     Raises:
         UserError: no camera, several different ones, or a damaged file.
     """
-    if path.is_file() and path.suffix.lower() == ".json":
-        content = read_json_object(path)
-        if "params" in content:
-            try:
-                return Camera.from_json(content)
-            except UserError as error:
-                raise UserError(f"{path}: {error.message}", error.hint) from error
-    if path.is_file() and path.name == "cameras.txt":
-        try:
-            cameras = set(cameras_from_text(path.read_bytes()).values())
-        except (ValueError, KeyError) as error:
-            raise UserError(f"{path} is damaged: {error}", "expected COLMAP's cameras.txt") from error
-    else:
-        form, found = recognise(path)
-        if form.parse is None or form.name in ("tum", "kitti"):
-            raise UserError(f"{path} has no cameras", "give a file of intrinsics, such as COLMAP's cameras.txt")
-        cameras = {frame.camera for frame in form.parse(found, Given()).frames}
+    cameras = read_calibration(path).cameras
     if len(cameras) != 1:
         raise UserError(f"{path} has {len(cameras)} different cameras", "give a file with the one that took all frames")
-    return cameras.pop()
+    return cameras[0]
+
+
+def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
+    """The cameras in a file: as JSON {"model", "width", "height", "params"}, COLMAP's cameras.txt or cameras.bin, or of
+    any capture, a file or a folder.
+
+    Args:
+        path: the file or folder.
+        images: the folder of the photos, for formats whose files do not say how large these are.
+
+    Raises:
+        UserError: no camera, or a damaged file.
+    """
+    if path.is_file() and path.suffix.lower() == ".json":
+        content = read_json_object(path) if _is_object(path) else {}
+        if "params" in content:
+            try:
+                return Calibration(path, (Camera.from_json(content),), {})
+            except UserError as error:
+                raise UserError(f"{path}: {error.message}", error.hint) from error
+    cameras_file = path if path.name in _CAMERAS_FILES else _alone(path)
+    if cameras_file is not None and cameras_file.is_file():
+        cameras, of_image = read_cameras(cameras_file)
+        upright = _is_own(cameras_file.parent)
+    else:
+        form, found = recognise(path)
+        if form.parse is None or form.name in _WITHOUT_CAMERAS:
+            raise _no_cameras(path)
+        # In scenes of nerfcli poses and in arrays the cameras may be for upright pictures; the capture then says so.
+        capture = form.parse(found, Given(images=images))
+        cameras = {index: frame.camera for index, frame in enumerate(capture.frames)}
+        of_image = {frame.name: index for index, frame in enumerate(capture.frames)}
+        upright = capture.pixels == UPRIGHT
+    if not cameras:
+        raise _no_cameras(path)
+    different = tuple(dict.fromkeys(cameras.values()))
+    numbers = {camera: number for number, camera in enumerate(different)}
+    return Calibration(path, different, {name: numbers[cameras[key]] for name, key in of_image.items()}, upright)
+
+
+def _no_cameras(path: Path) -> UserError:
+    return UserError(f"{path} has no cameras", "give a file of intrinsics, such as COLMAP's cameras.txt")
+
+
+def _alone(folder: Path) -> Path | None:
+    """The cameras file of a folder that holds nothing else of a model."""
+    return next((folder / name for name in _CAMERAS_FILES if (folder / name).is_file()), None)
+
+
+def _is_own(model_dir: Path) -> bool:
+    """Whether a model is that of a scene as nerfcli poses writes it."""
+    return (model_dir.resolve().parent.parent / SCENE_FILE).is_file() and model_dir.resolve().match(MODEL_FOLDER)
+
+
+def _is_object(path: Path) -> bool:
+    with path.open(encoding="utf-8-sig", errors="replace") as stream:
+        return stream.read(1000).lstrip().startswith("{")

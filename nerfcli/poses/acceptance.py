@@ -4,7 +4,7 @@ The number of placed photos and the reprojection error say little: a wrong model
 the verified matches of all pairs are asked again, and observations that the adjustment did not see.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -144,6 +144,8 @@ def judge(
     names: Mapping[str, str],
     seed: int,
     threads: int,
+    given: Collection[int] = (),
+    fixed: Sequence[int] = (),
 ) -> Verdict:
     """Measure a model against the evidence and say whether it can be believed.
 
@@ -154,6 +156,8 @@ def judge(
         names: what the user calls each photo of the model.
         seed: of what is drawn at random.
         threads: of the adjustment, -1 for all.
+        given: ids of cameras whose intrinsics were known beforehand, whatever focal length they have.
+        fixed: ids of cameras whose intrinsics stay as they are.
     """
     found = agreements(model, pairs)
     rotations = rotation_errors(model, pairs, seed=seed)
@@ -162,7 +166,7 @@ def judge(
     share = sum(c.matches for c in contradictions) / total if total else 0.0
     geometry = _geometry(model)
     focal = [_focal_measure(camera) for camera in _cameras_in_use(model)]
-    held = _held_out_measure(model, seed=seed, threads=threads)
+    held = _held_out_measure(model, seed=seed, threads=threads, fixed=fixed)
     measures = {
         "pairs": _pair_measure(found),
         "strong_contradictions": [asdict(c) for c in contradictions[:_MOST_LISTED]],
@@ -178,7 +182,7 @@ def judge(
         *_no_baseline(turn, geometry),
         *_contradicted(contradictions, share, found, names=names),
         *_turned(measures["rotations"]),
-        *_implausible(model, measures),
+        *_implausible(model, measures, given=given),
     ]
     return Verdict(measures, tuple(failures))
 
@@ -252,11 +256,13 @@ def _focal_measure(camera: pycolmap.Camera) -> float:
     return camera.mean_focal_length() / max(camera.width, camera.height)
 
 
-def _held_out_measure(model: pycolmap.Reconstruction, *, seed: int, threads: int) -> dict[str, Any]:
+def _held_out_measure(
+    model: pycolmap.Reconstruction, *, seed: int, threads: int, fixed: Sequence[int]
+) -> dict[str, Any]:
     training, held = held_out.split(model, seed=seed)
     cameras = _cameras_in_use(model)
     # The lens was chosen before; a principal point that was freed is not moved again.
-    held_out.adjust(training, threads=threads)
+    held_out.adjust(training, threads=threads, fixed=fixed)
     errors = held_out.errors_px(training, held)
     centred = all(is_centred(camera) for camera in cameras)
     if not len(errors):
@@ -347,7 +353,9 @@ def _turned(rotations: Mapping[str, Any]) -> list[Failure]:
     return [Failure("the poses contradict pairs of photos", evidence, "take more photos, with more overlap")]
 
 
-def _implausible(model: pycolmap.Reconstruction, measures: Mapping[str, Any]) -> list[Failure]:
+def _implausible(
+    model: pycolmap.Reconstruction, measures: Mapping[str, Any], *, given: Collection[int]
+) -> list[Failure]:
     """Numbers that no real capture has."""
     checks = [
         (
@@ -369,7 +377,7 @@ def _implausible(model: pycolmap.Reconstruction, measures: Mapping[str, Any]) ->
     low, high = _FOCAL_RANGE
     for camera in _cameras_in_use(model):
         focal = _focal_measure(camera)
-        if not camera.is_perspective_fisheye() and not low < focal < high:
+        if camera.camera_id not in given and not camera.is_perspective_fisheye() and not low < focal < high:
             evidence = f"the focal length came out as {focal:.2f} times the longer side"
             failures.append(
                 Failure(

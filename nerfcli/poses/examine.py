@@ -59,11 +59,13 @@ def examine(models: list[pycolmap.Reconstruction], job: Job, report: Callable[[s
         names=dict(zip(job.files, job.names, strict=True)),
         seed=job.seed,
         threads=job.threads,
+        given=job.given_cameras,
+        fixed=job.fixed_cameras,
     )
     report("check", 3, 4)
     blur = {}
     if verdict.accepted and model.num_reg_images() <= _MOST_PHOTOS_FOR_BLUR:
-        blur = pose_blur_px(model, threads=job.threads)
+        blur = pose_blur_px(model, threads=job.threads, fixed=job.fixed_cameras)
     report("check", 4, 4)
     reasons = {numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
     return Examined(model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details)
@@ -71,9 +73,8 @@ def examine(models: list[pycolmap.Reconstruction], job: Job, report: Callable[[s
 
 def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> tuple[pycolmap.Reconstruction, list[Candidate]]:
     """Lens models by evidence, where neither the user nor a file has said what they are."""
-    fixed = [number for number, group in enumerate(job.groups, start=1) if group.fixed]
     named = [number for number, group in enumerate(job.groups, start=1) if not group.choose]
-    return choose_lenses(model, seed=job.seed, threads=job.threads, fixed=fixed, named=named)
+    return choose_lenses(model, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras, named=named)
 
 
 def _with_names(reason: str, job: Job) -> str:

@@ -238,9 +238,9 @@ def _significance(before: _Trial, after: _Trial, camera_id: int) -> float:
         return float("inf")  # another family: it adds nothing, it is something else
     added = [(index, new.params[index]) for index in new.extra_params_idxs()[len(old.extra_params_idxs()) :]]
     if after.principal_point and not before.principal_point:
-        centre = (new.width / 2, new.height / 2)
+        before_it = (old.principal_point_x, old.principal_point_y)  # the centre, or what was given
         indices = new.principal_point_idxs()
-        added += [(index, new.params[index] - middle) for index, middle in zip(indices, centre, strict=True)]
+        added += [(index, new.params[index] - start) for index, start in zip(indices, before_it, strict=True)]
     ratios = [abs(value) / after.deviations[index] for index, value in added if after.deviations[index] > 0]
     return max(ratios, default=0.0)
 

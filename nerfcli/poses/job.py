@@ -73,6 +73,16 @@ class Job:
         return Path(self.folder) / "masks"
 
     @property
+    def fixed_cameras(self) -> list[int]:
+        """The ids of the cameras whose intrinsics stay as they are; a camera's id is its group's place, from 1 on."""
+        return [number for number, group in enumerate(self.groups, start=1) if group.fixed]
+
+    @property
+    def given_cameras(self) -> list[int]:
+        """The ids of the cameras whose intrinsics are known beforehand."""
+        return [number for number, group in enumerate(self.groups, start=1) if group.params is not None]
+
+    @property
     def database(self) -> Path:
         """pycolmap's database of features and matches; it stays beside the model."""
         return database_path(Path(self.folder), self.rung)

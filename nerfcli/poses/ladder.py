@@ -62,7 +62,9 @@ class _Ladder:
         self._take(what, models, job)
         if len(models) > 1:
             output = Path(job.folder) / f"merged_{number}"
-            merged = merge_models(models, job.database, output=output, seed=job.seed, threads=job.threads)
+            merged = merge_models(
+                models, job.database, output=output, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras
+            )
             if _placed(merged) > _placed(models):
                 self._take("sub-models merged", merged, job)
 

@@ -27,7 +27,7 @@ def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
     return sorted(job.files.index(model.image(image_id).name) for image_id in model.reg_image_ids())
 
 
-def describe_cameras(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
+def describe_cameras(model: pycolmap.Reconstruction, job: Job) -> list[dict[str, Any]]:
     """Intrinsics, for the report, of the cameras that took the placed photos."""
     counts: dict[int, int] = {}
     for image_id in model.reg_image_ids():
@@ -39,7 +39,7 @@ def describe_cameras(model: pycolmap.Reconstruction) -> list[dict[str, Any]]:
             "width": camera.width,
             "height": camera.height,
             "params": [float(value) for value in camera.params],
-            "focal_from_exif": camera.has_prior_focal_length,
+            "focal_from_exif": camera.has_prior_focal_length and camera_id not in job.given_cameras,
             "images": counts[camera_id],
         }
         for camera_id, camera in sorted(model.cameras.items())
@@ -69,7 +69,7 @@ def map_photos(
     options.triangulation.random_seed = seed
     # Small captures are no less whole; what is the largest is decided below.
     options.min_model_size = 3
-    options.constant_cameras = {number for number, group in enumerate(job.groups, start=1) if group.fixed}
+    options.constant_cameras = set(job.fixed_cameras)
     options.mapper.constant_cameras = options.constant_cameras
     options.mapper.init_min_tri_angle = start.init_min_tri_angle
     options.mapper.init_min_num_inliers = start.init_min_num_inliers

@@ -37,7 +37,13 @@ class CommonPoints:
 
 
 def merge_models(
-    models: Sequence[pycolmap.Reconstruction], database: Path, *, output: Path, seed: int, threads: int
+    models: Sequence[pycolmap.Reconstruction],
+    database: Path,
+    *,
+    output: Path,
+    seed: int,
+    threads: int,
+    fixed: Sequence[int] = (),
 ) -> list[pycolmap.Reconstruction]:
     """The models, largest first, each joined with the ones before where they have enough in common.
 
@@ -49,6 +55,7 @@ def merge_models(
         output: a folder for what pycolmap writes on the way.
         seed: of the search for the similarity.
         threads: -1 for all.
+        fixed: ids of cameras whose intrinsics stay as they are.
     """
     with pycolmap.Database.open(str(database)) as opened:
         pairs = read_verified_pairs(opened, min_matches=1)
@@ -62,7 +69,7 @@ def merge_models(
             similarity = align(base, common, seed=seed)
             if similarity is None:
                 continue
-            joined = _joined(base, model, similarity, database, output=output, threads=threads)
+            joined = _joined(base, model, similarity, database, output=output, threads=threads, fixed=fixed)
             if _holds(joined, base, pairs):
                 merged[index] = joined
                 break
@@ -155,6 +162,7 @@ def _joined(
     *,
     output: Path,
     threads: int,
+    fixed: Sequence[int],
 ) -> pycolmap.Reconstruction:
     """All photos of both in the frame of the first; points found again from the matches of all, then adjusted."""
     moved = pycolmap.Reconstruction(second)
@@ -177,9 +185,15 @@ def _joined(
     options.num_threads = threads
     options.extract_colors = False
     joined = pycolmap.triangulate_points(
-        joined, str(database), str(output), str(output), clear_points=True, options=options, refine_intrinsics=True
+        joined,
+        str(database),
+        str(output),
+        str(output),
+        clear_points=True,
+        options=options,
+        refine_intrinsics=not fixed,
     )
-    settle(joined, threads=threads)
+    settle(joined, threads=threads, fixed=fixed)
     return joined
 
 

@@ -40,7 +40,7 @@ class PosesReport:
     errors. parts: sizes of the groups of photos that matches hold together.
     seconds: per stage, of the call that wrote the report; what an earlier one left is not in them. models: the sizes of
     all models found, the kept one first. attempts: what each rung of the ladder gave. matching: the rule for pairs, and
-    their number. points: how many the kept model has.
+    their number. points: how many the kept model has. intrinsics: what was given of them, see `cameras.Grouped`.
     """
 
     registered: int
@@ -59,6 +59,7 @@ class PosesReport:
     pose_blur_px: dict[str, Any] | None
     lenses: tuple[dict[str, Any], ...]
     parts: tuple[int, ...]
+    intrinsics: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and dictionaries."""
@@ -66,7 +67,12 @@ class PosesReport:
 
 
 def make_report(
-    photos: Photos, settings: PoseSettings, *, result: Mapping[str, Any], matching: dict[str, Any]
+    photos: Photos,
+    settings: PoseSettings,
+    *,
+    result: Mapping[str, Any],
+    matching: dict[str, Any],
+    intrinsics: dict[str, Any] | None = None,
 ) -> PosesReport:
     """Put what the worker found into words."""
     models: list[list[int]] = result["models"]
@@ -98,6 +104,7 @@ def make_report(
         pose_blur_px=_blur_summary(images.values()),
         lenses=tuple(result.get("lenses", ())),
         parts=tuple(result["parts"]),
+        intrinsics=intrinsics,
     )
 
 

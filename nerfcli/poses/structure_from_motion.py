@@ -16,14 +16,14 @@ from typing import Any
 from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.errors import UserError
-from nerfcli.media.images import Exif, list_images
-from nerfcli.poses.intrinsics import START_FISHEYE, START_MODEL
-from nerfcli.poses.job import CameraGroup, Job, write_job
+from nerfcli.media.images import list_images
+from nerfcli.poses.cameras import GivenIntrinsics, Grouped, group_by_given, group_photos
+from nerfcli.poses.job import Job, write_job
 from nerfcli.poses.layout import lay_out
 from nerfcli.poses.masks import lay_out_masks
 from nerfcli.poses.pairs import Pairing, choose_pairs
 from nerfcli.poses.pairs_file import read_pairs
-from nerfcli.poses.photos import Photo, Photos, camera_groups, find_photos
+from nerfcli.poses.photos import Photos, find_photos
 from nerfcli.poses.plan import Plan, make_plan
 from nerfcli.poses.report import PosesReport, make_report, refusal
 from nerfcli.poses.settings import Limits, PoseSettings, check_settings
@@ -41,6 +41,7 @@ def estimate_poses(
     progress: Callable[[str, int, int], None],
     limits: Limits = Limits(),
     planned: Callable[[Plan], None] = lambda plan: None,
+    given: GivenIntrinsics | None = None,
 ) -> PosesReport:
     """Estimate where the photos of a folder were taken, and write a scene.
 
@@ -57,6 +58,7 @@ def estimate_poses(
             "match", "map" and "check", in this order.
         limits: see `Limits`.
         planned: told the plan before the long work starts.
+        given: intrinsics that are known beforehand.
 
     Raises:
         ValueError: a setting is out of its range.
@@ -65,14 +67,16 @@ def estimate_poses(
             reached, or pycolmap died.
     """
     start = time.perf_counter()
-    photos, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress)
+    photos, grouped, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
     _check_destination(scene_dir, photos_dir)
     for name, why in photos.unreadable.items():
         notify(f"{name} is left out: {why}")
+    for note in grouped.notes:
+        notify(note)
     planned(plan)
     with workspace(scene_dir) as space:
         work = space.folder
-        job = _prepare(photos, settings, pairing=pairing, work=work, notify=notify)
+        job = _prepare(photos, settings, grouped=grouped, pairing=pairing, work=work, notify=notify)
         write_job(work / "job.json", job)
         run_worker(work / "job.json", threads=settings.threads, progress=progress, limits=limits, lock=space.lock)
         result = _read_json(work / "result.json")["content"]
@@ -80,7 +84,7 @@ def estimate_poses(
         matching = {"rule": pairing.rule, "pairs": result["pairs"]}
         if settings.pairs_file is not None:
             matching["pairs_file_key"] = file_key(Path(settings.pairs_file))
-        report = make_report(photos, settings, result=result, matching=matching)
+        report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
         for rung in report.attempts if len(report.attempts) > 1 else ():
             notify(f"{rung['what']}: {_sizes(rung['models'])} of {len(photos.names)} photos placed")
         if error := refusal(report, photos_dir):
@@ -89,6 +93,7 @@ def estimate_poses(
         def describe() -> None:
             write_json(scene_dir / "poses_report.json", report.to_json())
             provenance = {"command": "poses", "settings": asdict(settings), "versions": report.versions}
+            provenance |= {} if given is None else {"intrinsics": given.to_json()}
             masks = Path(settings.masks) if settings.masks else None
             scene.save(scene_dir, image_folder=photos_dir, provenance=provenance, unit="arbitrary", masks=masks)
 
@@ -101,24 +106,31 @@ def estimate_poses(
 
 
 def plan_poses(
-    photos_dir: Path, *, settings: PoseSettings, progress: Callable[[str, int, int], None]
-) -> tuple[Photos, Pairing, Plan]:
-    """Read the photos, choose what to compare, and say how long it will take; nothing is written.
+    photos_dir: Path,
+    *,
+    settings: PoseSettings,
+    progress: Callable[[str, int, int], None],
+    given: GivenIntrinsics | None = None,
+) -> tuple[Photos, Grouped, Pairing, Plan]:
+    """Read the photos, decide on cameras and on what to compare, and say how long it will take; nothing is written.
 
     Raises:
         ValueError, UserError: as for `estimate_poses`, as far as that can be known now.
     """
     check_settings(settings)
     photos = find_photos(photos_dir, lambda done, total: progress("read", done, total))
+    grouped = group_photos(photos, model=settings.camera_model) if given is None else group_by_given(photos, given)
     if settings.pairs_file is None:
         pairing = choose_pairs(photos.photos, rule=settings.pairing)
     else:
         pairing = read_pairs(Path(settings.pairs_file), photos)
     threads = settings.threads if settings.threads > 0 else os.cpu_count() or 1
-    return photos, pairing, make_plan(photos, pairing, settings, threads=threads)
+    return photos, grouped, pairing, make_plan(photos, pairing, settings, threads=threads)
 
 
-def is_same_scene(scene_dir: Path, photos_dir: Path, settings: PoseSettings) -> bool:
+def is_same_scene(
+    scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: GivenIntrinsics | None = None
+) -> bool:
     """Whether `scene_dir` was made from the photos that are in `photos_dir` now, with these settings, threads aside."""
     try:
         report = _read_json(scene_dir / "poses_report.json")
@@ -126,6 +138,9 @@ def is_same_scene(scene_dir: Path, photos_dir: Path, settings: PoseSettings) -> 
         names = [path.name for path in list_images(photos_dir)]
         pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
     except (OSError, ValueError, KeyError, UserError):
+        return False
+    known = report.get("intrinsics")
+    if (known and (known["use"], known["key"])) != (given and (given.use, given.calibration.key)):
         return False
     made_with = asdict(PoseSettings()) | report["settings"]  # a setting that it does not know yet had its default
     wanted = {key: value for key, value in asdict(settings).items() if key != "threads"}
@@ -137,22 +152,16 @@ def is_same_scene(scene_dir: Path, photos_dir: Path, settings: PoseSettings) -> 
     )
 
 
-def start_model(exif: Exif) -> str:
-    """The COLMAP camera model that the mapper starts from: one distortion term, or a fisheye if the lens says so."""
-    return START_FISHEYE if "fisheye" in (exif.lens or "").lower() else START_MODEL
-
-
 def _prepare(
-    photos: Photos, settings: PoseSettings, *, pairing: Pairing, work: Path, notify: Callable[[str], None]
+    photos: Photos,
+    settings: PoseSettings,
+    *,
+    grouped: Grouped,
+    pairing: Pairing,
+    work: Path,
+    notify: Callable[[str], None],
 ) -> Job:
-    """Decide on cameras, and lay out the photos for the worker."""
-    numbers = {name: number for number, name in enumerate(photos.names)}
-    groups = tuple(
-        _camera_group([numbers[name] for name in names], photos.photos, model=settings.camera_model)
-        for names in camera_groups(photos.photos)
-    )
-    if len(groups) > 1:
-        notify(f"{len(groups)} cameras, by EXIF and size: {', '.join(_described(group) for group in groups)}")
+    """Lay out the photos and masks for the worker."""
     laid_out = lay_out(photos, work)
     files = tuple(photo.file for photo in laid_out)
     masks = Path(settings.masks) if settings.masks else None
@@ -162,7 +171,7 @@ def _prepare(
         originals=str(photos.folder.absolute()),
         names=photos.names,
         keys=tuple(photo.key for photo in laid_out),
-        groups=groups,
+        groups=grouped.groups,
         pairs=pairing.pairs,
         neighbours=pairing.neighbours,
         max_image_size=settings.max_image_size,
@@ -170,18 +179,6 @@ def _prepare(
         seed=settings.seed,
         threads=settings.threads,
         masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),
-    )
-
-
-def _camera_group(members: Sequence[int], photos: Sequence[Photo], *, model: str) -> CameraGroup:
-    first = photos[members[0]]
-    choose = model == "auto"
-    return CameraGroup(
-        photos=tuple(members),
-        model=start_model(first.exif) if choose else model,
-        width=first.width,
-        height=first.height,
-        choose=choose,
     )
 
 
@@ -208,10 +205,6 @@ def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserErro
 
 def _sizes(models: Sequence[int]) -> str:
     return " + ".join(str(size) for size in models) or "none"
-
-
-def _described(group: CameraGroup) -> str:
-    return f"{len(group.photos)} photos {group.width}x{group.height} {group.model}"
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -8,6 +8,8 @@ Letters: R, t is a camera's pose from the world, C its centre. A pose's six unkn
 camera's axes, and the change of t; J maps them to pixels; a similarity has theta, tau, s as its seven.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -22,7 +24,7 @@ _POINTS_PER_PHOTO = 60
 _ANGLE_FROM_TANGENT = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 
 
-def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int) -> dict[int, float]:
+def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequence[int] = ()) -> dict[int, float]:
     """By image id: how far a typical point moves in the photo, root mean square, by one standard deviation of its pose.
 
     The noise of an observation is taken from what the adjustment leaves. Points and intrinsics are as uncertain as
@@ -31,12 +33,13 @@ def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int) -> dict[int, f
     Args:
         model: a converged model; it is not changed.
         threads: of the adjustment, -1 for all.
+        fixed: ids of cameras whose intrinsics are taken to be exact.
 
     Returns:
         Empty if the covariance could not be had, for a model that is not held in all directions.
     """
     copy = pycolmap.Reconstruction(model)
-    adjuster = held_out.adjust(copy, threads=threads)
+    adjuster = held_out.adjust(copy, threads=threads, fixed=fixed)
     options = pycolmap.BACovarianceOptions()
     options.params = pycolmap.BACovarianceOptionsParams.ALL
     found = pycolmap.estimate_ba_covariance(options, copy, adjuster)

@@ -93,7 +93,7 @@ def _map(job: Job, report: Report, *, seconds: dict[str, float]) -> dict[str, An
     }
     if model is not None:
         result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
-        result["cameras"] = describe_cameras(model)
+        result["cameras"] = describe_cameras(model, job)
         result["points"] = model.num_points3D()
         write_model(model, job)
     return result

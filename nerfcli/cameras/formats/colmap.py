@@ -9,12 +9,13 @@ Source: colmap.github.io/format.html; colmap src/colmap/scene/reconstruction_io_
 
 import struct
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import colmap_binary, colmap_text
-from nerfcli.cameras.formats.colmap_model import ColmapModel, capture_of
+from nerfcli.cameras.formats.colmap_model import ColmapImage, ColmapModel, capture_of
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling
 from nerfcli.errors import UserError
@@ -107,17 +108,39 @@ def read_model(model_dir: Path) -> ColmapModel:
     if not images:
         raise UserError(f"{model_dir} has no registered image", "the reconstruction is empty; make it again")
     for image in images:
-        if image.camera_id not in cameras:
-            raise UserError(
-                f"{images_file}: image {image.name} has camera {image.camera_id}, which is not there",
-                "the files of the model are from different reconstructions; copy all of them again",
-            )
+        _check_camera(image, cameras, images_file)
     twice, count = Counter(image.name for image in images).most_common(1)[0]
     if count > 1:
         raise UserError(
             f"{model_dir}: image {twice} is registered twice", "an image has one pose; make the model again"
         )
     return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points, point_ids, colours)
+
+
+def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
+    """The cameras of a cameras.bin or cameras.txt by their ids, and the ids by the names of the images, which are known
+    where the model's file of images is beside it.
+
+    Raises:
+        UserError: a file is not readable, truncated or inconsistent; the file is named.
+    """
+    binary = path.suffix == ".bin"
+    cameras = _parse(path, colmap_binary.cameras_from_bytes if binary else colmap_text.cameras_from_text)
+    images_file = path.with_name(f"images{path.suffix}")
+    if not images_file.is_file():
+        return cameras, {}
+    images = _parse(images_file, colmap_binary.images_from_bytes if binary else colmap_text.images_from_text)
+    for image in images:
+        _check_camera(image, cameras, images_file)
+    return cameras, {image.name: image.camera_id for image in images}
+
+
+def _check_camera(image: ColmapImage, cameras: Mapping[int, Camera], images_file: Path) -> None:
+    if image.camera_id not in cameras:
+        raise UserError(
+            f"{images_file}: image {image.name} has camera {image.camera_id}, which is not there",
+            "the files of the model are from different reconstructions; copy all of them again",
+        )
 
 
 def _file(model_dir: Path, name: str) -> Path:

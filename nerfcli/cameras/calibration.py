@@ -1,0 +1,134 @@
+"""Intrinsics that are known beforehand, and which of them belong to a photo: by its name, else by its size."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.orientation import fit_to_picture
+from nerfcli.errors import UserError
+
+_SIZES_SHOWN = 4
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The cameras of a file.
+
+    Args:
+        path: the file, or the folder that was named.
+        cameras: the different ones, in the order of the file.
+        of_image: the number of each image's camera, by the image's name as the file lists it, with forward slashes.
+        upright: whether the cameras refer to pictures as they are shown; else to the stored pixels, see
+            `cameras.orientation`.
+    """
+
+    path: Path
+    cameras: tuple[Camera, ...]
+    of_image: Mapping[str, int]
+    upright: bool = False
+
+    @property
+    def key(self) -> str:
+        """A hash of what it says, wherever the file is."""
+        content = [[camera.to_json() for camera in self.cameras], sorted(self.of_image.items()), self.upright]
+        return hashlib.blake2b(json.dumps(content).encode(), digest_size=16).hexdigest()
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A photo as its calibration is looked up: its file, upright size and EXIF orientation."""
+
+    path: Path
+    width: int
+    height: int
+    orientation: int
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """The camera of an upright photo, the number of the one in the file, and whether the photo was found by name."""
+
+    camera: Camera
+    number: int
+    by_name: bool
+
+
+def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[Calibrated, ...]:
+    """The camera of each photo, turned and rescaled to its upright picture.
+
+    An image of the file has the photo's name, folders left aside. A photo that is not listed gets the one camera
+    of its size, upright or as stored, or else the one camera of its shape.
+
+    Raises:
+        UserError: a photo has no camera in the file, or several, or another shape than its camera.
+    """
+    numbers: dict[str, set[int]] = {}
+    for name, number in calibration.of_image.items():
+        numbers.setdefault(_last_part(name), set()).add(number)
+    return tuple(_of_picture(calibration, picture, numbers) for picture in pictures)
+
+
+def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str, set[int]]) -> Calibrated:
+    listed = numbers.get(picture.path.name, set())
+    if len(listed) > 1:
+        raise UserError(
+            f"{calibration.path} lists {len(listed)} images called {picture.path.name}, with different cameras",
+            "give a file with the cameras of these photos alone",
+        )
+    if listed:
+        number = next(iter(listed))
+        return Calibrated(_fitted(calibration, number, picture), number, by_name=True)
+    size = {picture.width, picture.height}
+    sizes = [{camera.width, camera.height} for camera in calibration.cameras]
+    fitting = [n for n in range(len(sizes)) if sizes[n] == size and _fits(calibration, n, picture)]
+    if not fitting:
+        fitting = [n for n in range(len(sizes)) if _fits(calibration, n, picture)]
+    if len(fitting) == 1:
+        return Calibrated(_fitted(calibration, fitting[0], picture), fitting[0], by_name=False)
+    what = f"photo {picture.path.name} of {picture.width}x{picture.height}"
+    if fitting:
+        raise UserError(
+            f"{calibration.path} has {len(fitting)} cameras that may have taken {what}, and does not list it",
+            "give a file that lists the photos by name, or one with a single camera of this size",
+        )
+    known = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in calibration.cameras))
+    more = f" and {len(known) - _SIZES_SHOWN} more" if len(known) > _SIZES_SHOWN else ""
+    raise UserError(
+        f"{calibration.path} has no camera for {what}: it does not list it, and its cameras are for "
+        f"{', '.join(known[:_SIZES_SHOWN])}{more}",
+        "intrinsics belong to whole pictures of one shape; give those of these photos, or leave out --intrinsics",
+    )
+
+
+def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
+    """Whether a camera has the shape of a picture, lying or upright."""
+    camera = calibration.cameras[number]
+    shapes = [(picture.width, picture.height)]
+    if not calibration.upright and picture.orientation >= 5:
+        shapes.append((picture.height, picture.width))
+    return any(_is_shape(camera, *shape) for shape in shapes)
+
+
+def _is_shape(camera: Camera, width: int, height: int) -> bool:
+    """Whether a picture of this size can be the camera's picture resized, to rounding."""
+    try:
+        camera.resized(width, height)
+    except UserError:
+        return False
+    return True
+
+
+def _fitted(calibration: Calibration, number: int, picture: Picture) -> Camera:
+    orientation = 1 if calibration.upright else picture.orientation
+    measured = (picture.width, picture.height, orientation)
+    camera, _ = fit_to_picture(calibration.cameras[number], np.eye(4), path=picture.path, measure=lambda path: measured)
+    return camera
+
+
+def _last_part(name: str) -> str:
+    return name.replace("\\", "/").rpartition("/")[2]
