@@ -15,8 +15,8 @@ BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03
 _MOVED = 0.1
 _FLAT_LOOK = 0.8
 _LEAST_PAIRS = 3
-# A patch counts where two pairs find it at the same place of a photo.
-_PAIRS_FOR_PATCH = 2
+# A patch counts where so many pairs find it at the same place of a photo.
+_PAIRS_FOR_PATCH = 3
 
 
 def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
@@ -79,7 +79,7 @@ def flatness(pairs: Sequence[Pair]) -> Finding | None:
 
 
 def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
-    """Photos in which something moved by itself: in the same place for at least two of their pairs."""
+    """Photos in which something moved by itself: in the same place for several of their pairs."""
     seen: dict[int, list[tuple[tuple[float, float, float, float], Patch]]] = {}
     for pair in pairs:
         for patch in pair.patches:
@@ -91,8 +91,8 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
         confirmed = [
             (box, patch) for box, patch in boxes if sum(_overlap(box, other) for other, _ in boxes) >= _PAIRS_FOR_PATCH
         ]
-        if confirmed or (len(pairs) == 1 and boxes):
-            (left, top, right, bottom), patch = max(confirmed or boxes, key=lambda item: item[1].matches)
+        if confirmed:
+            (left, top, right, bottom), patch = max(confirmed, key=lambda item: item[1].matches)
             still = still or patch.still
             width, height = photos[photo].features.size
             across, down = 100 * (left + right) / 2 / width, 100 * (top + bottom) / 2 / height

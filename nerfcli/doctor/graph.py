@@ -13,8 +13,9 @@ from nerfcli.poses.retrieval import alike, likeness
 
 # Up to here every photo is compared with every other one.
 EXHAUSTIVE_UP_TO = 60
-# Beyond, each with the next ones by name and with the ones that look most like it.
-NEXT_BY_NAME = 5
+# Beyond, each with some that follow by name and with the ones that look most like it. From one frame of a video to the
+# next the camera hardly moves, hence the wider steps.
+STEPS_BY_NAME = (1, 2, 8, 20, 50)
 LOOK_ALIKES = 6
 # They are found by this many features of each photo, the largest ones; fewer miss some, more take longer.
 _COARSEST = 96
@@ -29,7 +30,7 @@ def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
     count = len(photos)
     if count <= EXHAUSTIVE_UP_TO:
         return list(combinations(range(count), 2))
-    near = {(i, i + step) for step in range(1, NEXT_BY_NAME + 1) for i in range(count - step)}
+    near = {(i, i + step) for step in STEPS_BY_NAME for i in range(count - step)}
     coarsest = [
         photo.features.descriptors[np.argsort(-photo.features.scales, kind="stable")[:_COARSEST]] for photo in photos
     ]
@@ -41,7 +42,7 @@ def pair_count(count: int) -> int:
     """About how many pairs `choose_pairs` chooses."""
     if count <= EXHAUSTIVE_UP_TO:
         return count * (count - 1) // 2
-    return count * (NEXT_BY_NAME + LOOK_ALIKES)
+    return count * (len(STEPS_BY_NAME) + LOOK_ALIKES)
 
 
 def apart(count: int, pairs: Sequence[Pair]) -> set[int]:
