@@ -7,10 +7,12 @@ import pytest
 import typer
 from test_cli import USAGE, error_of, nerfcli, write_photos
 
+from nerfcli.cli import poses as poses_command
 from nerfcli.cli.options import bytes_from_text
 from nerfcli.cli.poses import _STAGES
-from nerfcli.errors import BAD_INPUT
+from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses import supervise
+from nerfcli.poses.settings import QUALITIES, PoseSettings
 
 
 @pytest.mark.parametrize(
@@ -69,6 +71,22 @@ def test_the_plan_can_be_read(tmp_path: Path):
     photos = write_photos(tmp_path / "photos", 5)
     result = nerfcli("poses", photos, "--dry-run")
     assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to compare (exhaustive), about ")
+
+
+@pytest.mark.parametrize("command", ["poses", "run"])
+def test_the_quality_goes_to_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str):
+    asked: list[tuple[int, int]] = []
+
+    def estimate(folder: Path, scene: Path, *, settings: PoseSettings, **more: object) -> None:
+        asked.append((settings.max_image_size, settings.max_features))
+        raise UserError("enough", "that was all")
+
+    monkeypatch.setattr(poses_command, "estimate_scene", estimate)
+    photos = write_photos(tmp_path / "photos", 5)
+    for quality in ("fast", "best"):
+        assert nerfcli(command, photos, "--quality", quality).exit_code == BAD_INPUT
+    assert asked == [QUALITIES["fast"], QUALITIES["best"]]
+    assert nerfcli(command, photos, "--quality", "superb").exit_code == USAGE
 
 
 def test_progress_has_words_for_every_stage_of_the_worker():

@@ -36,6 +36,8 @@ _STAGES = {
     "check": "checks of the poses",
 }
 
+Quality = Annotated[str, typer.Option(help="Of the poses: fast, default or best: sizes and numbers of features.")]
+
 
 @command
 def poses(
@@ -45,7 +47,7 @@ def poses(
     masks: Annotated[
         Path | None, typer.Option(help="A folder of masks named after the photos; black is not used.")
     ] = None,
-    quality: Annotated[str, typer.Option(help="fast, default or best: sizes and numbers of features.")] = "default",
+    quality: Quality = "default",
     max_size: Annotated[
         int | None, typer.Option(help="Longer side for feature extraction, pixels.  [default: by --quality]", min=100)
     ] = None,
@@ -106,12 +108,11 @@ def poses(
     from nerfcli.poses.cameras import USES
     from nerfcli.poses.memory import default_memory_limit
     from nerfcli.poses.pairs import PAIRINGS
-    from nerfcli.poses.settings import CAMERA_MODELS, QUALITIES, Limits, PoseSettings
+    from nerfcli.poses.settings import CAMERA_MODELS, Limits, PoseSettings
 
     for value, choices, option in (
         (camera_model, CAMERA_MODELS, "--camera-model"),
         (pairing, PAIRINGS, "--pairing"),
-        (quality, tuple(QUALITIES), "--quality"),
         (intrinsics_as or "fixed", USES, "--intrinsics-as"),
     ):
         if value not in choices:
@@ -125,7 +126,7 @@ def poses(
             "the camera models come from --intrinsics; leave out --camera-model", param_hint="--camera-model"
         )
     console = Console(quiet=quiet, json_lines=json)
-    usual_size, usual_features = QUALITIES[quality]
+    usual_size, usual_features = sizes_of(quality)
     settings = PoseSettings(
         max_image_size=usual_size if max_size is None else max_size,
         max_features=usual_features if max_features is None else max_features,
@@ -158,6 +159,19 @@ def poses(
         console.result(scene)
 
     for_each_input(photos, work)
+
+
+def sizes_of(quality: str) -> tuple[int, int]:
+    """(max_image_size, max_features) of a quality.
+
+    Raises:
+        typer.BadParameter: there is none of that name.
+    """
+    from nerfcli.poses.settings import QUALITIES
+
+    if quality not in QUALITIES:
+        raise typer.BadParameter(f"{quality!r}; choose {', '.join(QUALITIES)}", param_hint="--quality")
+    return QUALITIES[quality]
 
 
 def given_intrinsics(file: Path | None, photos: Path, *, use: str) -> "GivenIntrinsics | None":

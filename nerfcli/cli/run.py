@@ -22,6 +22,7 @@ from nerfcli.cli.options import (
     seconds_from_text,
     thread_count,
 )
+from nerfcli.cli.poses import Quality, sizes_of
 
 
 @command
@@ -29,6 +30,7 @@ def run(
     photos: Annotated[str, typer.Argument(help="A folder of photos or a video, or - for such on standard input.")],
     output: Output = None,
     frames: Frames = None,
+    quality: Quality = "default",
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
     downscale: Downscale = "auto",
     count: Annotated[int, typer.Option(help="Views of the orbit video.", min=2)] = 60,
@@ -66,7 +68,8 @@ def run(
 
     console = Console(quiet=quiet, json_lines=json)
     cores, torch_device = thread_count(threads), device_name(device)
-    pose_settings = PoseSettings(seed=seed, threads=cores)
+    max_image_size, max_features = sizes_of(quality)
+    pose_settings = PoseSettings(max_image_size=max_image_size, max_features=max_features, seed=seed, threads=cores)
     train_settings = TrainSettings(
         budget_seconds=seconds_from_text(budget),
         downscale=downscale_factor(downscale),
