@@ -3,6 +3,7 @@
 The evidence is that models agree to the last bit with one thread, and what pycolmap's database holds at which time.
 """
 
+import json
 import os
 import random
 import shutil
@@ -25,6 +26,7 @@ from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
 from nerfcli.poses.memory import default_memory_limit, resident_bytes
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.settings import Limits, PoseSettings
+from nerfcli.poses.stages import read_stage, write_stage
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, plan_poses
 from nerfcli.poses.workspace import database_bytes, drop_database, workspace
 
@@ -156,6 +158,47 @@ def test_a_damaged_database_is_made_anew(photos: Path, whole: Path, again: Path)
     content = bytearray((again / "database.db").read_bytes())
     content[len(content) // 3 : len(content) // 2] = bytes(len(content) // 2 - len(content) // 3)
     (again / "database.db").write_bytes(content)
+    estimate(photos, again)
+    assert model(again) == model(whole)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        '{"key": "k", "content": {"1"',
+        "[]",
+        '"k"',
+        '{"key": "k"}',
+        '{"key": ["k"], "content": {}}',
+        '{"key": "k", "content": [3]}',
+        "[" * 100_000,
+        "\udcff",
+    ],
+)
+def test_a_damaged_stage_is_none(tmp_path: Path, text: str):
+    path = tmp_path / "stage.json"
+    write_stage(path, "k", {"1": "a", "2": (3, 0.1)})
+    assert read_stage(path, "k") == {"1": "a", "2": [3, 0.1]}
+    assert read_stage(path, "other") is None
+    whole = json.loads(path.read_text())
+    path.write_bytes(text.encode(errors="surrogateescape"))
+    assert read_stage(path, "k") is None
+    path.write_text(json.dumps(whole | {"content": {"1": "b", "2": [3, 0.1]}}))
+    assert read_stage(path, "k") is None
+
+
+def test_damaged_stages_are_done_again(photos: Path, whole: Path, again: Path):
+    """Each in another way: cut off, of the wrong type, another content, no text."""
+    stages = sorted(path for path in (again / "work").glob("*.json"))
+    assert {path.stem for path in stages} >= {"enlarged", "features", "geometries", "matches", "photos"}
+    for number, path in enumerate(stages):
+        content = json.loads(path.read_text())
+        wrong = (path.read_text()[:20], "[1, 2]", json.dumps(content | {"content": 7}), "\udcff\udc80")[number % 4]
+        path.write_bytes(wrong.encode(errors="surrogateescape"))
+    (again / "poses_report.json").write_text("[]")
+    assert not is_same_scene(again, photos, ONE_THREAD)
     estimate(photos, again)
     assert model(again) == model(whole)
 

@@ -1,7 +1,8 @@
 """Stages as files: what is complete, and on what it depends.
 
-A complete stage is a JSON file {"key", "content"} in the work folder. The key is a hash of all that the content depends
-on: a stage whose key is not the one that is asked for is as good as not there.
+A complete stage is a JSON file {"key", "content", "seal"} in the work folder. The key is a hash of all that the content
+depends on: a stage whose key is not the one that is asked for is as good as not there. The seal is a hash of the
+content: a stage that is cut off or was changed is as good as not there, too.
 """
 
 import hashlib
@@ -26,12 +27,21 @@ def file_key(path: Path) -> str:
 
 def write_stage(path: Path, key: str, content: Any) -> None:
     """Say that a stage is complete. Whatever else belongs to it must be on disk by now."""
-    write_json(path, {"key": key, "content": content})
+    write_json(path, {"key": key, "content": content, "seal": _seal(content)})
 
 
 def read_stage(path: Path, key: str) -> Any | None:
-    """The content of a complete stage with this key, None where there is none."""
+    """The content of a complete stage with this key, None where there is none, or a damaged one."""
     if not path.is_file():
         return None
-    stage = json.loads(path.read_text(encoding="utf-8"))
-    return stage["content"] if stage["key"] == key else None
+    try:
+        stage = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):  # cut off, or no text
+        return None
+    if not isinstance(stage, dict) or stage.get("key") != key or "content" not in stage:
+        return None
+    return stage["content"] if stage.get("seal") == _seal(stage["content"]) else None
+
+
+def _seal(content: Any) -> str:
+    return stage_key(json.loads(json.dumps(content)))  # as a file gives it back: keys are texts, tuples are lists

@@ -133,12 +133,16 @@ def is_same_scene(
 ) -> bool:
     """Whether `scene_dir` was made from the photos that are in `photos_dir` now, with these settings, threads aside."""
     try:
-        report = _read_json(scene_dir / "poses_report.json")
-        made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
-        names = [path.name for path in list_images(photos_dir)]
-        pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
-    except (OSError, ValueError, KeyError, UserError):
+        return _is_same(scene_dir, photos_dir, settings, given=given)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError):  # a file is not there, or damaged
         return False
+
+
+def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: GivenIntrinsics | None) -> bool:
+    report = _read_json(scene_dir / "poses_report.json")
+    made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
+    names = [path.name for path in list_images(photos_dir)]
+    pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
     known = report.get("intrinsics")
     if (known and (known["use"], known["key"])) != (given and (given.use, given.calibration.key)):
         return False
