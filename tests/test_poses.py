@@ -173,8 +173,18 @@ def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], 
 
 def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
     write_noise(tmp_path / "photos")
+    told: list[str] = []
     with pytest.raises(UserError, match=r"only 0 of 5 photos could be placed.*matches no other photo well") as caught:
-        estimate(tmp_path / "photos", tmp_path / "scene")
+        estimate_poses(
+            tmp_path / "photos",
+            tmp_path / "scene",
+            settings=FAST,
+            notify=told.append,
+            progress=lambda stage, done, total: told.append(stage),
+        )
+    # What was tried is told while the work goes on, not after it.
+    assert told.index("default thresholds: none of 5 photos placed") < told.index("next: more features, full size")
+    assert "match" in told[told.index("next: more features, full size") :]
     assert caught.value.exit_code == TOO_FEW_PHOTOS
     assert "overlap" in caught.value.hint
     assert not (tmp_path / "scene" / "scene.json").exists()

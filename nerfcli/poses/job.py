@@ -8,6 +8,8 @@ from typing import Any
 
 # Told (stage, done, total) as the work goes on.
 Report = Callable[[str, int, int], None]
+# Told what the user should know, one sentence at a time.
+Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pycolmap
 
 from nerfcli.poses.database import evidence
 from nerfcli.poses.features import extract, match, start_matching
-from nerfcli.poses.job import Job, Report
+from nerfcli.poses.job import Job, Report, Tell
 from nerfcli.poses.mapping import Start, map_photos
 from nerfcli.poses.merging import merge_models
 from nerfcli.poses.pairs import all_pairs
@@ -50,13 +50,33 @@ class Climb:
 
 
 class _Ladder:
-    def __init__(self, job: Job, report: Report) -> None:
+    def __init__(self, job: Job, report: Report, tell: Tell) -> None:
         self.best = Climb([], job, [])
         self.rungs: list[dict[str, Any]] = []
         self._report = report
+        self._tell = tell
+        self._photos = len(job.files)
+        self._told = 0
+        self._announced = ""
+
+    def announce(self, what: str) -> None:
+        """Tell what the rungs so far gave, and once what comes next."""
+        self.tell_results()
+        if what != self._announced:
+            self._tell(f"next: {what}")
+        self._announced = what
+
+    def tell_results(self) -> None:
+        """Tell what each rung gave that has not been told yet."""
+        for rung in self.rungs[self._told :]:
+            sizes = " + ".join(str(size) for size in rung["models"]) or "none"
+            self._tell(f"{rung['what']}: {sizes} of {self._photos} photos placed")
+        self._told = len(self.rungs)
 
     def attempt(self, what: str, job: Job, start: Start) -> None:
         """Map once; the result counts if it places more photos than the best so far."""
+        if self.rungs:
+            self.announce(what)
         number = len(self.rungs)
         models = map_photos(job, self._report, attempt=number, start=start)
         self._take(what, models, job)
@@ -73,6 +93,7 @@ class _Ladder:
         models, job = self.best.models, self.best.job
         if not models:
             return
+        self.announce(what)
         grown = map_photos(job, self._report, attempt=len(self.rungs), start=start, base=models[0])
         if grown:
             self._take(what, [grown[0], *models[1:]], job)
@@ -87,15 +108,15 @@ class _Ladder:
         return _placed(self.best.models) / max(candidates, 1)
 
 
-def climb(job: Job, report: Report) -> Climb:
+def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Climb:
     """Map a job's photos, with as many attempts as it takes.
 
     The first attempt has pycolmap's own thresholds. If it leaves out many photos that match some other one well, the
     next ones start from a pair with a smaller baseline, from the strongest pair that was left out, and with low angles.
     If photos with features are still missing, all pairs are compared that were not, and last, more features are sought
-    in the photos' full size.
+    in the photos' full size. If the first attempt is not the last, `tell` is told each attempt and its result.
     """
-    ladder = _Ladder(job, report)
+    ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, Start())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
     _other_starts(ladder, job)
@@ -105,6 +126,7 @@ def climb(job: Job, report: Report) -> Climb:
         match(job, rest, report)
         ladder.attempt("every pair compared", job, SMALLER_BASELINE)
     if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE:
+        ladder.announce("more features, full size")
         full = replace(
             job,
             rung="full-size",
@@ -117,6 +139,8 @@ def climb(job: Job, report: Report) -> Climb:
         match(full, full.pairs, report)
         ladder.attempt("more features, full size", full, Start())
         _other_starts(ladder, full)
+    if len(ladder.rungs) > 1:
+        ladder.tell_results()
     return replace(ladder.best, rungs=ladder.rungs)
 
 

@@ -78,15 +78,20 @@ def estimate_poses(
         work = space.folder
         job = _prepare(photos, settings, grouped=grouped, pairing=pairing, work=work, notify=notify)
         write_job(work / "job.json", job)
-        run_worker(work / "job.json", threads=settings.threads, progress=progress, limits=limits, lock=space.lock)
-        result = _read_json(work / "result.json")["content"]
+        run_worker(
+            work / "job.json",
+            threads=settings.threads,
+            progress=progress,
+            limits=limits,
+            lock=space.lock,
+            notify=notify,
+        )
+        result = _read_json(work / "result.json")["content"]  # that the worker has written or found whole
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"]}
         if settings.pairs_file is not None:
             matching["pairs_file_key"] = file_key(Path(settings.pairs_file))
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
-        for rung in report.attempts if len(report.attempts) > 1 else ():
-            notify(f"{rung['what']}: {_sizes(rung['models'])} of {len(photos.names)} photos placed")
         if error := refusal(report, photos_dir):
             raise _refused(error, report, scene_dir)
 

@@ -35,6 +35,7 @@ def run_worker(
     progress: Callable[[str, int, int], None],
     limits: Limits = Limits(),
     lock: int | None = None,
+    notify: Callable[[str], None] = lambda note: None,
 ) -> None:
     """Run `nerfcli.poses.worker` on a job until it is done; it is dead when this returns or raises.
 
@@ -44,6 +45,7 @@ def run_worker(
         progress: told (stage, done, total).
         limits: the worker is ended when it goes beyond one of them.
         lock: a descriptor that the worker inherits.
+        notify: told what the user should know, one sentence at a time.
 
     Raises:
         UserError: the worker died or was ended; the text says while doing what, and its last words.
@@ -71,6 +73,9 @@ def run_worker(
             assert worker.stdout is not None
             for line in worker.stdout:
                 message = json.loads(line)
+                if "note" in message:
+                    notify(message["note"])
+                    continue
                 stage = f"{_STAGES[message['stage']]} ({message['done']} of {message['total']} done)"
                 progress(message["stage"], message["done"], message["total"])
             worker.wait()

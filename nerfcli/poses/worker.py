@@ -2,8 +2,9 @@
 
 pycolmap is C++ that may end the process without a Python exception, so it gets one of its own. It reads a job, goes on
 from the stages that are complete in the job's folder, leaves `sparse/0` and `result.json` there, and tells its progress
-as JSON lines {"stage", "done", "total"} on stdout. Everything else, glog's lines included, goes to stderr. It ends by
-itself when its stdin closes, which is what happens when the parent dies, however it dies.
+as JSON lines {"stage", "done", "total"} on stdout, and what the user should know as {"note"}. Everything else, glog's
+lines included, goes to stderr. It ends by itself when its stdin closes, which is what happens when the parent dies,
+however it dies.
 
 Photos go by number here: pycolmap sees `00000.jpg`, `00001.png`..., so that a space or an umlaut in a name
 cannot break the list of pairs.
@@ -26,7 +27,7 @@ import nerfcli
 from nerfcli.poses.database import discard_if_damaged, evidence, name_images
 from nerfcli.poses.examine import examine
 from nerfcli.poses.features import extract, match, start_matching
-from nerfcli.poses.job import Job, Report, read_job
+from nerfcli.poses.job import Job, Report, Tell, read_job
 from nerfcli.poses.ladder import climb
 from nerfcli.poses.mapping import describe_cameras, photo_numbers, write_model
 from nerfcli.poses.retrieval import with_neighbours
@@ -38,15 +39,15 @@ RESULT = "result.json"
 
 def main(job_path: str) -> None:
     """Do one job and write its result."""
-    report = _take_stdout()
+    report, tell = _take_stdout()
     _end_with_parent()
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     job = read_job(Path(job_path))
     pycolmap.set_random_seed(job.seed)
-    solve(job, report)
+    solve(job, report, tell)
 
 
-def solve(job: Job, report: Report) -> None:
+def solve(job: Job, report: Report, tell: Tell) -> None:
     """Extraction, matching, mapping; each goes on from what is there."""
     seconds: dict[str, float] = {}
     discard_if_damaged(job.database)
@@ -59,7 +60,7 @@ def solve(job: Job, report: Report) -> None:
     result, key = Path(job.folder) / RESULT, mapping_key(job)
     if read_stage(result, key) is None:
         result.unlink(missing_ok=True)
-        write_stage(result, key, _map(job, report, seconds=seconds))
+        write_stage(result, key, _map(job, report, tell, seconds=seconds))
     name_images(job)
 
 
@@ -71,10 +72,10 @@ def mapping_key(job: Job) -> str:
     return stage_key(content, nerfcli.__version__, pycolmap.__version__)
 
 
-def _map(job: Job, report: Report, *, seconds: dict[str, float]) -> dict[str, Any]:
+def _map(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> dict[str, Any]:
     """Writes `sparse/0` if there is a model and returns what the report needs."""
     with _timed(seconds, "map"):
-        climbed = climb(job, report)
+        climbed = climb(job, report, tell)
     with _timed(seconds, "check"):
         examined = examine(climbed.models, climbed.job, report)
     model = examined.model
@@ -106,16 +107,19 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = round(time.perf_counter() - start, 3)
 
 
-def _take_stdout() -> Report:
-    """A function that reports on stdout, which from here on is closed to every other writer in the process."""
+def _take_stdout() -> tuple[Report, Tell]:
+    """Functions that report on stdout, which from here on is closed to every other writer in the process."""
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
 
-    def report(stage: str, done: int, total: int) -> None:
-        channel.write(json.dumps({"stage": stage, "done": done, "total": total}) + "\n")
+    def send(message: dict[str, Any]) -> None:
+        channel.write(json.dumps(message) + "\n")
         channel.flush()
 
-    return report
+    return (
+        lambda stage, done, total: send({"stage": stage, "done": done, "total": total}),
+        lambda text: send({"note": text}),
+    )
 
 
 def _end_with_parent() -> None:
