@@ -33,12 +33,13 @@ MAY_IMPORT = {
     "train": {"render", "field", "kernels", "scene", "cameras", "media"},
     "evaluate": {"render", "field", "scene", "cameras", "media"},
     "export": {"render", "field", "scene", "cameras", "media"},
+    "selftest": {"render", "field", "kernels", "cameras"},
     "report": {"media"},
     "viewer": {"render", "field", "scene", "cameras", "media"},
 }
 # Libraries that are heavy, or whose ways must not spread, and the parts that may use them.
 CONFINED = {
-    "torch": {"kernels", "field", "render", "train", "evaluate", "export", "viewer", "cli"},
+    "torch": {"kernels", "field", "render", "train", "evaluate", "export", "selftest", "viewer", "cli"},
     "safetensors": {"field"},
     "numba": {"kernels"},
     "triton": {"kernels"},

@@ -36,6 +36,7 @@ from nerfcli.train.run_folder import append_log, describe_run, write_cameras
 from nerfcli.train.settings import TrainSettings
 
 COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert")
+WITHOUT_INPUT = ("selftest",)
 USAGE = 2
 README = Path(__file__).parent.parent / "README.md"
 # Enough for a command that trains to do everything that it does.
@@ -129,7 +130,7 @@ def needed(command: str, folder: Path) -> tuple[Any, ...]:
     return (folder / "out.npz", "--to", "npz") if command == "convert" else ()
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [*COMMANDS, *WITHOUT_INPUT])
 def test_help_has_examples_that_parse(command):
     result = nerfcli(command, "--help")
     assert result.exit_code == 0
@@ -143,7 +144,7 @@ def test_help_has_examples_that_parse(command):
 def test_help_lists_every_command_and_the_exit_codes():
     result = nerfcli("--help")
     assert result.exit_code == 0
-    assert all(re.search(rf"^\s+{command}\b", result.stdout, re.M) for command in COMMANDS)
+    assert all(re.search(rf"^\s+{command}\b", result.stdout, re.M) for command in (*COMMANDS, *WITHOUT_INPUT))
     assert "130 interrupted" in re.sub(r"\s+", " ", result.stdout)
     for line in result.stdout.splitlines():
         if line.strip().startswith("nerfcli "):

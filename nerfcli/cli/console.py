@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TextIO, TypeVar
 
 import typer
 
@@ -19,7 +19,9 @@ R = TypeVar("R")
 
 # Without a terminal, progress is a plain line at most this often.
 PLAIN_LINE_SECONDS = 10.0
+# A file or a pipe has no width of its own: that of tables of findings, and of numbers.
 PLAIN_TABLE_WIDTH = 140
+WIDE_TABLE_WIDTH = 200
 
 
 class Console:
@@ -39,6 +41,15 @@ class Console:
         line = json.dumps({"path": str(path), **(content or {})}) if self.json_lines else str(path)
         print(line, flush=True)  # noqa: T201 - the one place that writes results
 
+    def fact(self, content: dict[str, Any]) -> None:
+        """One result that is no file: a line of JSON on stdout."""
+        print(json.dumps(content), flush=True)  # noqa: T201 - a result, as above
+
+    def fact_table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str]) -> None:
+        """Results that are no files as a table on stdout; a cell that is a key of `styles` is coloured so."""
+        width = None if sys.stdout.isatty() else WIDE_TABLE_WIDTH
+        _print_table(columns, rows, styles=styles, width=width, file=sys.stdout)
+
     def note(self, text: str) -> None:
         """A line for the user to know."""
         if not self.quiet:
@@ -52,16 +63,8 @@ class Console:
         """A table for the user to read; a cell that is a key of `styles` is coloured so."""
         if self.quiet:
             return
-        from rich.box import SIMPLE
-        from rich.console import Console as RichConsole
-        from rich.table import Table
-        from rich.text import Text
-
-        table = Table(*columns, box=SIMPLE, pad_edge=False)
-        for row in rows:
-            table.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
-        # A file or a pipe has no width of its own.
-        RichConsole(stderr=True, width=None if sys.stderr.isatty() else PLAIN_TABLE_WIDTH).print(table)
+        width = None if sys.stderr.isatty() else PLAIN_TABLE_WIDTH
+        _print_table(columns, rows, styles=styles, width=width, file=sys.stderr)
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float, str], None]]:
@@ -76,6 +79,20 @@ class Console:
             yield from _bar(title)
         else:
             yield from _plain_lines(title)
+
+
+def _print_table(
+    columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str], width: int | None, file: TextIO
+) -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console as RichConsole
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(*columns, box=SIMPLE, pad_edge=False)
+    for row in rows:
+        table.add_row(*(Text(cell, style=styles.get(cell, "")) for cell in row))
+    RichConsole(file=file, width=width).print(table)
 
 
 def _bar(title: str) -> Iterator[Callable[[float, str], None]]:

@@ -24,6 +24,7 @@ __all__ = [
     "density",
     "distortion",
     "grid_coordinates",
+    "has_compiled",
     "hash_encode",
     "interval_weights",
     "light_ends",
@@ -198,6 +199,11 @@ def _module_for(*tensors: Tensor, constant: tuple[Tensor, ...] = ()) -> ModuleTy
     fits = all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in tensors)
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in constant)
     return (_numba_cpu() or reference) if fits and not wanted else reference
+
+
+def has_compiled() -> bool:
+    """Whether the compiled CPU kernels work here."""
+    return _numba_cpu() is not None
 
 
 def prepare(notify: Callable[[str], None]) -> None:

@@ -1,4 +1,4 @@
-"""From what a network puts out to what the volume integral takes."""
+"""From what a network puts out to what the volume integral takes, and from optical depth to opacity."""
 
 from typing import Any
 
@@ -34,3 +34,27 @@ def density_from_log(log_density: Tensor) -> Tensor:
     The gradient is density itself, also beyond the limits: a plain clamp would hold a value that went too far forever.
     """
     return _BoundedExp.apply(log_density)  # type: ignore[return-value]
+
+
+class _Opacity(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, optical_depth: Tensor) -> Tensor:
+        ctx.save_for_backward(optical_depth)
+        return -torch.expm1(-optical_depth)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (optical_depth,) = ctx.saved_tensors
+        return gradients[0] * torch.exp(-optical_depth)
+
+
+def opacity(optical_depth: Tensor) -> Tensor:
+    """1 - exp(-x) with all digits where x is small, and its gradient exp(-x) with all of them where x is large.
+
+    Args:
+        optical_depth: x, any shape, >= 0.
+
+    torch's own gradient of expm1 is its value plus 1: a difference that has no digits left where x is above 17 in
+    float32, or above 37 in float64.
+    """
+    return _Opacity.apply(optical_depth)  # type: ignore[return-value]

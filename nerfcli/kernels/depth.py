@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.activations import opacity
 from nerfcli.kernels.reference import interval_weights, optical_depth_before, ray_indices, sum_along_rays
 
 # Below this optical depth the mean place is taken from its series, whose next term is then 5e-14.
@@ -181,11 +182,11 @@ def light_ends(
     means = interval_means(density, starts, ends)
     mean = conditional(weights, means, offsets)
     width = spread(weights, means, interval_variances(density, lengths), offsets=offsets)
-    opacity = -torch.expm1(-sum_along_rays(density * lengths, offsets))
+    total = opacity(sum_along_rays(density * lengths, offsets))
     columns = [quantile(density, starts, ends, offsets=offsets, share=share) for share in shares]
     quantiles = torch.stack(columns, dim=-1) if columns else density.new_empty(len(offsets) - 1, 0)
     heaviest, largest = max_weight(weights, means, offsets), _largest(weights, offsets)
-    return LightEnds(opacity, transmittance, mean, width, heaviest, largest, quantiles)
+    return LightEnds(total, transmittance, mean, width, heaviest, largest, quantiles)
 
 
 def mixture_quantile(

@@ -8,7 +8,7 @@ another module of this folder agrees with these functions in value and gradient.
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.activations import density_from_log
+from nerfcli.kernels.activations import density_from_log, opacity
 
 HASH_PRIMES = (1, 2654435761, 805459861)
 
@@ -19,17 +19,20 @@ def contract(points: Tensor) -> Tensor:
     contract(x) = x for |x| <= 1, else (2 - 1/|x|) x / |x|
 
     Args:
-        points: (..., 3) finite; components up to the square root of the dtype's largest number.
+        points: (..., 3) finite; components up to half of the dtype's largest number.
 
     Returns:
         (..., 3) with norm below or at 2.
 
-    Differentiable everywhere, with the identity as its derivative at 0: norms below 1 are raised to 1 before the
-    division, so that no gradient passes through a root at 0.
+    Differentiable everywhere, also at 0: norms below 1 are raised to 1, so that no gradient passes through a root at 0.
     Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 10.
     """
-    norm = points.square().sum(-1, keepdim=True).clamp_min(1.0).sqrt()
-    return (2.0 - 1.0 / norm) / norm * points
+    limit = torch.finfo(points.dtype).max
+    far = points.detach().abs().amax(-1, keepdim=True) > limit**0.25  # there, squares could overflow
+    shrink = torch.where(far, limit**-0.5 / 4, 1.0).to(points)
+    small = points * shrink
+    norm = small.square().sum(-1, keepdim=True).maximum(shrink.square()).sqrt()
+    return (2.0 - shrink / norm) * (small / norm)
 
 
 def grid_coordinates(points: Tensor, unbounded: bool) -> Tensor:
@@ -175,8 +178,7 @@ def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> T
 
     tau_i = sum_{j < i} density_j * length_j over the samples of the same ray.
 
-    The sums are shifted and then accumulated, ray by ray: the shorter way (accumulate, then subtract the interval's
-    own part) loses all digits when a later interval is much denser.
+    Shifted, then accumulated: to accumulate and subtract the own part loses all digits at a much denser interval.
 
     Args:
         density: (N,) >= 0, finite, in 1 / unit of length.
@@ -207,12 +209,12 @@ def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple
     Returns:
         weights (N,), transmittance (R,) behind the last interval; per ray they sum to 1.
 
-    Differentiable in density and lengths. alpha by expm1: 1 - exp loses every digit below 1e-7 in float32.
+    Differentiable in density and lengths. 1 - exp would lose every digit below 1e-7 in float32.
     Source: Max 1995, Optical models for direct volume rendering; Mildenhall et al. 2020, arXiv:2003.08934, eq. 3.
     """
     before = optical_depth_before(density, lengths, offsets)
     depth = density * lengths
-    weights = torch.exp(-before) * -torch.expm1(-depth)
+    weights = torch.exp(-before) * opacity(depth)
     total = torch.zeros(len(offsets) - 1, dtype=density.dtype, device=density.device)
     total = total.index_add(0, ray_indices(offsets), depth)
     return weights, torch.exp(-total)
@@ -252,8 +254,7 @@ def composite(
 def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
     """How far the light of each ray ends apart: the mean distance between two places where it ends.
 
-    sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (ends_i - starts_i), with m the middles; 0 for light that ends in one
-    point, and for a ray without samples.
+    sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (ends_i - starts_i), with m the middles; 0 without samples.
 
     Args:
         weights: (N,) >= 0, see `interval_weights`.
@@ -263,15 +264,15 @@ def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -
     Returns:
         (R,). Differentiable in weights.
 
-    The double sum is 2 sum_i w_i (m_i W_i - M_i) with the running sums W of weights and M of weights * middles.
-    Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 15; the running sums from Sun et al. 2022,
-    arXiv:2206.05085, section 3.
+    The double sum is 2 sum_i (m_i - m_(i-1)) W_i B_i with the weights W_i in front of interval i and B_i from it on: a
+    gap between two middles counts for all pairs on its two sides. Nothing is subtracted from a sum.
+    Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 15.
     """
-    middles = (starts + ends) / 2
-    ones = torch.ones_like(weights)
+    middles, ones = (starts + ends) / 2, torch.ones_like(weights)
     before = optical_depth_before(weights, ones, offsets)
-    moment_before = optical_depth_before(weights, middles, offsets)
-    terms = 2 * weights * (middles * before - moment_before) + weights.square() * (ends - starts) / 3
+    behind = optical_depth_before(weights.flip(0), ones, offsets[-1] - offsets.flip(0)).flip(0)
+    gaps = torch.nn.functional.pad(middles.diff(), (1, 0))[: len(middles)]  # at a ray's first sample `before` is 0
+    terms = 2 * gaps * before * (weights + behind) + weights.square() * (ends - starts) / 3
     return sum_along_rays(terms, offsets)
 
 

@@ -21,8 +21,11 @@ class Occupancy:
         self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
 
     def above(self, optical_depth: float) -> Tensor:
-        """(side, side, side) bool, indexed [z, y, x]: cells that hold more; those never looked at are among them."""
-        return self.optical_depth > optical_depth
+        """(side, side, side) bool, indexed [z, y, x]: cells that hold more; those never looked at are among them.
+
+        A cell with NaN counts as holding more: rays look into it, and the loss finds the NaN.
+        """
+        return ~(self.optical_depth <= optical_depth)
 
     @torch.no_grad()
     def refresh(

@@ -76,8 +76,9 @@ def inverse_cdf(edges: Tensor, weights: Tensor, *, uniform: Tensor) -> Tensor:
     """
     if edges.shape[-1] != weights.shape[-1] + 1:
         raise ValueError(f"edges must be (rays, {weights.shape[-1] + 1}), got {tuple(edges.shape)}")
-    total = weights.sum(-1, keepdim=True)
-    weights = torch.where(total > 0, weights, edges.diff(dim=-1))
+    largest = weights.amax(-1, keepdim=True)
+    # Shares of the largest: sums of very large or very small weights would leave the range of the dtype.
+    weights = torch.where(largest > 0, weights / torch.where(largest > 0, largest, 1.0), edges.diff(dim=-1))
     cumulated = weights.cumsum(-1)
     total = cumulated[:, -1:]
     cdf = torch.cat([torch.zeros_like(total), cumulated / total], dim=-1)

@@ -1,0 +1,85 @@
+"""nerfcli selftest: how right the numbers are on this machine."""
+
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nerfcli.cli.console import Console, command
+from nerfcli.cli.options import Device, Quiet, Threads, device_name, thread_count
+from nerfcli.errors import GATE_NOT_MET, UserError
+
+if TYPE_CHECKING:
+    from nerfcli.selftest.measure import Errors, Row
+
+_COLUMNS = ("#", "case", "operation", "in", "error", "gradient", "bound", "verdict", "textbook", "gradient", "ms")
+_STYLES = {"met": "green", "not met": "bold red", "does not occur": "dim"}
+
+
+@command
+def selftest(
+    device: Device = "auto",
+    threads: Threads = 0,
+    json: Annotated[
+        bool, typer.Option("--json", help="A line of JSON per row on stdout instead of the table.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Try every operation on hard cases with known answers, on this machine: errors, bounds, verdicts, time.
+
+    Thin fog and opaque walls, no samples and thousands, densities at overflow, points at infinity, rotations near 0 and
+    pi, lenses beyond what they can see: in float64, float32, bfloat16 and in the compiled kernels. Errors are relative;
+    beside each stands that of the formula that textbooks give. The number is that of the list of known hard cases.
+
+    Ends with exit code 7 if an error is above its bound.
+
+    \b
+    Examples:
+      nerfcli selftest
+      nerfcli selftest --device cpu --json | jq 'select(.verdict == "not met")'
+    """
+    import torch
+
+    from nerfcli.selftest.measure import MET, NOT_MET
+    from nerfcli.selftest.suite import rows
+
+    console = Console(quiet=quiet, json_lines=json)
+    torch.set_num_threads(thread_count(threads))
+    begin, measured = time.perf_counter(), []
+    for row in rows(device_name(device), console.note):
+        measured.append(row)
+        if json:
+            console.fact(row.to_json())
+    if not json:
+        console.fact_table(_COLUMNS, [_cells(row) for row in measured], styles=_STYLES)
+    met = sum(row.verdict == MET for row in measured)
+    failed = [row for row in measured if row.verdict == NOT_MET]
+    worse = sum(row.textbook is not None and not row.holds(row.textbook) for row in measured)
+    console.note(
+        f"{met} of {met + len(failed)} rows within their bounds, the textbook formulas beyond them in {worse}; "
+        f"{len(measured) - met - len(failed)} cases do not occur here; {time.perf_counter() - begin:.1f} s"
+    )
+    if failed:
+        row = failed[0]
+        raise UserError(
+            f"{len(failed)} of {len(measured)} rows are not within their bounds; first: {row.case} ({row.operation}, "
+            f"{row.precision})",
+            "numbers of this machine cannot be trusted; report this with the output of nerfcli selftest --json",
+            GATE_NOT_MET,
+        )
+
+
+def _cells(row: "Row") -> tuple[str, ...]:
+    def pair(errors: "Errors | None") -> tuple[str, str]:
+        return (_number(errors.value), _number(errors.gradient)) if errors else ("", "")
+
+    numbers = ",".join(map(str, row.hard_cases))
+    bound = "" if row.bounds is None else _number(row.bounds.value)
+    milliseconds = "" if row.seconds is None else f"{1e3 * row.seconds:.1f}"
+    case = row.case if row.errors else f"{row.case}: {row.reason}"
+    shown = (*pair(row.errors), bound, row.verdict, *pair(row.textbook), milliseconds)
+    return (numbers, case, row.operation, row.precision, *shown)
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.1e}" if value else "0"

@@ -1,0 +1,139 @@
+"""The answers for rays in 60 decimal digits, by the definitions, from the very numbers that the kernels get."""
+
+from dataclasses import dataclass
+from decimal import Decimal, localcontext
+
+from nerfcli.selftest.rays import Intervals, Ray
+
+DIGITS = 60
+SHARES = (0.5, 0.05, 0.95)
+
+
+@dataclass(frozen=True)
+class Composited:
+    """Answers of one ray; see `composited`."""
+
+    weights: list[float]
+    transmittance: float
+    colour: list[float]
+    density_gradient: list[float]
+    density_gradient_size: list[float]
+    optical_depth: float
+
+
+def composited(
+    ray: Intervals,
+    rgb: list[list[float]],
+    background: list[float],
+    *,
+    colour_gradient: list[float],
+    transmittance_gradient: float,
+    weights_gradient: list[float],
+) -> Composited:
+    """Weights, transmittance and colour of a ray, and the gradient of a weighted sum of them.
+
+    loss = sum_c gc_c colour_c + gt T + sum_i gw_i w_i, with the gradient
+    d loss / d density_k = length_k (T_(k+1) v_k - sum_(i>k) w_i v_i - T (gc . background + gt)),
+    v_i = gc . rgb_i + gw_i.
+
+    `density_gradient_size` is the same sum with absolute values: what its rounding is proportional to.
+    """
+    with localcontext() as context:
+        context.prec = DIGITS
+        passing, weights, after, tau = Decimal(1), [], [], Decimal(0)
+        for sigma, length in zip(ray.density, ray.lengths, strict=True):
+            own = Decimal(sigma) * Decimal(length)
+            through = (-own).exp()
+            weights.append(passing * (1 - through))
+            passing *= through
+            after.append(passing)
+            tau += own
+        columns = list(zip(*rgb, strict=True)) or [()] * len(background)
+        colour = [
+            sum((w * Decimal(c) for w, c in zip(weights, column, strict=True)), passing * Decimal(b))
+            for column, b in zip(columns, background, strict=True)
+        ]
+        gains = [Decimal(g) for g in colour_gradient]
+        values = [
+            sum((g * Decimal(c) for g, c in zip(gains, pixel, strict=True)), Decimal(own))
+            for pixel, own in zip(rgb, weights_gradient, strict=True)
+        ]
+        behind = passing * sum(
+            (g * Decimal(b) for g, b in zip(gains, background, strict=True)), Decimal(transmittance_gradient)
+        )
+        size = abs(behind)
+        gradient, sizes = [], []
+        for k in range(len(weights) - 1, -1, -1):
+            length = Decimal(ray.lengths[k])
+            gradient.append(float(length * (after[k] * values[k] - behind)))
+            sizes.append(float(length * (abs(after[k] * values[k]) + size)))
+            behind += weights[k] * values[k]
+            size += abs(weights[k] * values[k])
+        return Composited(
+            weights=[float(w) for w in weights],
+            transmittance=float(passing),
+            colour=[float(c) for c in colour],
+            density_gradient=gradient[::-1],
+            density_gradient_size=sizes[::-1],
+            optical_depth=float(tau),
+        )
+
+
+def distortion(weights: list[float], starts: list[float], ends: list[float]) -> tuple[float, list[float]]:
+    """sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 length_i / 3 of one ray, and its gradient by the weights."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        w = [Decimal(x) for x in weights]
+        middles = [(Decimal(a) + Decimal(b)) / 2 for a, b in zip(starts, ends, strict=True)]
+        lengths = [Decimal(b) - Decimal(a) for a, b in zip(starts, ends, strict=True)]
+        apart = [sum((wj * abs(m - mj) for wj, mj in zip(w, middles, strict=True)), Decimal(0)) for m in middles]
+        value = sum((wi * (a + wi * n / 3) for wi, a, n in zip(w, apart, lengths, strict=True)), Decimal(0))
+        gradient = [float(2 * (a + wi * n / 3)) for wi, a, n in zip(w, apart, lengths, strict=True)]
+        return float(value), gradient
+
+
+def light_ends(ray: Ray, *, far: float) -> dict[str, float]:
+    """Every depth of a ray and what goes with it, by the definitions of `render.depth`.
+
+    Args:
+        ray: its numbers are taken as they are.
+        far: the background's distance.
+
+    Returns:
+        opacity, transmittance, moment, background, conditional, spread, max-weight, median and the quantiles of
+        `SHARES`; NaN where undefined.
+    """
+    with localcontext() as context:
+        context.prec = DIGITS
+        tau, moment, mass, samples = Decimal(0), Decimal(0), Decimal(0), []
+        quantiles = dict.fromkeys(SHARES, Decimal("nan"))
+        columns = (map(Decimal, values) for values in (ray.density, ray.starts, ray.ends))
+        for sigma, start, end in zip(*columns, strict=True):
+            length, own = end - start, sigma * (end - start)
+            weight = (-tau).exp() * (1 - (-own).exp())
+            if own > 0:
+                # Below this, sixty digits are not enough for the closed forms; their series then has one term.
+                tiny = own < Decimal("1e-15")
+                mean = start + (length / 2 - own * length / 12 if tiny else 1 / sigma - length / (own.exp() - 1))
+                wide = length**2 / 12 if tiny else 1 / sigma**2 - length**2 * own.exp() / (own.exp() - 1) ** 2
+                samples.append((weight, mean, wide))
+                moment, mass = moment + weight * mean, mass + weight
+            for share in SHARES:
+                target = -(1 - Decimal(share)).ln()
+                if quantiles[share].is_nan() and tau + own >= target:
+                    quantiles[share] = start + (target - tau) / sigma
+            tau += own
+        left = (-tau).exp()
+        values: dict[str, Decimal] = {"opacity": 1 - left, "transmittance": left, "moment": moment}
+        values["background"] = moment + left * Decimal(far)
+        middle = moment / mass if mass else Decimal("nan")
+        values["conditional"] = middle
+        values["spread"] = (
+            (sum(w * (v + (m - middle) ** 2) for w, m, v in samples) / mass).sqrt() if mass else Decimal("nan")
+        )
+        heaviest = max((w for w, _, _ in samples), default=Decimal(0))
+        # Equal weights are told apart by rounding alone; then the nearest counts.
+        near = [m for w, m, _ in samples if w >= heaviest * (1 - Decimal("1e-15"))]
+        values["max-weight"] = near[0] if near else Decimal("nan")
+        values |= {"median": quantiles[0.5], "quantile:0.05": quantiles[0.05], "quantile:0.95": quantiles[0.95]}
+        return {name: float(value) for name, value in values.items()}

@@ -1,0 +1,337 @@
+"""Weights, colours, depths and distortion of hard rays, with gradients, in every precision."""
+
+import functools
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.kernels import depth as depth_reference
+from nerfcli.kernels import reference
+from nerfcli.kernels.depth import LightEnds
+from nerfcli.selftest import exact, textbook
+from nerfcli.selftest.exact import Composited
+from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
+from nerfcli.selftest.rays import Group, Intervals, Ray, depth_rays, groups
+
+# In bfloat16 a sum of more terms than this has no digits left.
+MOST_IN_BFLOAT16 = 16
+# A bound above this says nothing: bfloat16 has no digit of exp(-tau) for tau above 100.
+MEANINGLESS = 0.25
+BACKGROUND = [1.0, 0.5, 0.25]
+COLOUR_GRADIENT = [1.0, 0.5, 0.25]
+TRANSMITTANCE_GRADIENT = 0.5
+FAR = 300.0
+
+COMPILED_BOUND = "8 roundings u of the result: sums in float64; of a gradient 16, relative to its terms"
+REFERENCE_BOUND = (
+    "u (8 + (n + 2) (1 + tau)): sums of n terms, and exp turns the error of tau into one of the result; n and tau as "
+    "far as light comes; twice for a gradient, relative to its terms"
+)
+NERF = "1 - exp, cumulative product, 1 - sum of weights"
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """Rays as the kernels take them."""
+
+    density: Tensor
+    rgb: Tensor
+    lengths: Tensor
+    offsets: Tensor
+    background: Tensor
+    weights_gradient: Tensor
+
+
+def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
+    """Rows of everything about light along rays."""
+    for group in groups():
+        answers = [_exact(ray) for ray in group.rays]
+        for precision in precisions:
+            yield from _composite_row(group, answers, precision)
+    yield from _subtraction_rows(precisions)
+    for precision in precisions:
+        if precision.dtype != torch.bfloat16:
+            yield from _depth_rows(precision)
+            yield _distortion_row(precision)
+
+
+def _rgb(samples: int) -> list[list[float]]:
+    return [[(k % 5 + 1) / 8, (k % 3 + 1) / 4, (k % 7 + 1) / 8] for k in range(samples)]
+
+
+def _weights_gradient(samples: int) -> list[float]:
+    return [(k % 3 - 1) / 2 for k in range(samples)]
+
+
+@functools.cache
+def _exact(ray: Intervals) -> Composited:
+    samples = len(ray.density)
+    return exact.composited(
+        ray,
+        _rgb(samples),
+        BACKGROUND,
+        colour_gradient=COLOUR_GRADIENT,
+        transmittance_gradient=TRANSMITTANCE_GRADIENT,
+        weights_gradient=_weights_gradient(samples),
+    )
+
+
+def _packed(rays: list[Intervals], precision: Precision) -> _Packed:
+    density, lengths, rgb, gradient, offsets = [], [], [], [], [0]
+    for ray in rays:
+        density += ray.density
+        lengths += ray.lengths
+        rgb += _rgb(len(ray.density))
+        gradient += _weights_gradient(len(ray.density))
+        offsets.append(len(density))
+    return _Packed(
+        density=precision.tensor(density).requires_grad_(),
+        rgb=precision.tensor(rgb).reshape(-1, 3).requires_grad_(),
+        lengths=precision.tensor(lengths),
+        offsets=torch.tensor(offsets, device=precision.device),
+        background=precision.tensor([BACKGROUND] * len(rays)),
+        weights_gradient=precision.tensor(gradient),
+    )
+
+
+def _lit(rays: list[Intervals], precision: Precision) -> tuple[int, float]:
+    """The most intervals that light comes to, and the optical depth it comes through."""
+    counts, depths = [0], [0.0]
+    for ray in rays:
+        depth, count = 0.0, 0
+        for sigma, length in zip(ray.density, ray.lengths, strict=True):
+            if depth > precision.deepest:
+                break
+            depth, count = depth + sigma * length, count + 1
+        counts.append(count)
+        depths.append(min(depth, precision.deepest))
+    return max(counts), max(depths)
+
+
+def _bounds(rays: list[Intervals], precision: Precision) -> tuple[Errors, str]:
+    if precision.compiled:
+        return Errors(8 * precision.unit, 16 * precision.unit), COMPILED_BOUND
+    samples, depth = _lit(rays, precision)
+    bound = precision.unit * (8 + (samples + 2) * (1 + depth))
+    return Errors(bound, 2 * bound), REFERENCE_BOUND
+
+
+def _composite_row(group: Group, answers: list[Composited], precision: Precision) -> Iterator[Row]:
+    most = MOST_IN_BFLOAT16 if precision.dtype == torch.bfloat16 else math.inf
+    chosen = [(ray, answer) for ray, answer in zip(group.rays, answers, strict=True) if len(ray.density) <= most]
+    if not chosen:
+        return
+    rays, wanted = [ray for ray, _ in chosen], [answer for _, answer in chosen]
+    module = kernels if precision.compiled else reference
+    errors, seconds = _composite_errors(module.composite, rays, wanted, precision=precision)
+    bounds, reason = _bounds(rays, precision)
+    if bounds.value > MEANINGLESS:
+        return
+    yield Row(
+        hard_cases=group.hard_cases,
+        case=group.name,
+        operation="composite",
+        precision=precision.name,
+        errors=errors,
+        bounds=bounds,
+        reason=reason,
+        formula=NERF,
+        textbook=_composite_errors(textbook.composite, rays, wanted, precision=precision)[0],
+        seconds=seconds,
+    )
+
+
+def _composite_errors(operation, rays, wanted, *, precision):  # type: ignore[no-untyped-def]
+    packed = _packed(rays, precision)
+    start = time.perf_counter()
+    colour, transmittance, weights = operation(
+        packed.density, packed.rgb, packed.lengths, offsets=packed.offsets, background=packed.background
+    )
+    loss = (colour * precision.tensor(COLOUR_GRADIENT)).sum() + TRANSMITTANCE_GRADIENT * transmittance.sum()
+    (loss + (packed.weights_gradient * weights).sum()).backward()
+    seconds = time.perf_counter() - start
+    assert packed.density.grad is not None
+    assert packed.rgb.grad is not None
+    all_weights = [w for answer in wanted for w in answer.weights]
+    tiny = precision.tiny
+    value = max(
+        largest_error(weights, all_weights, tiny=tiny),
+        largest_error(transmittance, [answer.transmittance for answer in wanted], tiny=tiny),
+        largest_error(colour, [answer.colour for answer in wanted], tiny=tiny),
+    )
+    longest = max((length for ray in rays for length in ray.lengths), default=0.0)
+    gradient = max(
+        largest_error(
+            packed.density.grad,
+            [g for answer in wanted for g in answer.density_gradient],
+            tiny=tiny * max(1.0, longest),
+            scale=[s for answer in wanted for s in answer.density_gradient_size],
+        ),
+        largest_error(packed.rgb.grad, [[w * g for g in COLOUR_GRADIENT] for w in all_weights], tiny=tiny),
+    )
+    return Errors(value, gradient), seconds
+
+
+def _subtraction_rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
+    """The gradient behind an opaque interval, which a running sum from the front cannot give."""
+    ray = Intervals((2.0**-4,) * 64 + (32.0, 16.0, 8.0, 4.0), (2.0**-6,) * 64 + (1.0,) * 4)
+    values = [(k % 5 + 1) / 8 for k in range(len(ray.density))]
+    wanted = exact.composited(
+        ray,
+        [[v] for v in values],
+        [0.0],
+        colour_gradient=[1.0],
+        transmittance_gradient=0.0,
+        weights_gradient=[0.0] * len(values),
+    )
+    for precision in precisions:
+        if precision.dtype == torch.bfloat16:
+            continue
+        module = kernels if precision.compiled else reference
+        density, lengths = precision.tensor(ray.density).requires_grad_(), precision.tensor(ray.lengths)
+        rgb, offsets = precision.tensor([[v] * 3 for v in values]), torch.tensor([0, len(values)]).to(precision.device)
+        start = time.perf_counter()
+        colour, _, _ = module.composite(
+            density, rgb, lengths, offsets=offsets, background=precision.tensor([[0.0] * 3])
+        )
+        colour[0, 0].backward()
+        seconds = time.perf_counter() - start
+        assert density.grad is not None
+        with torch.no_grad():
+            subtracted = textbook.gradient_by_subtraction(density, lengths, rgb[:, 0], colour[0, 0])
+
+        def error(gradient: Tensor, tiny: float = precision.tiny) -> float:
+            return largest_error(gradient, wanted.density_gradient, tiny=tiny, scale=wanted.density_gradient_size)
+
+        bounds, reason = _bounds([ray], precision)
+        yield Row(
+            hard_cases=(4,),
+            case="gradient where hardly any light is left",
+            operation="composite",
+            precision=precision.name,
+            errors=Errors(largest_error(colour[0], [wanted.colour[0]] * 3, tiny=precision.tiny), error(density.grad)),
+            bounds=bounds,
+            reason=reason,
+            formula="colour less the running sum",
+            textbook=Errors(0.0, error(subtracted)),
+            seconds=seconds,
+        )
+
+
+# The depths, by what is hard about them: name of the group, cases, columns.
+_DEPTHS: tuple[tuple[str, tuple[int, ...], tuple[str, ...]], ...] = (
+    ("opacity and transmittance from 1e-12 to opaque", (2, 3), ("opacity", "transmittance")),
+    ("mean depth, of next to no light and of none", (5, 23), ("conditional",)),
+    ("spread of depth, of shells and fog", (23,), ("spread",)),
+    ("median and quantiles, not reached and inside intervals", (6,), ("median", "quantile:0.05", "quantile:0.95")),
+)
+
+
+def _depth_rows(precision: Precision) -> Iterator[Row]:
+    rays = [_single(ray) for ray in depth_rays()]
+    wanted = [exact.light_ends(ray, far=FAR) for ray in rays]
+    offsets = torch.tensor([0, *torch.tensor([len(ray.density) for ray in rays]).cumsum(0).tolist()])
+    density, starts, ends = (
+        precision.tensor([x for ray in rays for x in column(ray)])
+        for column in (lambda ray: ray.density, lambda ray: ray.starts, lambda ray: ray.ends)
+    )
+    offsets = offsets.to(precision.device)
+    module = kernels if precision.compiled else depth_reference
+    start = time.perf_counter()
+    seen = module.light_ends(density, starts, ends, offsets=offsets, shares=exact.SHARES)
+    seconds = time.perf_counter() - start
+    got = _columns(seen)
+    plain = textbook.depth(density, starts, ends, offsets=offsets)
+    plain = {**plain, "conditional": plain["mean"]}
+    for name, cases, columns in _DEPTHS:
+        allowed = _depth_bound(rays, wanted, columns, precision=precision)
+
+        def error(answers: dict[str, Tensor], columns: tuple[str, ...] = columns) -> float:
+            shown = [column for column in columns if column in answers]
+            return max(
+                largest_error(answers[column], [one[column] for one in wanted], tiny=precision.tiny) for column in shown
+            )
+
+        yield Row(
+            hard_cases=cases,
+            case=name,
+            operation="light_ends",
+            precision=precision.name,
+            errors=Errors(error(got)),
+            bounds=Errors(allowed),
+            reason="u (16 + (n + 2) (1 + tau)), times place / width of what is asked for; compiled 16 u",
+            formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
+            textbook=Errors(error(plain)),
+            seconds=seconds,
+        )
+
+
+def _depth_bound(
+    rays: list[Ray], wanted: list[dict[str, float]], columns: tuple[str, ...], *, precision: Precision
+) -> float:
+    """The largest bound over the rays: a spread is as much more sensitive as it is smaller than its distance."""
+    largest = 0.0
+    for ray, answer in zip(rays, wanted, strict=True):
+        lengths = tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True))
+        samples, depth = _lit([Intervals(tuple(ray.density), lengths)], precision)
+        own = 16.0 if precision.compiled else 16 + (samples + 2) * (1 + depth)
+        if "spread" in columns and answer["spread"] > 0 and not precision.compiled:
+            own *= 1 + answer["conditional"] / answer["spread"]
+        largest = max(largest, own)
+    return largest * precision.unit
+
+
+def _columns(seen: LightEnds) -> dict[str, Tensor]:
+    named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
+    named |= {"conditional": seen.mean, "median": seen.quantiles[:, 0]}
+    return named | {f"quantile:{share:g}": seen.quantiles[:, i] for i, share in enumerate(exact.SHARES) if i}
+
+
+def _single(ray: Ray) -> Ray:
+    """The ray with the numbers that float32 holds."""
+    columns = (torch.tensor(v, dtype=torch.float32).tolist() for v in (ray.density, ray.starts, ray.ends))
+    return Ray(ray.name, *columns)
+
+
+def _distortion_row(precision: Precision) -> Row:
+    """Light of a surface far away: all of it within 1e-3 at 0.98 of the way to infinity."""
+    count = 64
+    starts = [0.984375 + k * 2.0**-16 for k in range(count)]
+    ends = [start + 2.0**-16 for start in starts]
+    values = [(k % 7 + 1) / 256 for k in range(count)]
+    wanted, wanted_gradient = exact.distortion(values, starts, ends)
+    module = kernels if precision.compiled else reference
+    first, last, offsets = precision.tensor(starts), precision.tensor(ends), torch.tensor([0, count])
+    weights = precision.tensor(values).requires_grad_()
+    start = time.perf_counter()
+    answer = module.distortion(weights, first, last, offsets.to(precision.device))
+    answer.sum().backward()
+    seconds = time.perf_counter() - start
+    plain = precision.tensor(values).requires_grad_()
+    of_textbook = textbook.distortion(plain, first, last)
+    of_textbook.backward()
+
+    def errors(value: Tensor, gradient: Tensor | None) -> Errors:
+        return Errors(
+            largest_error(value.reshape(1), [wanted], tiny=precision.tiny),
+            largest_error(gradient, wanted_gradient, tiny=precision.tiny),
+        )
+
+    bound = precision.unit * (8 if precision.compiled else 3 * count)
+    return Row(
+        hard_cases=(),
+        case="distortion of a far, thin surface",
+        operation="distortion",
+        precision=precision.name,
+        errors=errors(answer, weights.grad),
+        bounds=Errors(bound, bound),
+        reason="3 n u: sums of n terms that are all positive; compiled 8 u: sums in float64",
+        formula="difference of running sums",
+        textbook=errors(of_textbook, plain.grad),
+        seconds=seconds,
+    )

@@ -1,0 +1,124 @@
+"""What a row of the selftest is, and how an error is measured."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+MET, NOT_MET, NOT_HERE = "met", "not met", "does not occur"
+
+
+@dataclass(frozen=True)
+class Precision:
+    """An arithmetic that an operation is tried in: plain torch on the device, or the compiled kernels of the CPU."""
+
+    name: str
+    dtype: torch.dtype
+    device: str
+    compiled: bool = False
+
+    @property
+    def unit(self) -> float:
+        """The largest relative error of one rounding."""
+        return torch.finfo(self.dtype).eps / 2
+
+    @property
+    def tiny(self) -> float:
+        """The smallest number with all its digits; below, errors are absolute."""
+        return float(torch.finfo(self.dtype).tiny)
+
+    @property
+    def deepest(self) -> float:
+        """The optical depth behind which no light is left that this precision could tell from none."""
+        return -math.log(self.tiny)
+
+    def tensor(self, values: Any) -> Tensor:
+        """Numbers in this precision on its device."""
+        return torch.tensor(values, dtype=torch.float64).to(self.device, self.dtype)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The largest relative error of a value, and that of a gradient where there is one."""
+
+    value: float
+    gradient: float | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One hard case in one precision.
+
+    Args:
+        hard_cases: numbers in the list of known hard cases; () for one that is not in it.
+        case: what is hard.
+        operation: which operation it is tried on.
+        precision: name of the arithmetic.
+        errors: of the program; None where the case does not occur in it.
+        bounds: what they may be.
+        reason: where the bounds come from, or why the case does not occur.
+        formula: what textbooks do; "" where there is none.
+        textbook: its errors on the same numbers.
+        seconds: one run of the operation, forward and backward.
+    """
+
+    hard_cases: tuple[int, ...]
+    case: str
+    operation: str
+    precision: str
+    errors: Errors | None
+    bounds: Errors | None
+    reason: str
+    formula: str = ""
+    textbook: Errors | None = None
+    seconds: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Whether the bounds are met; NaN meets none."""
+        if self.errors is None:
+            return NOT_HERE
+        return MET if self.holds(self.errors) else NOT_MET
+
+    def holds(self, errors: Errors) -> bool:
+        """Whether errors are within the bounds of this row."""
+        assert self.bounds is not None
+        pairs = ((errors.value, self.bounds.value), (errors.gradient, self.bounds.gradient))
+        return all(error <= bound for error, bound in pairs if error is not None and bound is not None)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers; what is not finite by name, as JSON knows no such numbers."""
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {name: plain(inner) for name, inner in value.items()}
+            return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+        return {**plain(asdict(self)), "verdict": self.verdict}
+
+
+def largest_error(values: Any, wanted: Sequence[Any], *, tiny: float, scale: Sequence[Any] | None = None) -> float:
+    """The largest |value - wanted| / max(|wanted|, tiny).
+
+    Args:
+        values: tensor or array.
+        wanted: the answers; NaN where undefined.
+        tiny: below, errors are relative to it.
+        scale: what errors are relative to, in place of |wanted|.
+
+    Returns:
+        0 for nothing at all; infinite where only one of the two is a number.
+    """
+    got = values.detach().to("cpu", torch.float64).numpy() if isinstance(values, Tensor) else np.asarray(values, float)
+    want = np.asarray(wanted, dtype=np.float64).reshape(got.shape)
+    if got.size == 0:
+        return 0.0
+    size = np.abs(want if scale is None else np.asarray(scale, dtype=np.float64).reshape(got.shape))
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = np.abs(got - want) / np.maximum(size, tiny)
+    error = np.where(np.isnan(got) & np.isnan(want), 0.0, np.where(got == want, 0.0, error))
+    return float(np.where(np.isnan(error), np.inf, error).max())

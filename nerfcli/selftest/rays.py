@@ -1,0 +1,146 @@
+"""Rays that are hard for rounding, as data: thin and opaque, empty and dense, short and very long.
+
+Densities of `Group`s and lengths of their intervals are numbers of bfloat16, so that the same rays go into every
+precision, and an error is one of the arithmetic alone.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+# The largest number of bfloat16, which float32 holds too.
+LARGEST = 3.3895313892515355e38
+
+
+@dataclass(frozen=True)
+class Ray:
+    """Densities, and the distances at which the intervals start and end."""
+
+    name: str
+    density: list[float]
+    starts: list[float]
+    ends: list[float]
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """Densities and lengths of the intervals of one ray."""
+
+    density: tuple[float, ...]
+    lengths: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rays that are hard for the same reason.
+
+    Args:
+        hard_cases: their numbers in the list of known hard cases; () for one that is not in it.
+        name: what is hard about them.
+        rays: the rays.
+    """
+
+    hard_cases: tuple[int, ...]
+    name: str
+    rays: tuple[Intervals, ...]
+
+
+def coarse(value: float) -> float:
+    """The nearest number of bfloat16."""
+    return torch.tensor(value, dtype=torch.float64).to(torch.bfloat16).item()
+
+
+def fog(optical_depth: float, samples: int) -> Intervals:
+    """Intervals of about one optical depth; neither densities nor lengths are all equal."""
+    density = tuple(coarse(optical_depth * 64 * (3 + k % 5) / 4) for k in range(samples))
+    return Intervals(density, tuple(2.0 ** -(6 + k % 3) for k in range(samples)))
+
+
+def groups() -> tuple[Group, ...]:
+    """The rays for weights, colours and their gradients."""
+    counts = (1, 2, 64, 1024, 4096)
+    return (
+        *(
+            Group((2, 3, 4), f"optical depth {x:g} per interval, 1 to 4096", tuple(fog(x, n) for n in counts))
+            for x in (1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6)
+        ),
+        Group((), "no intervals", (Intervals((), ()), Intervals((), ()))),
+        Group((), "zero weights: empty intervals", (Intervals((0.0,) * 5, (0.5,) * 5), Intervals((0.0,), (4.0,)))),
+        Group(
+            (),
+            "duplicate edges: intervals of length 0",
+            (
+                Intervals((1.0, 2.0, 4.0), (0.0, 0.5, 0.0)),
+                Intervals((LARGEST, 1.0, 0.0), (0.0, 0.25, 0.0)),
+                Intervals((1.0, 1.0), (0.0, 0.0)),
+            ),
+        ),
+        Group(
+            (),
+            "first interval opaque",
+            (Intervals((2.0**20, 1.0, 2.0), (1.0, 0.5, 0.5)), Intervals((2.0**100, 0.0, 2.0**100), (1.0, 1.0, 1.0))),
+        ),
+        Group(
+            (4, 23),
+            "thin fog, then an opaque interval",
+            (
+                Intervals((2.0**-30,) * 64 + (2.0**20,), (2.0**-6,) * 65),
+                Intervals((2.0**-20,) * 64 + (16.0, 2.0**20, 4.0), (2.0**-6,) * 64 + (1.0, 1.0, 1.0)),
+            ),
+        ),
+        Group(
+            (23,),
+            "last interval very long, up to 1e38",
+            (
+                Intervals((0.5, 2.0**-40), (1.0, 2.0**40)),
+                Intervals((0.5, 0.0), (1.0, 2.0**126)),
+                Intervals((0.5, 1.0), (1.0, 2.0**126)),
+                Intervals((0.5, 2.0**-126), (1.0, 2.0**126)),
+            ),
+        ),
+        Group(
+            (1, 3),
+            "densities at overflow, product beyond float32",
+            (
+                Intervals((LARGEST,), (2.0**-6,)),
+                Intervals((1.0, LARGEST, 1.0), (0.5, 4.0, 0.5)),
+                Intervals((LARGEST, LARGEST, LARGEST), (4.0, 4.0, 4.0)),
+                Intervals((LARGEST, LARGEST), (0.0, 0.0)),
+            ),
+        ),
+        Group(
+            (),
+            "two surfaces, shells and slabs",
+            (
+                Intervals((44.5, 0.0, 2.0**14), (2.0**-6, 4.0, 2.0**-6)),
+                Intervals((0.0, 2.0**13, 0.0), (2.0, 2.0**-13, 4.0)),
+                Intervals((0.5, 1.0, 2.0), (1.0, 1.0, 1.0)),
+            ),
+        ),
+    )
+
+
+def even(name: str, density: list[float], near: float, length: float) -> Ray:
+    """Intervals of one length, side by side."""
+    edges = [near + length * i for i in range(len(density) + 1)]
+    return Ray(name, density, edges[:-1], edges[1:])
+
+
+def depth_rays() -> list[Ray]:
+    """The rays for depths."""
+    ln2 = math.log(2)
+    optical_depths = (1e-12, 1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6)
+    return [
+        even("three slabs (worked example)", [ln2, ln2, 2 * ln2], 0.0, 1.0),
+        even("empty, cut in 4", [0.0] * 4, 1.0, 0.5),
+        Ray("empty, not cut", [], [], []),
+        *(even(f"one interval of optical depth {x:g}", [x / 0.25], 2.0, 0.25) for x in optical_depths),
+        *(even(f"fog of optical depth {x:g} in 256", [x / 4] * 256, 1.0, 1 / 64) for x in optical_depths),
+        *(even(f"thin shell 1e-4 at 3, density {x:g}", [x], 3.0, 1e-4) for x in (1.0, 1e4, 1e8)),
+        Ray("two surfaces at 1 and 5, half each", [ln2 * 128, 1e4], [1.0, 5.0], [1.0078125, 5.0078125]),
+        Ray("two surfaces in fog of 1e-9", [40.0, 1e-9, 1e5], [1.0, 1.015625, 5.0], [1.015625, 5.0, 5.25]),
+        even("opaque first sample", [1e6, 1.0, 1.0], 0.5, 0.25),
+        even("ever denser, 1e-9 to 1e5", [10.0**e for e in range(-9, 6)], 0.25, 0.125),
+        even("far: fog of 1 from 200 to 300", [0.01] * 100, 200.0, 1.0),
+    ]

@@ -1,0 +1,226 @@
+"""Points and steps: contraction from its centre to infinity, world coordinates of 1e6, rays along axes, empty space."""
+
+import math
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, from_parts
+from nerfcli.field.contraction import uncontract
+from nerfcli.kernels import reference
+from nerfcli.render.rays import frame_rays
+from nerfcli.selftest import textbook
+from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
+
+GIVEN = (1.0, 0.5, 0.25)
+# Unit directions with coordinates that every precision holds, up to their length, which need not be 1.
+DIRECTIONS = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.5, -0.75, 1.0), (-1.0, 0.25, 2.0**-10))
+WORLD = 1e6
+
+
+def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
+    """Rows of everything about points and steps."""
+    for precision in precisions:
+        if not precision.compiled:
+            yield from _contraction_rows(precision)
+        if precision.dtype != torch.bfloat16:
+            yield _axis_row(precision)
+            yield _empty_row(precision)
+    yield from _world_rows()
+
+
+def _contracted(point: tuple[float, ...]) -> tuple[list[float], list[float], list[float]]:
+    """The contracted point, the gradient of its product with GIVEN, and the size of that gradient's terms."""
+    norm = math.hypot(*point)
+    if norm <= 1.0:
+        return list(point), list(GIVEN), [1.0] * 3
+    along = math.fsum(x / norm * g for x, g in zip(point, GIVEN, strict=True))
+    size = math.fsum(abs(x / norm * g) for x, g in zip(point, GIVEN, strict=True))
+    first, bend = (2 - 1 / norm) / norm, (-2 + 2 / norm) / norm  # d contracted = first dx + bend u (u . dx)
+    gradient = [first * g + bend * along * x / norm for x, g in zip(point, GIVEN, strict=True)]
+    sizes = [first * abs(g) + abs(bend) * size for g in GIVEN]
+    return [(2 - 1 / norm) * (x / norm) for x in point], gradient, sizes
+
+
+def _contraction_rows(precision: Precision) -> Iterator[Row]:
+    zero = (0.0, 0.0, 0.0)
+    groups = (
+        ((11,), "contraction at its centre and its border", (0.0, 2.0**-100, 2.0**-10, 0.5, 1.0, 1.25, 2.0)),
+        ((12,), "contraction far away, radius 1e3 to 1e37", (2.0**10, 2.0**33, 2.0**60, 2.0**66, 2.0**122)),
+    )
+    for cases, name, radii in groups:
+        points = [tuple(r * x for x in d) for r in radii for d in DIRECTIONS] + ([zero] if 0.0 in radii else [])
+        wanted = [_contracted(point) for point in points]
+
+        def errors(operation, points=points, wanted=wanted) -> tuple[Errors, float]:  # type: ignore[no-untyped-def]
+            given = precision.tensor(points).requires_grad_()
+            start = time.perf_counter()
+            answer = operation(given)
+            (answer * precision.tensor(GIVEN)).sum().backward()
+            seconds = time.perf_counter() - start
+            value = largest_error(answer, [w[0] for w in wanted], tiny=precision.tiny)
+            sizes = [w[2] for w in wanted]
+            return Errors(
+                value, largest_error(given.grad, [w[1] for w in wanted], tiny=precision.tiny, scale=sizes)
+            ), seconds
+
+        ours, seconds = errors(kernels.contract)
+        yield Row(
+            hard_cases=cases,
+            case=name,
+            operation="contract",
+            precision=precision.name,
+            errors=ours,
+            bounds=Errors(8 * precision.unit, 16 * precision.unit),
+            reason="8 roundings u; of the gradient 16, relative to its terms",
+            formula="where(|x| <= 1, x, (2 - 1 / |x|) x / |x|)",
+            textbook=errors(textbook.contract)[0],
+            seconds=seconds,
+        )
+    if precision.dtype == torch.bfloat16:
+        return
+    points = [tuple(r * x for x in DIRECTIONS[0]) for r in (0.5, 2.0, 30.0, 300.0)]
+    start = time.perf_counter()
+    back = uncontract(kernels.contract(precision.tensor(points)))
+    seconds = time.perf_counter() - start
+    beyond = uncontract(kernels.contract(precision.tensor([[2.0**30, 0.0, 0.0]])))
+    yield Row(
+        hard_cases=(12,),
+        case="contraction and back, to where rays end (300)",
+        operation="uncontract",
+        precision=precision.name,
+        errors=Errors(largest_error(back, points, tiny=precision.tiny)),
+        bounds=Errors(8 * 300 * precision.unit),
+        reason="8 u times the radius: next to 2, numbers stand u apart; rays end at 300, before it matters",
+        formula="the same at a radius of 1e9",
+        textbook=Errors(largest_error(beyond, [[2.0**30, 0.0, 0.0]], tiny=precision.tiny)),
+        seconds=seconds,
+    )
+
+
+def _axis_row(precision: Precision) -> Row:
+    """Rays along axes through a full cube of side 2, some in the plane of its side and of its cells' borders."""
+    origins = [[-2.0, 0.25, 0.125], [0.25, 2.0, 0.0], [0.5, -0.5, -3.0], [-2.0, -1.0, 1.0], [0.0, 0.0, 0.0]]
+    directions = [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
+    wanted = [2.0, 2.0, 2.0, 2.0, 1.0]  # the last starts in the middle
+    start = time.perf_counter()
+    starts, ends, offsets = _seen(origins, directions, precision=precision, full=True)
+    seconds = time.perf_counter() - start
+    chords = reference.sum_along_rays(ends - starts, offsets)
+    near = [(side - o) / d if d else (side - o) / 0.0 if side != o else math.nan for side, o, d in ((-1.0, -1.0, 0.0),)]
+    return Row(
+        hard_cases=(18,),
+        case="rays along axes, and in the plane of a side",
+        operation="visible_samples",
+        precision=precision.name,
+        errors=Errors(largest_error(chords, wanted, tiny=precision.tiny)),
+        bounds=Errors(0.0),
+        reason="steps of 2^-7 are kept or not by their middles; nothing is divided by a direction",
+        formula="slabs: (side - origin) / direction",
+        textbook=Errors(largest_error(np.array(near), [0.0], tiny=precision.tiny)),
+        seconds=seconds,
+    )
+
+
+def _empty_row(precision: Precision) -> Row:
+    """No cell is occupied: no samples, the background's colour, all light passes, no depth."""
+    origins, directions = [[-2.0, 0.25, 0.125]] * 3, [[1.0, 0.0, 0.0]] * 3
+    begin = time.perf_counter()
+    starts, ends, offsets = _seen(origins, directions, precision=precision, full=False)
+    module = kernels if precision.compiled else reference
+    density, background = torch.zeros_like(starts), precision.tensor([[0.25, 0.5, 1.0]] * 3)
+    rgb = starts.new_zeros(len(starts), 3)
+    colour, passing, _ = module.composite(density, rgb, ends - starts, offsets=offsets, background=background)
+    light = kernels.light_ends(density, starts, ends, offsets=offsets, shares=(0.5,))
+    seconds = time.perf_counter() - begin
+    got = torch.cat([colour.flatten(), passing, light.opacity, light.mean, light.quantiles.flatten()])
+    wanted = [0.25, 0.5, 1.0] * 3 + [1.0] * 3 + [0.0] * 3 + [math.nan] * 6
+    return Row(
+        hard_cases=(20,),
+        case="empty occupancy: every ray without samples",
+        operation="visible_samples, composite, light_ends",
+        precision=precision.name,
+        errors=Errors(largest_error(got, wanted, tiny=precision.tiny)),
+        bounds=Errors(0.0),
+        reason="exact: background, T = 1, opacity 0, depth undefined",
+        seconds=seconds,
+    )
+
+
+def _seen(
+    origins: list[list[float]], directions: list[list[float]], *, precision: Precision, full: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What is kept of rays cut into steps of 2^-7, in a bounded cube full of cells or without any."""
+    side, levels = 16, 8
+    make = torch.ones if full else torch.zeros
+    module = kernels if precision.compiled else reference
+    starts, ends, _, _, _, offsets = module.visible_samples(
+        precision.tensor(origins),
+        precision.tensor(directions),
+        precision.tensor([k * 2.0**-7 for k in range(5 * 2**7)]),
+        jitter=precision.tensor([0.0] * len(origins)),
+        occupied=make(side, side, side, dtype=torch.bool, device=precision.device),
+        unbounded=False,
+        table=precision.tensor([[[0.0] * 4] * 16] * levels),
+        resolutions=(2,) * levels,
+        weights=tuple(precision.tensor([[0.0] * n] * m) for m, n in ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))),
+        deepest=1e9,
+    )
+    return starts, ends, offsets
+
+
+def _world_rows() -> Iterator[Row]:
+    """A scene of size 1 at 1e6 from the world's origin: the step of rays, 1.7e-3, in its training frame and without."""
+    centre = np.array([WORLD, -WORLD, WORLD])
+    camera = Camera.pinhole(8, 6, 8.0)
+    offset = np.array([0.25, 0.125, -0.5])
+    frame = Frame("a", camera, from_parts(np.eye(3), centre + offset))
+    start = time.perf_counter()
+    rays = frame_rays(frame, Similarity(1.0, np.eye(3), -centre), torch.device("cpu"))
+    distances = torch.arange(1, 1025) * (math.sqrt(3) / 1024)
+    points = rays.origin + rays.directions[0] * distances[:, None]
+    seconds = time.perf_counter() - start
+    bearing = rays.directions[0].double()
+    steps = (torch.from_numpy(offset) + bearing * distances.double()[:, None]).diff(dim=0).norm(dim=1)
+    world = torch.tensor(centre + offset, dtype=torch.float32) + rays.directions[0] * distances[:, None]
+    unit = torch.finfo(torch.float32).eps / 2
+
+    def error(path: Tensor) -> float:
+        return largest_error(path.double().diff(dim=0).norm(dim=1), steps.tolist(), tiny=1e-30)
+
+    yield Row(
+        hard_cases=(17,),
+        case="world coordinates of 1e6: steps of rays",
+        operation="frame_rays",
+        precision="float32",
+        errors=Errors(error(points)),
+        bounds=Errors(8 * unit * 2.5 / float(steps.min())),
+        reason="8 u times place (2.5) / step: the similarity to the training frame is applied in float64",
+        formula="float32 in world coordinates",
+        textbook=Errors(error(world)),
+        seconds=seconds,
+    )
+    similarity = Similarity(1e-3, np.eye(3), -centre * 1e-3)
+    there = centre + np.random.default_rng(0).standard_normal((64, 3))
+    start = time.perf_counter()
+    back = similarity.inverse().apply(similarity.apply(there))
+    seconds = time.perf_counter() - start
+    lost = there.astype(np.float32).astype(np.float64)
+    yield Row(
+        hard_cases=(17,),
+        case="world coordinates of 1e6: to the frame and back",
+        operation="Similarity",
+        precision="float64",
+        errors=Errors(float(np.abs(back - there).max())),
+        bounds=Errors(8 * 2.0**-53 * WORLD * math.sqrt(3)),
+        reason="8 u of the coordinate, relative to the scene's size of 1",
+        formula="float32 in world coordinates",
+        textbook=Errors(float(np.abs(lost - there).max())),
+        seconds=seconds,
+    )

@@ -1,0 +1,91 @@
+"""The formulas as textbooks and most programs write them, to show what each remedy of the kernels buys.
+
+Nothing here is used for rendering. Every function takes what its counterpart in `nerfcli.kernels` takes.
+"""
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+# Of the published codes: added to transmittances, and under the sum of weights.
+EPS = 1e-10
+
+
+def composite(
+    density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """alpha = 1 - exp(-density length), T = cumulative product of 1 - alpha + 1e-10, background by 1 - sum of weights.
+
+    Source: Mildenhall et al. 2020, its published code, raw2outputs.
+    """
+    weights = _weights_of_all(density, lengths, offsets)
+    opacity = torch.stack([part.sum() for (part,) in _split(offsets, weights)])
+    colour = torch.stack([(w[:, None] * c).sum(0) for w, c in _split(offsets, weights, rgb)])
+    return colour + (1.0 - opacity)[:, None] * background, 1.0 - opacity, weights
+
+
+def _weights(density: Tensor, lengths: Tensor) -> Tensor:
+    alpha = 1.0 - torch.exp(-density * lengths)
+    passing = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1.0 - alpha + EPS]), dim=0)
+    return alpha * passing[:-1]
+
+
+def depth(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor) -> dict[str, Tensor]:
+    """Means and quantiles at midpoints, the sum of weights clamped: sum w m / max(sum w, 1e-10)."""
+    weights = _weights_of_all(density, ends - starts, offsets)
+    answers: dict[str, list[Tensor]] = {name: [] for name in ("opacity", "transmittance", "mean", "spread", "median")}
+    for w, m in _split(offsets, weights, (starts + ends) / 2):
+        total = w.sum()
+        mean = (w * m).sum() / total.clamp_min(EPS)
+        answers["opacity"].append(total)
+        answers["transmittance"].append(1.0 - total)
+        answers["mean"].append(mean)
+        answers["spread"].append(((w * m * m).sum() / total.clamp_min(EPS) - mean * mean).sqrt())
+        crossing = (w.cumsum(0) < 0.5).sum().clamp_max(max(0, len(w) - 1))
+        answers["median"].append(m[crossing] if len(w) else torch.zeros_like(mean))
+    return {name: torch.stack(values) for name, values in answers.items()}
+
+
+def gradient_by_subtraction(density: Tensor, lengths: Tensor, values: Tensor, colour: Tensor) -> Tensor:
+    """d colour / d density of one ray: what lies behind a sample taken as the colour less the running sum."""
+    weights = _weights(density, lengths)
+    after = torch.exp(-(density * lengths).cumsum(0))
+    return lengths * (after * values - (colour - (weights * values).cumsum(0)))
+
+
+def distortion(weights: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
+    """Of one ray: 2 sum w_i (m_i W_i - M_i) + sum w_i^2 length_i / 3, a difference of running sums."""
+    middles = (starts + ends) / 2
+    before, moment = (x.cumsum(0) - x for x in (weights, weights * middles))
+    return (2 * weights * (middles * before - moment) + weights.square() * (ends - starts) / 3).sum()
+
+
+def contract(points: Tensor) -> Tensor:
+    """x inside the unit ball and (2 - 1 / |x|) x / |x| outside, chosen by where."""
+    norm = points.square().sum(-1, keepdim=True).sqrt()
+    return torch.where(norm <= 1.0, points, (2.0 - 1.0 / norm) * points / norm)
+
+
+def inverse_cdf(edges: Tensor, weights: Tensor, *, uniform: Tensor) -> Tensor:
+    """Weights padded by 1e-5, the bins searched in their cumulative sum, the last edge beyond it.
+
+    Source: Mildenhall et al. 2020, its published code, sample_pdf.
+    """
+    pdf = (weights + 1e-5) / (weights + 1e-5).sum(-1, keepdim=True)
+    cdf = torch.cat([torch.zeros_like(pdf[:, :1]), pdf.cumsum(-1)], dim=-1)
+    right = torch.searchsorted(cdf, uniform.contiguous(), right=True)
+    low, high = (right - 1).clamp_min(0), right.clamp_max(cdf.shape[-1] - 1)
+    below, above = cdf.gather(-1, low), cdf.gather(-1, high)
+    share = (uniform - below) / torch.where(above - below < 1e-5, 1.0, above - below)
+    left = edges.gather(-1, low)
+    return left + share * (edges.gather(-1, high) - left)
+
+
+def _split(offsets: Tensor, *packed: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    counts = offsets.diff().tolist()
+    return zip(*(values.split(counts) for values in packed), strict=True)
+
+
+def _weights_of_all(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
+    return torch.cat([_weights(*of_ray) for of_ray in _split(offsets, density, lengths)])
