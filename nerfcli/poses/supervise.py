@@ -52,7 +52,9 @@ def run_worker(
     """
     log = job_path.with_name("worker.log")
     package_root = str(Path(nerfcli.__file__).parent.parent)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([package_root, os.environ.get("PYTHONPATH", "")])}
+    # An empty entry would mean the current folder, whose files must not pass for libraries.
+    places = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
     if threads > 0:
         environment["OMP_NUM_THREADS"] = str(threads)
     stage = "starting"
