@@ -180,10 +180,12 @@ def given_intrinsics(file: Path | None, photos: Path, *, use: str) -> "GivenIntr
     Raises:
         UserError: see `read_calibration`.
     """
+    if file is None:
+        return None
     from nerfcli.convert.intrinsics import read_calibration
     from nerfcli.poses.cameras import GivenIntrinsics
 
-    return None if file is None else GivenIntrinsics(read_calibration(file, images=photos), use)
+    return GivenIntrinsics(read_calibration(file, images=photos), use)
 
 
 def frames_there(source: Path, scene: Path) -> Path:

@@ -123,10 +123,11 @@ def _render_missing(
     notify: Callable[[str], None],
     workers: Workers,
 ) -> None:
-    missing = [index for index in part if not unfinished.has(order.names[index])]
-    if len(missing) < len(part):
-        notify(f"{len(part) - len(missing)} of {len(part)} frames are there already, in {unfinished.folder}")
-        cameras = [order.frames[index].camera for index in part if index not in set(missing)]
+    held = {index for index in part if unfinished.has(order.names[index])}
+    missing = [index for index in part if index not in held]
+    if held:
+        notify(f"{len(held)} of {len(part)} frames are there already, in {unfinished.folder}")
+        cameras = [order.frames[index].camera for index in held]
         on_rays(sum(camera.width * camera.height for camera in cameras))
     if workers.jobs > 1 and len(missing) > 1:
         render_in_processes(

@@ -120,7 +120,8 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Climb:
     ladder.attempt("default thresholds", job, Start())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
     _other_starts(ladder, job)
-    rest = [pair for pair in all_pairs(len(job.files)) if pair not in set(job.pairs)]
+    compared = set(job.pairs)
+    rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
     if rest and len(rest) <= _MOST_PAIRS and ladder.share(featured) < _GOOD_SHARE:
         job = replace(job, pairs=(*job.pairs, *rest))
         match(job, rest, report)

@@ -50,7 +50,7 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
         UserError: no such folder, a file instead of a folder, no photos in it, or fewer than `MIN_PHOTOS` readable.
     """
     if not folder.exists():
-        raise UserError(f"there is no folder {folder}", "give the folder that holds the photos")
+        raise UserError(f"there is no folder {folder}", "give the folder that holds the photos, or a video file")
     if not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder", "put the photos into a folder and give that folder")
     paths = list_images(folder)
