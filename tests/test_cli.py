@@ -660,8 +660,10 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 
 
 def started(*arguments: str | Path) -> subprocess.Popen[str]:
-    """The command as the shell starts it."""
-    command = [sys.executable, "-c", "from nerfcli.cli import main; main()", *map(str, arguments)]
+    """The command as a terminal starts it; a suite that runs in the background hands on that Ctrl-C is ignored."""
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    program += "from nerfcli.cli import main; main()"
+    command = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
