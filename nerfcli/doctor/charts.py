@@ -1,11 +1,11 @@
 """Small drawings for the page, without any library: bars as SVG, the matrix of matches as PNG."""
 
-import base64
 from collections.abc import Sequence
 from html import escape
 
-import cv2
 import numpy as np
+
+from nerfcli.pages.pictures import data_uri, png_bytes
 
 _WIDTH, _HEIGHT, _LEFT = 1040, 150, 44
 # The scale of a chart is at least this wide, so that noise does not look like a finding.
@@ -43,12 +43,11 @@ def match_matrix(count: int, linked: Sequence[tuple[int, int, int]]) -> str:
     for i, j, matches in linked:
         strength[i, j] = strength[j, i] = min(1.0, np.log2(matches / 16) / 5)
     np.fill_diagonal(strength, 0.12)
-    paper, ink = np.array([243, 240, 237.0]), np.array([122, 74, 25.0])  # blue, green, red
+    paper, ink = np.array([237, 240, 243.0]), np.array([25, 74, 122.0])
     picture = np.rint(paper + strength[..., None] * (ink - paper)).astype(np.uint8)
     cell = max(1, 520 // count)
-    encoded, data = cv2.imencode(".png", np.kron(picture, np.ones((cell, cell, 1), np.uint8)))
-    assert encoded
-    return f'<img class="matrix" alt="matches" src="data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}">'
+    data = png_bytes(np.kron(picture, np.ones((cell, cell, 1), np.uint8)))
+    return f'<img class="matrix" alt="matches" src="{data_uri(data, "png")}">'
 
 
 def _tick(value: float) -> str:

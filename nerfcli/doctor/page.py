@@ -1,7 +1,5 @@
 """The diagnosis as one HTML page that needs nothing else: findings, thumbnails, charts, and which photos match."""
 
-import base64
-import hashlib
 import re
 from html import escape
 from pathlib import Path
@@ -10,19 +8,18 @@ from string import Template
 import cv2
 import numpy as np
 
-from nerfcli.atomic import atomic_path
 from nerfcli.doctor.charts import bars, match_matrix
 from nerfcli.doctor.examination import Diagnosis
 from nerfcli.doctor.findings import BAD, GOOD, LOOK, VERDICTS, Finding, several, worst
 from nerfcli.doctor.photos import PhotoFacts
 from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
-from nerfcli.errors import UserError
+from nerfcli.pages import page
+from nerfcli.pages.pictures import data_uri, jpeg_bytes, picture_rule
 
 # Thumbnails of large captures are smaller, so that a page of a thousand photos has about 5 MB.
 _SMALL_THUMBNAILS_FROM, _SMALL_THUMBNAIL_PX = 200, 120
 # Photos shown beside a finding; the others are named only.
 _SHOWN_PER_FINDING = 12
-_MARK = '<meta name="nerfcli-doctor" content="{}">'
 _WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "mend this first"}
 
 
@@ -32,8 +29,7 @@ def write_page(diagnosis: Diagnosis, path: Path) -> None:
     Raises:
         UserError: it cannot be written.
     """
-    with atomic_path(path) as partial:
-        partial.write_text(page_html(diagnosis), encoding="utf-8")
+    page.write_page(page_html(diagnosis), path)
 
 
 def refuse_foreign(path: Path, capture: Path) -> None:
@@ -42,15 +38,7 @@ def refuse_foreign(path: Path, capture: Path) -> None:
     Raises:
         UserError: something else stands there.
     """
-    if not path.exists():
-        return
-    if path.is_file():
-        with path.open("rb") as file:
-            if _MARK.format(_identity(capture)).encode() in file.read(4096):
-                return
-    raise UserError(
-        f"{path} exists and is no page of this capture", "add --overwrite to replace it, or choose another file with -o"
-    )
+    page.refuse_foreign(path, _mark(capture), about="capture")
 
 
 def page_html(diagnosis: Diagnosis) -> str:
@@ -59,15 +47,13 @@ def page_html(diagnosis: Diagnosis) -> str:
     number = {photo.name: index for index, photo in enumerate(photos)}
     order = sorted(diagnosis.findings, key=lambda finding: -VERDICTS.index(finding.verdict))
     counts = {which: sum(finding.verdict == which for finding in order) for which in VERDICTS}
-    return _PAGE.substitute(
-        mark=_MARK.format(_identity(diagnosis.subject.path)),
+    body = _BODY.substitute(
         title=escape(_title(diagnosis.subject.path)),
         kind=diagnosis.subject.kind,
         count=several(len(photos), "photo"),
         verdict=verdict,
         words=_WORDS[verdict],
         counts=", ".join(f"{counts[which]} {which}" for which in (BAD, LOOK, GOOD) if counts[which]),
-        thumbnails="\n".join(_thumbnail_rule(index, photo, len(photos)) for index, photo in enumerate(photos)),
         findings="\n".join(_finding_html(finding, number) for finding in order),
         not_checked="".join(
             f"<li><b>{escape(check)}</b>: {escape(reason)}</li>" for check, reason in diagnosis.not_checked
@@ -76,11 +62,17 @@ def page_html(diagnosis: Diagnosis) -> str:
         charts=_charts_html(diagnosis),
         grid="\n".join(_photo_html(index, diagnosis) for index in range(len(photos))),
     )
+    thumbnails = "\n".join(_thumbnail_rule(index, photo, len(photos)) for index, photo in enumerate(photos))
+    return page.page_html(
+        title=_title(diagnosis.subject.path),
+        mark=_mark(diagnosis.subject.path),
+        style=f"{_STYLE}{thumbnails}\n",
+        body=body,
+    )
 
 
-def _identity(capture: Path) -> str:
-    """Tells captures apart without telling where they are."""
-    return hashlib.sha256(str(capture.resolve()).encode()).hexdigest()[:16]
+def _mark(capture: Path) -> page.Mark:
+    return page.Mark("doctor", capture)
 
 
 def _title(capture: Path) -> str:
@@ -94,11 +86,8 @@ def _thumbnail_rule(index: int, photo: PhotoFacts, count: int) -> str:
     if count > _SMALL_THUMBNAILS_FROM:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None
-        scale = _SMALL_THUMBNAIL_PX / max(picture.shape[:2])
-        size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
-        smaller = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if scale < 1 else picture
-        data = cv2.imencode(".jpg", smaller, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()
-    return f".p{index}{{background-image:url(data:image/jpeg;base64,{base64.b64encode(data).decode()})}}"
+        data = jpeg_bytes(picture[..., ::-1], longest_px=_SMALL_THUMBNAIL_PX, quality=70)
+    return picture_rule(f"p{index}", data_uri(data, "jpeg"))
 
 
 def _finding_html(finding: Finding, number: dict[str, int]) -> str:
@@ -173,25 +162,7 @@ def _charts_html(diagnosis: Diagnosis) -> str:
     )
 
 
-_PAGE = Template("""<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8">
-$mark
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title: nerfcli doctor</title>
-<style>
-:root{--bg:#f6f7f9;--card:#fff;--ink:#1b2026;--soft:#5b6672;--line:#e2e6eb;--good:#2c8a57;--look:#b7791f;--bad:#c0392b;
---tint-look:#fdf6e7;--tint-bad:#fdeeec;--bar:#7d93ab}
-@media (prefers-color-scheme:dark){:root{--bg:#14171b;--card:#1d2126;--ink:#e7eaee;--soft:#98a3af;--line:#2e343b;
---good:#4fbf85;--look:#e0a94a;--bad:#ef6f61;--tint-look:#29241a;--tint-bad:#2d1f1e;--bar:#7c93ad}}
-*{box-sizing:border-box}
-body{margin:0;background:var(--bg);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
-main{max-width:1120px;margin:0 auto;padding:32px 20px 64px}
-h1{font-size:30px;margin:0;line-height:1.2;overflow-wrap:anywhere}
-h2{font-size:19px;margin:40px 0 12px}h3{font-size:15px;margin:0}
-.top{display:flex;gap:20px;align-items:center;justify-content:space-between;flex-wrap:wrap;margin-bottom:24px}
-.top p{margin:4px 0 0;color:var(--soft)}
-.pill{color:#fff;border-radius:999px;padding:8px 18px;font-weight:600;white-space:nowrap}
-.pill.good{background:var(--good)}.pill.look{background:var(--look)}.pill.bad{background:var(--bad)}
+_STYLE = """\
 article{background:var(--card);border:1px solid var(--line);border-left:4px solid var(--good);border-radius:8px;
 padding:12px 16px;margin:8px 0}
 article.look{border-left-color:var(--look);background:var(--tint-look)}
@@ -208,10 +179,7 @@ figure{margin:0;width:132px}.frame{height:100px;background:var(--line);border-ra
 .none{background:repeating-linear-gradient(45deg,var(--line) 0 8px,transparent 8px 16px)}
 figcaption{font-size:12px;line-height:1.35;margin-top:4px;color:var(--soft);overflow-wrap:anywhere}
 figcaption b{color:var(--ink);font-weight:600;display:block}
-.charts{display:grid;gap:12px}
-.chart{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:14px 16px}
-.chart p{margin:2px 0 10px;color:var(--soft);font-size:13px}.chart svg{display:block;width:100%;height:auto}
-.chart text{fill:var(--soft);font-size:11px}.matrix{width:min(100%,520px);image-rendering:pixelated;border-radius:4px}
+.matrix{width:min(100%,520px);image-rendering:pixelated;border-radius:4px}
 .grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(140px,1fr));gap:14px}
 .photo{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:8px}
 .photo figure{width:100%}.photo.look{border-color:var(--look)}.photo.bad{border-color:var(--bad)}
@@ -219,11 +187,11 @@ figcaption b{color:var(--ink);font-weight:600;display:block}
 .badge{display:inline-block;font-size:11px;border-radius:4px;padding:0 6px;margin-top:4px;color:#fff;
 background:var(--look)}
 .badge.bad{background:var(--bad)}
-footer{margin-top:40px;color:var(--soft);font-size:13px}
 @media (max-width:640px){.advice,.threshold,.row,details{margin-left:0}article header{grid-template-columns:12px 1fr}
 article header p{grid-column:1/-1}}
-$thumbnails
-</style></head><body><main>
+"""
+
+_BODY = Template("""\
 <div class="top"><div><h1>$title</h1><p>nerfcli doctor: $kind, $count; checks: $counts</p></div>
 <span class="pill $verdict">$words</span></div>
 <h2>Findings</h2>
@@ -235,6 +203,4 @@ $findings
 <div class="grid">$grid</div>
 <footer>Photos were judged at 1600 px and matched at 800 px. Blur that vanishes at that size, movement along the line of
 sight, and things that move towards or away from the camera cannot be seen this way; repeated patterns may look like
-matches.</footer>
-</main></body></html>
-""")
+matches.</footer>""")

@@ -1,0 +1,119 @@
+"""The page around what a command tells: head, common style, whose page it is; and how it is written."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+
+# An earlier page of the same kind is known by what stands this near to its beginning.
+_HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Whose page it is, without telling where that is.
+
+    Args:
+        kind: the command that wrote it.
+        source: the folder that it is about.
+    """
+
+    kind: str
+    source: Path
+
+    def html(self) -> str:
+        """What stands in the page's head."""
+        identity = hashlib.sha256(str(self.source.resolve()).encode()).hexdigest()[:16]
+        return f'<meta name="nerfcli-{self.kind}" content="{identity}">'
+
+
+def page_html(*, title: str, mark: Mark, style: str, body: str, script: str = "") -> str:
+    """A whole page that loads nothing; a browser that knows content security policies would refuse to.
+
+    Args:
+        title: plain text.
+        mark: whose page it is.
+        style: CSS that follows `page.css`.
+        body: HTML, whatever comes from outside escaped.
+        script: JavaScript that runs when the body is there; for data see `data_element`.
+    """
+    return _PAGE.substitute(
+        mark=mark.html(),
+        title=escape(title),
+        kind=mark.kind,
+        policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+        + ("; script-src 'unsafe-inline'" if script else ""),
+        style=asset("page.css") + style,
+        body=body,
+        script=f"<script>{script}</script>\n" if script else "",
+    )
+
+
+def data_element(name: str, content: Any) -> str:
+    """Data for the page's script, which finds it with JSON.parse(document.getElementById(name).textContent).
+
+    Raises:
+        ValueError: NaN or infinity, for which JSON has no word.
+    """
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    # Inside a script element nothing else than these letters can end it or begin another.
+    safe = text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    return f'<script type="application/json" id="{escape(name)}">{safe}</script>'
+
+
+@cache
+def asset(name: str) -> str:
+    """The text of a style sheet or script that stands beside this file."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+
+
+def write_page(text: str, path: Path) -> None:
+    """Write a page, atomically.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    with atomic_path(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def refuse_foreign(path: Path, mark: Mark, *, about: str) -> None:
+    """Raise unless a page may be written at a path: nothing stands there, or an earlier page with the same mark.
+
+    Args:
+        about: what such a page is of, for the message: "capture".
+
+    Raises:
+        UserError: something else stands there.
+    """
+    if not path.exists():
+        return
+    if path.is_file():
+        with path.open("rb") as file:
+            if mark.html().encode() in file.read(_HEAD_BYTES):
+                return
+    raise UserError(
+        f"{path} exists and is no page of this {about}", "add --overwrite to replace it, or choose another file with -o"
+    )
+
+
+_PAGE = Template("""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+$mark
+<meta http-equiv="Content-Security-Policy" content="$policy">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>$title: nerfcli $kind</title>
+<style>
+$style</style></head><body><main>
+$body
+</main>
+$script</body></html>
+""")
