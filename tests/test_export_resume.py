@@ -17,7 +17,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import OUT_OF_MEMORY, UserError
-from nerfcli.export.frames import Workers, export_frames, export_part
+from nerfcli.export.frames import RAYS_PER_PROCESS, Workers, automatic_workers, export_frames, export_part
 from nerfcli.export.order import Order
 from nerfcli.export.presentation import playing_order
 from nerfcli.export.settings import ExportSettings, VideoSettings
@@ -156,6 +156,21 @@ def test_parts_are_put_together_without_rendering(model, tmp_path, in_one_go):
     export(model, order(), folder, on_rays=done.append)
     assert done == [4 * PIXELS]
     assert contents(folder) == in_one_go
+
+
+@pytest.mark.parametrize(
+    ("rays", "device", "threads", "jobs"),
+    [
+        (0, "cpu", 2, 1),
+        (2 * RAYS_PER_PROCESS - 1, "cpu", 8, 1),
+        (2 * RAYS_PER_PROCESS, "cpu", 8, 2),
+        (100 * RAYS_PER_PROCESS, "cpu", 1, 1),
+        (100 * RAYS_PER_PROCESS, "cpu", 64, 4),
+        (100 * RAYS_PER_PROCESS, "cuda", 64, 1),
+    ],
+)
+def test_processes_are_started_where_there_is_work_for_them(rays, device, threads, jobs):
+    assert automatic_workers(rays, device=device, threads=threads) == Workers(jobs, threads)
 
 
 def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go):

@@ -78,7 +78,9 @@ def render(
         str | None,
         typer.Option(help="START:STOP[:STEP]: render these views alone, counted from 0; assemble nothing."),
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes that share the views, and --threads.", min=1)] = 1,
+    jobs: Annotated[
+        int, typer.Option(help="Processes that share the views, and --threads; 0 chooses by the work.", min=0)
+    ] = 0,
     cameras_only: Annotated[
         bool,
         typer.Option("--cameras-only", help="Render nothing; write cameras.json and camera_path.json."),
@@ -228,12 +230,13 @@ def render_run(
     threads: int,
     overwrite: bool,
     console: Console,
-    jobs: int = 1,
+    jobs: int = 0,
     part: slice | None = None,
 ) -> list[Path]:
     """Render into `target`, or keep what stands there if it is the same.
 
     Args:
+        jobs: processes; 0 for `automatic_workers`.
         part: render these views alone, for a later call to find them.
 
     Returns:
@@ -247,7 +250,7 @@ def render_run(
 
     import torch
 
-    from nerfcli.export.frames import Workers, export_frames, export_part
+    from nerfcli.export.frames import Workers, automatic_workers, export_frames, export_part
     from nerfcli.export.order import Order, refuse_foreign
     from nerfcli.render.model import load_model
     from nerfcli.train.run_folder import FIELD
@@ -285,7 +288,7 @@ def render_run(
             done += rays
             update(done / total, f"{len(chosen)} frames")
 
-        workers = Workers(jobs, threads)
+        workers = Workers(jobs, threads) if jobs else automatic_workers(total, device=device, threads=threads)
         if part is not None:
             return [export_part(model, order, target, chosen, on_rays=on_rays, notify=console.note, workers=workers)]
         return export_frames(model, order, target, on_rays=on_rays, notify=console.note, workers=workers)

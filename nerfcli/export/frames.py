@@ -16,6 +16,11 @@ from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.model import Model
 
+# A process costs seconds to start: it has to have this many rays to render, about 20 s of work for a core.
+RAYS_PER_PROCESS = 2**22
+# Each process holds the model and a picture, and a few hundred megabytes of libraries.
+MOST_PROCESSES = 4
+
 
 @dataclass(frozen=True)
 class Workers:
@@ -28,6 +33,22 @@ class Workers:
 
     jobs: int = 1
     threads: int = 1
+
+
+def automatic_workers(rays: int, *, device: str, threads: int) -> Workers:
+    """A process for each thread where there is enough to do: on CPUs a picture per thread beats threads per picture.
+
+    Two threads share a picture in 0.6 of the time of one, as its samples are put in order by one of them; two processes
+    with a picture each take half. A GPU is used by one process.
+
+    Args:
+        rays: of all pictures together.
+        device: where they are rendered.
+        threads: to share.
+    """
+    if device != "cpu":
+        return Workers(1, threads)
+    return Workers(max(1, min(threads, MOST_PROCESSES, rays // RAYS_PER_PROCESS)), threads)
 
 
 def export_frames(

@@ -14,7 +14,7 @@ from nerfcli.render.pixels import pixels_of_rays
 from nerfcli.render.rays import Rays, pixel_rays, places_in_pixel
 from nerfcli.render.tracing import TOLERANCE, render_rays
 
-RAYS_PER_TILE = 4096
+RAYS_PER_TILE = 8192
 # Rays are made for this many at a time, whatever the tile: their last bits must not depend on it.
 RAYS_PER_BLOCK = 2**18
 
