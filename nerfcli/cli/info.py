@@ -98,7 +98,8 @@ def _describe_run(folder: Path) -> dict[str, Any]:
         "held_out": len(cameras["test"]),
         "unit": config.get("unit"),
         "unit_source": config.get("unit_source"),
-        "settings": config.get("settings"),
+        "settings": {k: v for k, v in config.get("settings", {}).items() if k != "components"},
+        "components": config.get("settings", {}).get("components"),
         "versions": config.get("versions"),
     }
     if log:

@@ -19,6 +19,14 @@ Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
 Threads = Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)]
 Downscale = Annotated[str, typer.Option(help="Average photos over squares: auto, 1, 2, 4 or 8.")]
+Include = Annotated[
+    list[str] | None,
+    typer.Option("--with", metavar="NAME[=VALUE]", help="A component to switch on; see below. Repeatable."),
+]
+Exclude = Annotated[
+    list[str] | None,
+    typer.Option("--without", metavar="NAME", help="A component to switch off; see below. Repeatable."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No notes and no progress; warnings and errors stay.")]

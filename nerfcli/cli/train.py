@@ -11,6 +11,8 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Device,
     Downscale,
+    Exclude,
+    Include,
     Json,
     Output,
     Overwrite,
@@ -39,6 +41,8 @@ def train(
         str | None, typer.Option(help="Training time: 90s, 5m, 1h.  [default: 2m, or none with --steps]")
     ] = None,
     steps: Annotated[int | None, typer.Option(help="Optimiser steps in all; repeatable bit for bit.", min=1)] = None,
+    include: Include = None,
+    exclude: Exclude = None,
     downscale: Downscale = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint to the new total.")] = False,
     device: Device = "auto",
@@ -54,12 +58,18 @@ def train(
     transforms_train.json (Blender) or poses_bounds.npy (LLFF). Every 8th photo is held out. Writes SCENE-run/.
     Ctrl-C saves a checkpoint; --resume goes on from it.
 
+    Components, for --with and --without: background (auto, black, random: what is behind the field), view (0 to 3: the
+    degree to which colours depend on the direction), near (smaller gradients near cameras), distortion (a weight:
+    the light of a ray in one place).
+
     \b
     Examples:
       nerfcli train photos-scene --budget 90s
       nerfcli train photos-scene --budget 5m --resume
       nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
+      nerfcli train photos-scene --without view --with distortion=0.01
     """
+    from nerfcli.train.components import Components, choose
     from nerfcli.train.settings import TrainSettings
 
     if budget is None and steps is None:
@@ -72,6 +82,7 @@ def train(
         seed=seed,
         device=device_name(device),
         threads=thread_count(threads),
+        components=choose(Components(), included=include or (), excluded=exclude or ()),
     )
 
     def work(folder: Path, one_of_many: bool) -> None:

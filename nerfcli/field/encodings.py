@@ -26,11 +26,12 @@ def fourier_features(x: Tensor, octaves: int) -> Tensor:
     return torch.stack([phases.sin(), phases.cos()], dim=-1).flatten(-3)
 
 
-def spherical_harmonics(directions: Tensor) -> Tensor:
+def spherical_harmonics(directions: Tensor, degree: int = 3) -> Tensor:
     """The 16 real spherical harmonics of degree 0 to 3, orthonormal on the sphere.
 
     Args:
         directions: (..., 3) unit norm.
+        degree: 0 to 3; the harmonics above it are 0.
 
     Returns:
         (..., 16), ordered by degree l, then by order m = -l .. l, with the Condon-Shortley phase left out.
@@ -40,7 +41,7 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
     """
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
-    return torch.stack(
+    harmonics = torch.stack(
         [
             torch.full_like(x, math.sqrt(1 / (4 * math.pi))),
             math.sqrt(3 / (4 * math.pi)) * y,
@@ -61,3 +62,6 @@ def spherical_harmonics(directions: Tensor) -> Tensor:
         ],
         dim=-1,
     )
+    if degree == 3:
+        return harmonics
+    return harmonics * (torch.arange(16, device=x.device) < (degree + 1) ** 2)

@@ -25,6 +25,7 @@ class HashFieldSettings:
         log2_rows: rows per level as a power of two.
         coarsest, finest: cells per axis of the first and the last level; those between are in geometric progression.
         width: neurons of the hidden layers.
+        view_degree: spherical harmonics of the direction that colours may depend on, 0 (not at all) to 3.
     """
 
     unbounded: bool
@@ -34,6 +35,7 @@ class HashFieldSettings:
     coarsest: int = 16
     finest: int = 1024
     width: int = 32
+    view_degree: int = 3
 
     @property
     def resolutions(self) -> tuple[int, ...]:
@@ -73,7 +75,8 @@ class HashField(nn.Module):
 
     def radiance_of_encoded(self, encoded: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         """The same for positions that `kernels.hash_encode` has been asked about already, (N, L * F)."""
-        return kernels.radiance(encoded, spherical_harmonics(directions), rays, tuple(self.weights))
+        harmonics = spherical_harmonics(directions, self.settings.view_degree)
+        return kernels.radiance(encoded, harmonics, rays, tuple(self.weights))
 
 
 def _uniform_weights(outputs: int, inputs: int) -> nn.Parameter:

@@ -12,8 +12,8 @@ from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
-from nerfcli.train.losses import DISTORTION, colour_loss, distortion_loss, over_background
-from nerfcli.train.photos import PixelPool
+from nerfcli.train.losses import colour_loss, distortion_loss, over_background
+from nerfcli.train.photos import Drawn, PixelPool
 from nerfcli.train.settings import TrainSettings
 
 OCCUPANCY_SIDE = 64
@@ -32,7 +32,7 @@ BETAS = (0.9, 0.99)
 EPS = 1e-15
 
 
-def _scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> None:
+def scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> None:
     """Have gradients that come to these tensors multiplied by min(1, distance^2).
 
     Space near a camera is crossed by many of its rays and by those of no other camera: without this it learns
@@ -70,7 +70,11 @@ class Fitting:
         self.marching = marching
         self.settings = settings
         self.step = 0
-        self.field = HashField(HashFieldSettings(unbounded=unbounded)).to(device)
+        self.components = settings.components
+        field = HashFieldSettings(unbounded=unbounded, view_degree=self.components.view)
+        self.field = HashField(field).to(device)
+        behind = self.components.background
+        self.random_background = behind == "random" or (behind == "auto" and pool.has_alpha)
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
@@ -97,9 +101,9 @@ class Fitting:
             self._refresh_occupancy()
         wanted = settings.first_samples_per_step + share * (settings.samples_per_step - settings.first_samples_per_step)
         rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
-        origins, directions, colours = self.pool.draw(rays, self.generator)
+        drawn = self.pool.draw(rays, self.generator)
         stride = next(stride for until, stride in STRIDES if share <= until)
-        loss, samples = self._loss(origins, directions, colours, edges=self.edges[::stride].contiguous())
+        loss, samples = self._loss(drawn, edges=self.edges[::stride].contiguous())
         self.optimiser.zero_grad(set_to_none=True)
         if samples > 0:
             loss.backward()
@@ -129,14 +133,15 @@ class Fitting:
         warmup = min(1.0, (self.step + 1) / settings.warmup_steps)
         return settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
 
-    def _loss(self, origins: Tensor, directions: Tensor, colours: Tensor, *, edges: Tensor) -> tuple[Tensor, int]:
+    def _loss(self, drawn: Drawn, *, edges: Tensor) -> tuple[Tensor, int]:
         """Loss over some rays, and the number of samples it took."""
-        device = origins.device
+        origins, directions, colours, _ = drawn
+        components, device = self.components, origins.device
         jitter = torch.rand(len(origins), generator=self.generator, device=device)
         # Photos with alpha are shown on random colours, so that only opacity explains them. Others fill the frame:
         # behind them is black, as random colours shining through the fog of the start would drown all else.
         background = torch.zeros(len(origins), 3, device=device)
-        if colours.shape[-1] == 4:
+        if self.random_background:
             background = torch.rand(len(origins), 3, generator=self.generator, device=device)
         field = self.field
         starts, ends, _, known, coordinates, offsets = kernels.visible_samples(
@@ -155,10 +160,13 @@ class Fitting:
             coordinates, field.table, field.settings.resolutions, sink=self.table_gradient, known=known
         )
         density, rgb = field.radiance_of_encoded(encoded, directions, kernels.ray_indices(offsets))
-        _scale_gradients(density, rgb, distance=starts)
+        if components.near:
+            scale_gradients(density, rgb, distance=starts)
         rendered, _, weights = kernels.composite(density, rgb, ends - starts, offsets=offsets, background=background)
         loss = colour_loss(rendered, over_background(colours, background))
-        return loss + DISTORTION * distortion_loss(weights, starts, ends, offsets), len(starts)
+        if components.distortion:
+            loss = loss + components.distortion * distortion_loss(weights, starts, ends, offsets)
+        return loss, len(starts)
 
     def _refresh_occupancy(self) -> None:
         # The whole grid once, after a warm-up in which everything is open; then a share at a time.

@@ -21,7 +21,7 @@ class HeldoutPixels:
     def __init__(self, photos: Sequence[Photo], training_from_scene: Similarity, device: torch.device):
         pool = PixelPool(photos, training_from_scene, device)
         generator = torch.Generator(device=device).manual_seed(SEED)
-        self.origins, self.directions, self.colours = pool.draw(PIXELS, generator)
+        self.origins, self.directions, self.colours, _ = pool.draw(PIXELS, generator)
 
     @torch.no_grad()
     def psnr(self, model: Model) -> float:

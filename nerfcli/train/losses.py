@@ -6,8 +6,6 @@ from torch import Tensor
 from nerfcli import kernels
 
 HUBER_DELTA = 0.1
-# Share of the distortion in the whole loss; 0.05 is best or as good as any on real and synthetic captures.
-DISTORTION = 0.05
 
 
 def colour_loss(rendered: Tensor, measured: Tensor) -> Tensor:

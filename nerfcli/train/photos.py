@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -64,6 +65,21 @@ def downscaled_camera(camera: Camera, factor: float) -> Camera:
     return camera.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
 
 
+class Drawn(NamedTuple):
+    """Pixels with their rays.
+
+    Args:
+        origins, directions: (N, 3) training frame, unit directions.
+        colours: (N, 3 or 4) float32 in [0, 1].
+        numbers: (N,) int64, counted through all photos.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    colours: Tensor
+    numbers: Tensor
+
+
 class PixelPool:
     """All usable pixels of some photos, and the ray of each, in the training frame.
 
@@ -109,22 +125,27 @@ class PixelPool:
     def has_alpha(self) -> bool:
         return self.colours.shape[-1] == 4
 
-    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
-        """`count` random pixels, with replacement.
-
-        Returns:
-            origins (count, 3), unit directions (count, 3), colours (count, 3 or 4) float32 in [0, 1].
-        """
+    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+        """`count` random pixels, with replacement."""
         device = self.colours.device
         chosen = torch.randint(self.usable_count, (count,), generator=generator, device=device)
-        return kernels.pixel_rays(
-            chosen if self.usable is None else self.usable[chosen],
+        return self.rays_of(chosen if self.usable is None else self.usable[chosen])
+
+    def rays_of(self, numbers: Tensor) -> Drawn:
+        """The rays and colours of pixels (N,), counted through all photos."""
+        rays = kernels.pixel_rays(
+            numbers,
             self.first_pixel,
             self.first_bearing,
             bearings=self.bearings,
             poses=self.poses,
             photos=self.colours,
         )
+        return Drawn(*rays, numbers)
+
+    def photo_of(self, numbers: Tensor) -> Tensor:
+        """Which photo each pixel (N,) is of."""
+        return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
 
 
 def _with_alpha(pixels: np.ndarray) -> np.ndarray:

@@ -1,9 +1,10 @@
 """Everything a training depends on, besides the scene."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from nerfcli.errors import UserError
+from nerfcli.train.components import Components
 
 DOWNSCALES = (1, 2, 4, 8)
 # `--downscale auto` takes the largest pictures whose longer side is within this many pixels.
@@ -25,6 +26,7 @@ class TrainSettings:
             number of rays follows. Small steps learn more from a sample, large ones cost less each.
         learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
         warmup_steps: steps over which the learning rate rises from 0.
+        components: what is in the model and in its loss.
 
     Raises:
         UserError: neither or a non-positive limit, or an unknown downscale.
@@ -41,6 +43,7 @@ class TrainSettings:
     learning_rate: float = 1e-2
     final_learning_rate: float = 1e-3
     warmup_steps: int = 50
+    components: Components = field(default_factory=Components)
 
     def __post_init__(self) -> None:
         if self.budget_seconds is None and self.steps is None:

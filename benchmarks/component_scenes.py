@@ -1,0 +1,389 @@
+"""Scenes that need one component each, made from sample_scenes: known truth, the same bytes for the same seed.
+
+    python benchmarks/component_scenes.py scenes
+    python benchmarks/component_scenes.py scenes --only exposure --only poses --seed 3
+
+Each is a scene of its own, OUT/NAME (COLMAP model and scene.json), in OUT/NAME/truth.json what was done to it. Held-out
+photos keep the exposure, the poses and the lens of the truth, so that a gain on them is a gain of the field. Needs
+nothing but nerfcli; `--only` may be given again, the seed moves every random choice.
+"""
+
+import importlib.util
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from PIL import ExifTags, Image
+
+from nerfcli import scene as scenes
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.conventions import opencv_from_opengl_pose
+from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.media.images import downscale, read_image
+
+SAMPLES = Path(__file__).parent.parent / "sample_scenes"
+DESK_DOWNSCALE = 2
+# Of the views of the balls.
+VIEWS, WIDTH, HEIGHT, SUBPIXELS, REACH, FOV_X = 48, 160, 120, 3, 4.4, 0.8
+EXPOSURE_SPREAD, WHITE_BALANCE_SPREAD = 0.3, 0.06
+POSE_NOISE_DEG = 0.5
+FOCAL_ERROR = 0.02
+FEW_VIEWS = 6
+POINTS_PER_VIEW, POINT_NOISE_PX = 250, 0.4
+
+
+@dataclass(frozen=True)
+class View:
+    """A photo that is going to be written: camera, pose, pixels uint8 (H, W, 3 or 4), whether held out, a mask."""
+
+    name: str
+    camera: Camera
+    world_from_cam: np.ndarray
+    pixels: np.ndarray
+    test: bool
+    mask: np.ndarray | None = None
+    exposure_seconds: float | None = None
+
+
+def linear(levels: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB in [0, 1]."""
+    return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+
+
+def srgb(light: np.ndarray) -> np.ndarray:
+    """sRGB of linear light, clipped to [0, 1] as a camera does."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def to_8_bit(levels: np.ndarray) -> np.ndarray:
+    return np.rint(255 * np.clip(levels, 0.0, 1.0)).astype(np.uint8)
+
+
+# --- the desk ---------------------------------------------------------------------------------------------------------
+
+
+def desk_views() -> list[View]:
+    """The photos of the desk at half size, with the cameras that they were rendered with."""
+    known = json.loads((SAMPLES / "desk" / "truth" / "cameras.json").read_text(encoding="utf-8"))
+    whole = Camera.from_json(known["camera"])
+    camera = whole.resized(whole.width // DESK_DOWNSCALE, whole.height // DESK_DOWNSCALE)
+    test = scenes.default_split(view["name"] for view in known["images"])
+    return [
+        View(
+            view["name"],
+            camera,
+            np.array(view["world_from_cam"]),
+            downscale(read_image(SAMPLES / "desk" / "images" / view["name"]), DESK_DOWNSCALE),
+            view["name"] in test,
+        )
+        for view in known["images"]
+    ]
+
+
+def desk(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """As it is: nothing beyond the default is needed."""
+    return desk_views(), {}
+
+
+def log_gains(views: list[View], generator: np.random.Generator) -> np.ndarray:
+    """(views, 3) logarithms of gains in linear light; their mean over the training photos is 0."""
+    common = np.clip(generator.normal(0.0, EXPOSURE_SPREAD, (len(views), 1)), -0.6, 0.6)
+    gains = common + generator.normal(0.0, WHITE_BALANCE_SPREAD, (len(views), 3))
+    return gains - gains[[not view.test for view in views]].mean(axis=0)
+
+
+def exposed(view: View, gain: np.ndarray) -> np.ndarray:
+    return to_8_bit(srgb(linear(view.pixels / 255.0) * np.exp(gain)))
+
+
+def exposure(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """Exposure and white balance drift from photo to photo, and no EXIF tells; held-out photos have the mean."""
+    views = desk_views()
+    gains = log_gains(views, generator)
+    changed = [
+        view if view.test else replace(view, pixels=exposed(view, gain))
+        for view, gain in zip(views, gains, strict=True)
+    ]
+    return changed, {"log_gains": {v.name: g.tolist() for v, g in zip(views, gains, strict=True) if not v.test}}
+
+
+def exposure_exif(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """Exposure drifts, that of held-out photos too, and EXIF tells the shutter times."""
+    views = desk_views()
+    gains = log_gains(views, generator).mean(axis=1, keepdims=True)
+    changed = [
+        replace(view, pixels=exposed(view, gain), exposure_seconds=math.exp(gain[0]) / 60)
+        for view, gain in zip(views, gains, strict=True)
+    ]
+    return changed, {"log_gains": {v.name: [g[0]] * 3 for v, g in zip(views, gains, strict=True)}}
+
+
+def poses(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """Training photos are turned by half a degree about a random axis through their centres."""
+    views, changed, angles = desk_views(), [], {}
+    for view in views:
+        axis = generator.normal(size=3)
+        turn = math.radians(POSE_NOISE_DEG) * axis / np.linalg.norm(axis)
+        pose = view.world_from_cam.copy()
+        pose[:3, :3] = pose[:3, :3] @ rotation_from_vector(turn)
+        changed.append(view if view.test else replace(view, world_from_cam=pose))
+        if not view.test:
+            angles[view.name] = turn.tolist()
+    truth = {view.name: view.world_from_cam.tolist() for view in views}
+    return changed, {"turned_by_rad": angles, "world_from_cam": truth}
+
+
+def focal(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """The focal length of the training photos is 2 % too long."""
+    views = desk_views()
+    camera = views[0].camera
+    wrong = replace(camera, params=(camera.params[0] * (1 + FOCAL_ERROR), *camera.params[1:]))
+    return [view if view.test else replace(view, camera=wrong) for view in views], {"params": list(camera.params)}
+
+
+# --- the balls --------------------------------------------------------------------------------------------------------
+
+
+def ball_tracer() -> ModuleType:
+    """The script that made sample_scenes/spheres: what stands where, hit by rays in closed form."""
+    spec = importlib.util.spec_from_file_location("make_spheres", SAMPLES / "make_spheres.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def ball_pose(index: int, count: int) -> np.ndarray:
+    """world_from_cam (4, 4), OpenCV axes: evenly spread over a band of a sphere."""
+    azimuth, height = index * math.pi * (3 - math.sqrt(5)), 0.12 + 0.72 * (index + 0.5) / count
+    ring = math.sqrt(1 - height**2)
+    backward = np.array((ring * math.cos(azimuth), ring * math.sin(azimuth), height))
+    right = np.cross((0, 0, 1), backward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack((right, np.cross(backward, right), backward), axis=1)
+    pose[:3, 3] = REACH * backward
+    return opencv_from_opengl_pose(pose)
+
+
+def ball_camera() -> Camera:
+    return Camera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (0.5 * WIDTH / math.tan(0.5 * FOV_X), WIDTH / 2, HEIGHT / 2))
+
+
+# What a ray of no hit sees, and what a surface reflects, by directions (..., 3) in the world or in the camera.
+Light = Callable[[np.ndarray], np.ndarray]
+
+
+def room_light(directions: np.ndarray) -> np.ndarray:
+    """(..., 3): three soft lamps in fixed directions."""
+    lamps = np.array([[0.6, 0.2, 0.77], [-0.7, 0.5, 0.5], [0.1, -0.8, 0.6]])
+    lamps /= np.linalg.norm(lamps, axis=1, keepdims=True)
+    shades = np.array([[1.0, 0.95, 0.85], [0.7, 0.85, 1.0], [0.9, 1.0, 0.8]])
+    return np.exp(14.0 * (directions @ lamps.T - 1.0)) @ shades
+
+
+def surroundings(directions: np.ndarray) -> np.ndarray:
+    """(..., 3) sRGB of what is infinitely far: a sky, a horizon, hills and clouds."""
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    around = np.arctan2(y, x)
+    hills = 0.08 * np.sin(3 * around) + 0.05 * np.sin(7 * around + 1)
+    cloud = 0.5 + 0.25 * np.sin(9 * x + 3 * np.sin(5 * y)) + 0.25 * np.sin(8 * y + 4 * z)
+    sky = np.stack([0.35 + 0.4 * cloud, 0.5 + 0.3 * cloud, 0.75 + 0.15 * cloud], axis=-1)
+    stripes = 0.5 + 0.5 * np.sin(14 * x + 11 * y)
+    ground = np.stack([0.35 + 0.15 * stripes, 0.3 + 0.2 * stripes, 0.2 + 0.1 * stripes], axis=-1)
+    share = 1.0 / (1.0 + np.exp(-40.0 * (z - hills + 0.25)))
+    return share[..., None] * sky + (1.0 - share[..., None]) * ground
+
+
+def ball_views(
+    *, behind: Light | None = None, moving_behind: Light | None = None, gloss: float = 0.0, views: int = VIEWS
+) -> list[View]:
+    """Views of the balls, every 8th held out: RGBA; or in front of something far, fixed to the world or the camera.
+
+    Args:
+        behind, moving_behind: what is infinitely far by directions in the world, or by directions in the camera.
+        gloss: how much of `room_light` the surfaces reflect.
+        views: how many.
+    """
+    tracer, camera, made = ball_tracer(), ball_camera(), []
+    fine = camera.resized(WIDTH * SUBPIXELS, HEIGHT * SUBPIXELS)
+    bearings = fine.pixel_bearings()[0].reshape(fine.height, fine.width, 3)
+    for index in range(views):
+        pose = ball_pose(index, views)
+        rays = bearings @ pose[:3, :3].T
+        rgb, distance = tracer.trace(pose[:3, 3], rays)
+        hit = np.isfinite(distance)
+        if gloss:
+            normals = surface_normals(tracer, pose[:3, 3] + distance[hit][:, None] * rays[hit])
+            mirrored = rays[hit] - 2 * (rays[hit] * normals).sum(-1, keepdims=True) * normals
+            rgb[hit] = np.clip((1 - 0.3 * gloss) * rgb[hit] + gloss * room_light(mirrored), 0, 1)
+        alpha = hit[..., None].astype(float)
+        far = behind(rays) if behind else moving_behind(bearings) if moving_behind else None
+        cells = np.concatenate([rgb * alpha if far is None else np.where(alpha > 0, rgb, far), alpha], axis=-1)
+        mean = cells.reshape(HEIGHT, SUBPIXELS, WIDTH, SUBPIXELS, 4).mean(axis=(1, 3))
+        if far is None:
+            pixels = np.concatenate([mean[..., :3] / np.maximum(mean[..., 3:], 1e-9), mean[..., 3:]], axis=-1)
+        else:
+            pixels = mean[..., :3]
+        covered = to_8_bit(mean[..., 3]) if moving_behind else None
+        made.append(View(f"view_{index:03d}.png", camera, pose, to_8_bit(pixels), index % 8 == 4, mask=covered))
+    return made
+
+
+def surface_normals(tracer: ModuleType, points: np.ndarray) -> np.ndarray:
+    """(N, 3) outward normals at points on the surfaces."""
+    best, normals = np.full(len(points), np.inf), np.zeros_like(points)
+    for ball in tracer.BALLS:
+        local = (points - np.array(ball.centre)) / ball.radius
+        off = np.abs(np.linalg.norm(local, axis=-1) - 1.0)
+        normals[off < best] = local[off < best]
+        best = np.minimum(off, best)
+    share = (points - np.array(tracer.BOX.centre)) / np.array(tracer.BOX.half_size)
+    largest = np.abs(share).max(axis=-1)
+    flat = np.where(np.abs(share) == largest[:, None], np.sign(share), 0.0)
+    nearer = np.abs(largest - 1.0) < best
+    normals[nearer] = flat[nearer]
+    return normals
+
+
+def alpha(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """A matt object in RGBA: colours depend on the point alone, and behind it is nothing."""
+    return ball_views(), {}
+
+
+def glossy(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """The same object, polished: lamps wander over it with the view."""
+    return ball_views(gloss=0.7), {}
+
+
+def unbounded(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """The object in front of what is infinitely far: colours behind it depend on the direction alone."""
+    return ball_views(behind=surroundings), {}
+
+
+def turntable(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """The object turns in front of a camera that stands still: what is behind it contradicts the poses. With masks,
+    whose black is empty space; held-out photos are RGBA."""
+    clean = ball_views()
+    views = ball_views(moving_behind=surroundings)
+    return [a if a.test else b for a, b in zip(clean, views, strict=True)], {}
+
+
+def few(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+    """Six photos to learn from, with points and where they were seen, as structure from motion gives them."""
+    views = ball_views(behind=surroundings)
+    kept = set(np.linspace(0, len(views) - 1, FEW_VIEWS).round().astype(int).tolist())
+    chosen = [replace(view, test=index not in kept) for index, view in enumerate(views) if index in kept or view.test]
+    return chosen, {}
+
+
+def ball_points(views: list[View], generator: np.random.Generator) -> tuple[np.ndarray, Observations]:
+    """Points on the surfaces that the training views see, and where they see them, with noise."""
+    tracer, points = ball_tracer(), []
+    training = [view for view in views if not view.test]
+    for view in training:
+        bearings = view.camera.pixel_bearings()[0] @ view.world_from_cam[:3, :3].T
+        distance = tracer.trace(view.world_from_cam[:3, 3], bearings[None])[1][0]
+        chosen = generator.choice(np.flatnonzero(np.isfinite(distance)), POINTS_PER_VIEW, replace=False)
+        points.append(view.world_from_cam[:3, 3] + distance[chosen, None] * bearings[chosen])
+    cloud = np.concatenate(points)
+    frames, indices, pixels = [], [], []
+    for number, view in enumerate(views):
+        if view.test:
+            continue
+        offset = cloud - view.world_from_cam[:3, 3]
+        away = np.linalg.norm(offset, axis=-1)
+        first = tracer.trace(view.world_from_cam[:3, 3], (offset / away[:, None])[None])[1][0]
+        places, valid = view.camera.project(offset @ view.world_from_cam[:3, :3])
+        size = (view.camera.width, view.camera.height)
+        seen = valid & (places >= 1).all(1) & (places < np.array(size) - 1).all(1) & (np.abs(first - away) < 1e-3)
+        chosen = np.flatnonzero(seen)
+        frames.append(np.full(len(chosen), number))
+        indices.append(chosen)
+        pixels.append(places[chosen] + generator.normal(0.0, POINT_NOISE_PX, (len(chosen), 2)))
+    return cloud, Observations(np.concatenate(frames), np.concatenate(indices), np.concatenate(pixels))
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+MAKERS: dict[str, Callable[[np.random.Generator], tuple[list[View], dict[str, Any]]]] = {
+    "desk": desk,
+    "exposure": exposure,
+    "exposure-exif": exposure_exif,
+    "poses": poses,
+    "focal": focal,
+    "alpha": alpha,
+    "glossy": glossy,
+    "unbounded": unbounded,
+    "turntable": turntable,
+    "few": few,
+}
+
+
+def write_photo(view: View, path: Path) -> None:
+    """JPEG or PNG by the name's ending, with the exposure time in EXIF where it is known."""
+    exif = Image.Exif()
+    if view.exposure_seconds is not None:
+        camera = exif.get_ifd(ExifTags.IFD.Exif)
+        camera[ExifTags.Base.ExposureTime] = view.exposure_seconds
+        camera[ExifTags.Base.ISOSpeedRatings] = 800
+        camera[ExifTags.Base.FNumber] = 5.6
+    image = Image.fromarray(view.pixels)
+    if path.suffix == ".jpg":
+        image.save(path, exif=exif, quality=95, subsampling=0)
+    else:
+        image.save(path, exif=exif)
+
+
+def make(name: str, folder: Path, seed: int) -> None:
+    """Write the scene `name` into a folder."""
+    generator = np.random.default_rng([seed, list(MAKERS).index(name)])
+    views, truth = MAKERS[name](generator)
+    images, masks = folder / "images", folder / "masks"
+    images.mkdir(parents=True, exist_ok=True)
+    for view in views:
+        write_photo(view, images / view.name)
+        if view.mask is not None:
+            masks.mkdir(exist_ok=True)
+            Image.fromarray(np.where(view.mask > 127, np.uint8(255), np.uint8(0))).save(masks / f"{view.name}.png")
+    frames = tuple(Frame(view.name, view.camera, view.world_from_cam, images / view.name) for view in views)
+    points, observations = ball_points(views, generator) if name == "few" else (np.zeros((0, 3)), None)
+    model = folder / scenes.MODEL_FOLDER
+    model.mkdir(parents=True, exist_ok=True)
+    write_colmap_binary(Capture(frames, points, (), None, "colmap", observations=observations), model)
+    scenes.save(
+        folder,
+        image_folder=images,
+        provenance={"made_by": "benchmarks/component_scenes.py", "seed": seed},
+        masks=masks if masks.is_dir() else None,
+        split={view.name: "test" if view.test else "train" for view in views},
+    )
+    (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+
+
+def main(
+    out: Annotated[Path, typer.Argument(help="Where to write; a folder per scene.")],
+    only: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(MAKERS)}; may be given again.")] = None,
+    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+) -> None:
+    """Make the scenes."""
+    unknown = sorted(set(only or ()) - set(MAKERS))
+    if unknown:
+        raise typer.BadParameter(f"{unknown[0]!r}; choose from {', '.join(MAKERS)}", param_hint="--only")
+    for name in only or MAKERS:
+        make(name, out / name, seed)
+        typer.echo(out / name)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,120 @@
+"""The parts of a model and of its training that a scene may need or not, each chosen by itself.
+
+A component is a field of `Components`. Its value says what is done; `CHOICES` tells, for each, which value switches it
+off, which one `--with NAME` stands for, and what `--with NAME=VALUE` may say.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+from nerfcli.errors import UserError
+
+Value = bool | int | float | str
+
+# What may be behind all that the field holds.
+BACKGROUNDS = ("auto", "black", "random")
+# Spherical harmonics up to this degree: 16 of them.
+MOST_DEGREES = 3
+
+
+@dataclass(frozen=True)
+class Components:
+    """What is in the model and in its loss. The defaults are what nearly every scene needs.
+
+    Args:
+        background: behind the field: "black"; "random" colours in training, for photos with alpha; "auto" is random
+            for photos with alpha and black for all others.
+        view: how colours depend on the direction they are seen from: the highest degree of the spherical harmonics
+            that the colour network is told, 0 to 3. 0: not at all.
+        near: whether gradients near a camera are scaled down; see `fitting.scale_gradients`.
+        distortion: weight of `losses.distortion_loss`; 0.05 is best or as good as any on real and synthetic
+            captures.
+    """
+
+    background: str = "auto"
+    view: int = MOST_DEGREES
+    near: bool = True
+    distortion: float = 0.05
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a component may be.
+
+    Args:
+        what: it does, in a few words.
+        off, on: the values that `--without` and `--with` stand for.
+        allowed: all values, or None for every number that is not negative.
+    """
+
+    what: str
+    off: Value
+    on: Value
+    allowed: tuple[Value, ...] | None
+
+    def value(self, name: str, text: str) -> Value:
+        """The value that a text stands for.
+
+        Raises:
+            UserError: it stands for none.
+        """
+        if self.allowed is not None:
+            for value in self.allowed:
+                if text == str(value).lower():
+                    return value
+            listed = ", ".join(str(value).lower() for value in self.allowed)
+            raise _wrong(name, text, f"one of {listed}")
+        try:
+            number = float(text)
+        except ValueError as error:
+            raise _wrong(name, text, "a number") from error
+        if not 0.0 <= number < float("inf"):
+            raise _wrong(name, text, "a number from 0 on")
+        return number
+
+
+CHOICES = {
+    "background": Choice("what is behind the field", "black", "random", BACKGROUNDS),
+    "view": Choice("colour by direction, degree", 0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
+    "near": Choice("smaller gradients near cameras", False, True, (False, True)),
+    "distortion": Choice("light of a ray in one place, weight", 0.0, 0.05, None),
+}
+assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
+
+
+def choose(start: Components, *, included: Sequence[str], excluded: Sequence[str]) -> Components:
+    """`start` with some components switched on and off.
+
+    Args:
+        start: what holds where nothing is said.
+        included: NAME, for the value that switches it on, or NAME=VALUE.
+        excluded: NAME, for the value that switches it off.
+
+    Raises:
+        UserError: an unknown name or value, or a component that is named twice.
+    """
+    values: dict[str, Value] = {}
+    for text, on in [*((text, True) for text in included), *((text, False) for text in excluded)]:
+        name, given, value = text.partition("=")
+        if name not in CHOICES or (given and not on):
+            option = "--with" if on else "--without"
+            raise UserError(f"{option} {text}: there is no such component", f"choose from {', '.join(CHOICES)}", 2)
+        if name in values:
+            raise UserError(f"component {name} is named twice", "name it once, with --with or with --without", 2)
+        choice = CHOICES[name]
+        values[name] = choice.value(name, value) if given else choice.on if on else choice.off
+    return replace(start, **values)
+
+
+def differences(components: Components) -> dict[str, Value]:
+    """The components that are not as they are by default, with their values."""
+    default = Components()
+    return {name: value for name in CHOICES if (value := getattr(components, name)) != getattr(default, name)}
+
+
+def _wrong(name: str, text: str, expected: str) -> UserError:
+    return UserError(f"--with {name}={text}: not {expected}", f"write for example --with {name}", 2)
