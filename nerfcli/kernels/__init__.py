@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import depth as depth_reference
-from nerfcli.kernels import reference
+from nerfcli.kernels import marching, reference
 from nerfcli.kernels.depth import LightEnds
 from nerfcli.kernels.reference import contract, grid_coordinates, sum_along_rays
 
@@ -28,7 +28,9 @@ __all__ = [
     "hash_encode",
     "interval_weights",
     "light_ends",
+    "lit_samples",
     "mixture_quantile",
+    "occupied_samples",
     "optical_depth_before",
     "pixel_rays",
     "prepare",
@@ -141,6 +143,27 @@ def mixture_quantile(
     module = _module_for(density, starts, ends)
     module = depth_reference if module is reference else module
     return module.mixture_quantile(density, starts, ends, offsets=offsets, rays_per_pixel=rays_per_pixel, share=share)
+
+
+def occupied_samples(
+    origins: Tensor,
+    directions: Tensor,
+    edges: Tensor,
+    *,
+    jitter: Tensor,
+    occupied: Tensor,
+    unbounded: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `marching.occupied_samples`."""
+    module = _module_for(origins, directions, edges, jitter)
+    module = marching if module is reference else module
+    return module.occupied_samples(origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded)
+
+
+def lit_samples(density: Tensor, lengths: Tensor, offsets: Tensor, *, deepest: float) -> tuple[Tensor, Tensor]:
+    """See `marching.lit_samples`."""
+    lit = optical_depth_before(density, lengths, offsets) < deepest
+    return lit, torch.nn.functional.pad(lit.cumsum(0), (1, 0))[offsets]
 
 
 def visible_samples(

@@ -7,6 +7,7 @@ import torch
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.depth import light_ends, mixture_quantile
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
+from nerfcli.kernels.numba_cpu.marching import occupied_samples
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
 from nerfcli.kernels.numba_cpu.pixels import pixel_rays
 from nerfcli.kernels.numba_cpu.rays import ray_indices
@@ -25,6 +26,7 @@ __all__ = [
     "is_compiled",
     "light_ends",
     "mixture_quantile",
+    "occupied_samples",
     "optical_depth_before",
     "pixel_rays",
     "radiance",
@@ -52,6 +54,9 @@ def warm_up() -> None:
         direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, unbounded=True,
         table=table, resolutions=(2,) * 8, weights=weights, deepest=10.0,
     )  # fmt: skip
+    occupied_samples(
+        direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, unbounded=True
+    )
     encoded = hash_encode(points, table, (2,) * 8, None, encoded)
     hash_encode(points, table, (2,) * 8, None, None)
     optical_depth_before(density(encoded, weights), lengths, offsets)

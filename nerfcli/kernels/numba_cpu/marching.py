@@ -1,0 +1,74 @@
+"""The samples of rays in occupied cells, on CPU threads: for fields whose density is not compiled in `visible`."""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, padded
+from nerfcli.kernels.numba_cpu.threads import use_threads
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _count(
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, unbounded: Any, counts: Any
+) -> None:
+    """How many samples each ray has."""
+    intervals = edges.shape[0] - 2 - CHUNK
+    for ray in numba.prange(origins.shape[0]):
+        places, cells = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
+        count = 0
+        for first in range(0, intervals, CHUNK):
+            look_ahead(origins, directions, edges, jitter, ray, first, side, unbounded, places, cells)
+            for i in range(min(CHUNK, intervals - first)):
+                if cells[i] >= 0 and occupied[cells[i]]:
+                    count += 1
+        counts[ray] = count
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _write(
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, unbounded: Any, offsets: Any,
+    starts: Any, ends: Any, coordinates: Any,
+) -> None:  # fmt: skip
+    """The samples of each ray, from its offset on."""
+    intervals = edges.shape[0] - 2 - CHUNK
+    for ray in numba.prange(origins.shape[0]):
+        places, cells = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
+        at = offsets[ray]
+        for first in range(0, intervals, CHUNK):
+            if at == offsets[ray + 1]:
+                break
+            look_ahead(origins, directions, edges, jitter, ray, first, side, unbounded, places, cells)
+            for i in range(min(CHUNK, intervals - first)):
+                if cells[i] >= 0 and occupied[cells[i]]:
+                    starts[at] = cut(edges, jitter[ray], first + i)
+                    ends[at] = cut(edges, jitter[ray], first + i + 1)
+                    for axis in range(3):
+                        coordinates[at, axis] = places[axis, i]
+                    at += 1
+
+
+def occupied_samples(
+    origins: Tensor,
+    directions: Tensor,
+    edges: Tensor,
+    *,
+    jitter: Tensor,
+    occupied: Tensor,
+    unbounded: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `marching.occupied_samples`; float32 on the CPU."""
+    use_threads()
+    rays = (
+        origins.contiguous().numpy(), directions.contiguous().numpy(), padded(edges), jitter.contiguous().numpy(),
+        occupied.contiguous().view(-1).numpy(), occupied.shape[0], unbounded,
+    )  # fmt: skip
+    counts = np.zeros(len(origins), np.int64)
+    _count(*rays, counts)
+    offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    spans, coordinates = torch.empty(2, int(offsets[-1])), torch.empty(int(offsets[-1]), 3)
+    _write(*rays, offsets, spans[0].numpy(), spans[1].numpy(), coordinates.numpy())
+    return spans[0], spans[1], coordinates, torch.from_numpy(offsets)
