@@ -11,6 +11,7 @@ from fog import SIDE, STEP, fog, foggy_cells
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
+from nerfcli.field.hash_field import HashField
 from nerfcli.render import pictures
 from nerfcli.render.accuracy import IN_WORDS, measure_error, refined, truncation_bounds
 from nerfcli.render.depth import CONVENTIONS, DepthRequest
@@ -98,6 +99,7 @@ def two_walls() -> Model:
     """Dense walls: one in front that covers the outer part of the left pixels, and one behind that covers all."""
     cells = foggy_cells((-1, -1, 0.5), (1, 1, 1)) | foggy_cells((-1, -1, -0.5), (-0.15, 1, 0.0))
     dense = fog(cells, Similarity.identity())
+    assert isinstance(dense.field, HashField)
     with torch.no_grad():
         dense.field.weights[1].zero_()
         dense.field.weights[1][0, 0] = 6.0  # density exp(6)

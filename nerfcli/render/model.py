@@ -10,7 +10,8 @@ from torch import Tensor
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.field.interface import Field
+from nerfcli.field.kinds import fresh_field, settings_from_json
 from nerfcli.render.sampling import step_edges
 
 FORMAT = "nerfcli field 1"
@@ -44,7 +45,7 @@ class Model:
         unit_source: how a metre is known; None where nobody wrote it down.
     """
 
-    field: HashField
+    field: Field
     occupied: Tensor
     marching: Marching
     background: tuple[float, float, float]
@@ -84,7 +85,7 @@ def load_model(path: Path, device: str) -> Model:
             "train again with this version of nerfcli",
         )
     occupied = tensors.pop("occupied")
-    field = HashField(HashFieldSettings(**description["field"])).to(device)
+    field = fresh_field(settings_from_json(description["field"])).to(device)
     field.load_state_dict(tensors)
     red, green, blue = description["background"]
     return Model(

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.contraction import training_points
-from nerfcli.field.hash_field import HashField
+from nerfcli.field.interface import Field
 
 DECAY = 0.8
 
@@ -29,7 +29,7 @@ class Occupancy:
 
     @torch.no_grad()
     def refresh(
-        self, field: HashField, *, cells: slice, shortest_step: float, growth: float, generator: torch.Generator
+        self, field: Field, *, cells: slice, shortest_step: float, growth: float, generator: torch.Generator
     ) -> None:
         """Ask the field at one random point in each of some cells.
 

@@ -96,16 +96,12 @@ def render_cut_rays(
 ) -> RaysSeen:
     """`render_rays` with all rays cut at the same distances `cuts` (S + 1,)."""
     stop = deepest(tolerance)
-    starts, ends, density, encoded, _, offsets = kernels.visible_samples(
+    starts, ends, density, code, _, offsets = model.field.visible_samples(
         origins,
         directions,
         torch.cat([cuts, cuts[-1:]]),  # the last is never used: there is no jitter
         jitter=torch.zeros_like(directions[:, 0]),
         occupied=model.occupied,
-        unbounded=model.field.settings.unbounded,
-        table=model.field.table,
-        resolutions=model.field.settings.resolutions,
-        weights=tuple(model.field.weights),
         deepest=stop,
     )
     lengths = ends - starts
@@ -116,7 +112,7 @@ def render_cut_rays(
     unseen = weights <= negligible[rays]
     seen = (~unseen).nonzero()[:, 0]
     rgb = torch.full((len(density), 3), UNSEEN, dtype=density.dtype, device=density.device)
-    rgb[seen] = model.field.radiance_of_encoded(encoded[seen], directions, rays[seen])[1]
+    rgb[seen] = model.field.colour_of_code(code[seen], directions, rays[seen])
     colour, transmittance, _ = kernels.composite(
         density, rgb, lengths, offsets=offsets, background=background.expand(len(origins), 3)
     )

@@ -9,10 +9,12 @@ from torch import Tensor
 
 from nerfcli import kernels
 from nerfcli.errors import NON_FINITE, UserError
-from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.kinds import fresh_field
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
 from nerfcli.train.losses import colour_loss, distortion_loss, over_background
+from nerfcli.train.optimiser import FieldOptimiser
 from nerfcli.train.photos import Drawn, PixelPool
 from nerfcli.train.settings import TrainSettings
 
@@ -28,8 +30,6 @@ FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
 CLOSING_STEPS = 150
 # Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
 STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
-BETAS = (0.9, 0.99)
-EPS = 1e-15
 
 
 def scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> None:
@@ -72,19 +72,14 @@ class Fitting:
         self.step = 0
         self.components = settings.components
         field = HashFieldSettings(unbounded=unbounded, view_degree=self.components.view)
-        self.field = HashField(field).to(device)
+        self.field = fresh_field(field).to(device)
         behind = self.components.background
         self.random_background = behind == "random" or (behind == "auto" and pool.has_alpha)
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
-        self.optimiser = torch.optim.Adam(
-            self.field.weights.parameters(), lr=settings.learning_rate, betas=BETAS, eps=EPS
-        )
-        self.table_gradient, self.table_first, self.table_second = (
-            torch.zeros_like(self.field.table, requires_grad=False) for _ in range(3)
-        )
+        self.optimiser = FieldOptimiser(self.field)
         self.samples_per_ray = float(len(self.edges) - 2)
 
     def advance(self, share: float) -> StepResult:
@@ -104,25 +99,13 @@ class Fitting:
         drawn = self.pool.draw(rays, self.generator)
         stride = next(stride for until, stride in STRIDES if share <= until)
         loss, samples = self._loss(drawn, edges=self.edges[::stride].contiguous())
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimiser.zero_grad()
         if samples > 0:
             loss.backward()
         self._check_finite(loss)
         rate = self.learning_rate(share)
         self.step += 1
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
-        self.optimiser.step()
-        kernels.adam_rows(
-            self.field.table,
-            self.table_gradient,
-            self.table_first,
-            self.table_second,
-            step=self.step,
-            rate=rate,
-            betas=BETAS,
-            eps=EPS,
-        )
+        self.optimiser.step(self.step, rate)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         return StepResult(loss=loss.item(), samples=samples, rays=rays)
 
@@ -143,23 +126,13 @@ class Fitting:
         background = torch.zeros(len(origins), 3, device=device)
         if self.random_background:
             background = torch.rand(len(origins), 3, generator=self.generator, device=device)
-        field = self.field
-        starts, ends, _, known, coordinates, offsets = kernels.visible_samples(
-            origins,
-            directions,
-            edges,
-            jitter=jitter,
-            occupied=self.occupied,
-            unbounded=field.settings.unbounded,
-            table=field.table,
-            resolutions=field.settings.resolutions,
-            weights=tuple(field.weights),
-            deepest=DEEPEST,
+        samples = self.field.visible_samples(
+            origins, directions, edges, jitter=jitter, occupied=self.occupied, deepest=DEEPEST
         )
-        encoded = kernels.hash_encode(
-            coordinates, field.table, field.settings.resolutions, sink=self.table_gradient, known=known
+        starts, ends, offsets = samples.starts, samples.ends, samples.offsets
+        density, rgb = self.field.radiance_of_samples(
+            samples, directions, kernels.ray_indices(offsets), sink=self.optimiser.sink
         )
-        density, rgb = field.radiance_of_encoded(encoded, directions, kernels.ray_indices(offsets))
         if components.near:
             scale_gradients(density, rgb, distance=starts)
         rendered, _, weights = kernels.composite(density, rgb, ends - starts, offsets=offsets, background=background)
@@ -189,10 +162,10 @@ class Fitting:
         return self.occupancy.above(threshold)
 
     def _check_finite(self, loss: Tensor) -> None:
-        gradients = {f"gradient of {name}": p.grad for name, p in self.field.weights.named_parameters()}
+        gradients = {f"gradient of {name}": tensor for name, tensor in self.optimiser.gradients().items()}
         for name, tensor in {"loss": loss, **gradients}.items():
-            # A sum is non-finite if any term is. The table's gradient comes through that of the first weights.
-            if tensor is not None and not math.isfinite(tensor.sum().item()):
+            # A sum is non-finite if any term is.
+            if not math.isfinite(tensor.sum().item()):
                 raise UserError(
                     f"{name} is not finite at step {self.step}",
                     "the last checkpoint is kept; try another --seed, and please report the scene",
@@ -204,24 +177,15 @@ class Fitting:
         tensors = {
             "generator": self.generator.get_state(),
             **self.occupancy.state(),
-            "table_first": self.table_first,
-            "table_second": self.table_second,
+            **self.optimiser.state(),
         }
-        for index, entry in self.optimiser.state_dict()["state"].items():
-            tensors.update({f"adam.{index}.{name}": value for name, value in entry.items()})
         return tensors, {"step": self.step, "samples_per_ray": self.samples_per_ray}
 
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
         """Take up what `state` gave; the field's weights are loaded by the caller."""
         self.generator.set_state(tensors["generator"].cpu())
         self.occupancy.restore(tensors)
-        self.table_first, self.table_second = tensors["table_first"], tensors["table_second"]
-        entries: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith("adam."):
-                _, index, name = key.split(".")
-                entries.setdefault(int(index), {})[name] = value
-        self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": entries})
+        self.optimiser.restore(tensors)
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.occupied = self._open_cells()

@@ -1,0 +1,30 @@
+"""The kinds of fields, by the names that checkpoints and the command line give them."""
+
+from typing import Any
+
+from nerfcli.errors import UserError
+from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.field.interface import Field, FieldSettings
+
+
+def fresh_field(settings: FieldSettings) -> Field:
+    """A field that has learned nothing, from torch's random numbers."""
+    match settings:
+        case HashFieldSettings():
+            return HashField(settings)
+        case _:
+            raise ValueError(f"no field is made from {type(settings).__name__}")
+
+
+def settings_from_json(content: dict[str, Any]) -> FieldSettings:
+    """What `FieldSettings.to_json` gave; before there were kinds, all fields were hash grids.
+
+    Raises:
+        UserError: the kind is not known here.
+    """
+    sizes = {name: value for name, value in content.items() if name != "kind"}
+    match content.get("kind", HashFieldSettings.kind):
+        case HashFieldSettings.kind:
+            return HashFieldSettings(**sizes)
+        case kind:
+            raise UserError(f"fields of the kind {kind!r} are not known here", "use the nerfcli that trained it")

@@ -1,0 +1,73 @@
+"""Adam for a field: on all parameters that take part in every sample, and on the rows that a step has touched."""
+
+import torch
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.field.interface import Field
+
+BETAS = (0.9, 0.99)
+EPS = 1e-15
+
+
+class FieldOptimiser:
+    """Adam's moments for a field's rows and weights.
+
+    `sink` collects the gradient of the rows: it is made once, given to `Field.radiance_of_samples`, and empty again
+    after each step. None for a field without rows.
+    """
+
+    def __init__(self, field: Field):
+        self._field = field
+        rows = field.rows()
+        self._weights = {name: parameter for name, parameter in field.named_parameters() if parameter is not rows}
+        # Their rate is set at every step.
+        self._adam = torch.optim.Adam(self._weights.values(), betas=BETAS, eps=EPS) if self._weights else None
+        self.sink = self._first = self._second = None
+        if rows is not None:
+            self.sink, self._first, self._second = (torch.zeros_like(rows, requires_grad=False) for _ in range(3))
+
+    def zero_grad(self) -> None:
+        """Forget the gradients of the weights; those of the rows went with the step that used them."""
+        if self._adam is not None:
+            self._adam.zero_grad(set_to_none=True)
+
+    def gradients(self) -> dict[str, Tensor]:
+        """By name, those through which everything comes that could be non-finite: the rows' only without weights."""
+        if not self._weights and self.sink is not None:
+            return {"rows": self.sink}
+        return {name: weight.grad for name, weight in self._weights.items() if weight.grad is not None}
+
+    def step(self, number: int, rate: float) -> None:
+        """Step `number`, from 1, at a learning rate."""
+        rate = rate * self._field.rate_factor
+        if self._adam is not None:
+            for group in self._adam.param_groups:
+                group["lr"] = rate
+            self._adam.step()
+        rows = self._field.rows()
+        if rows is not None and self.sink is not None and self._first is not None and self._second is not None:
+            kernels.adam_rows(rows, self.sink, self._first, self._second, step=number, rate=rate, betas=BETAS, eps=EPS)
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs; the field's own numbers are not in it."""
+        tensors: dict[str, Tensor] = {}
+        if self._first is not None and self._second is not None:
+            tensors |= {"table_first": self._first, "table_second": self._second}
+        if self._adam is not None:
+            for index, entry in self._adam.state_dict()["state"].items():
+                tensors |= {f"adam.{index}.{name}": value for name, value in entry.items()}
+        return tensors
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take up what `state` gave; other tensors may stand beside it."""
+        if self._first is not None:
+            self._first, self._second = tensors["table_first"], tensors["table_second"]
+        if self._adam is None:
+            return
+        entries: dict[int, dict[str, Tensor]] = {}
+        for key, value in tensors.items():
+            if key.startswith("adam."):
+                _, index, name = key.split(".")
+                entries.setdefault(int(index), {})[name] = value
+        self._adam.load_state_dict({**self._adam.state_dict(), "state": entries})
