@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "evaluate": {"render", "field", "scene", "cameras", "media"},
     "export": {"render", "field", "scene", "cameras", "media"},
     "selftest": {"render", "field", "kernels", "cameras"},
-    "report": {"media", "pages"},
+    "report": {"train", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},
     "viewer": {"render", "field", "scene", "cameras", "media"},
 }
 # Libraries that are heavy, or whose ways must not spread, and the parts that may use them.

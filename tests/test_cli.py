@@ -370,6 +370,11 @@ def test_train_evaluate_render_info_in_a_row(capture):
     depth, meta = read_tiff(folder / "depth" / "test" / "r_000.tiff")
     assert depth.shape == (9, 12)
     assert (meta.convention, meta.axis, meta.unit) == ("median", "ray", "arbitrary")
+    reported = nerfcli("report", run, "--quiet")
+    assert (reported.exit_code, reported.stdout) == (0, f"{run / 'report.html'}\n")
+    assert f"{metrics['mean']['psnr']:.2f} dB" in (run / "report.html").read_text(encoding="utf-8")
+    both = nerfcli("report", run, run, "-o", run / "report.html")
+    assert (both.exit_code, "is no page of this report" in both.stderr) == (3, True)
     told = json.loads(nerfcli("info", run, "--json").stdout)
     assert (told["kind"], told["photos"], told["held_out"], told["step"]) == ("run", 4, 1, 1)
     assert told["metrics"] == metrics["mean"]

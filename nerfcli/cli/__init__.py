@@ -5,7 +5,7 @@ import os
 import typer
 
 from nerfcli import __version__
-from nerfcli.cli import convert, doctor, evaluate, info, poses, render, run, selftest, train
+from nerfcli.cli import convert, doctor, evaluate, info, poses, render, report, run, selftest, train
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -14,7 +14,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for _module in (doctor, poses, train, evaluate, render, run, info, convert, selftest):
+for _module in (doctor, poses, train, evaluate, render, report, run, info, convert, selftest):
     _name = _module.__name__.rsplit(".", 1)[-1]
     app.command(_name)(getattr(_module, _name))
 
@@ -33,6 +33,7 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       nerfcli train photos-scene/ --budget 2m      -> photos-scene-run/
       nerfcli evaluate photos-scene-run/           -> photos-scene-run/metrics.json
       nerfcli render photos-scene-run/ --cameras orbit --depth conditional --video
+      nerfcli report photos-scene-run/             -> photos-scene-run/report.html
     Cameras between formats, proved:
       nerfcli convert photos-scene/ transforms.json --to transforms
     Many captures:

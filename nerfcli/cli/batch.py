@@ -29,7 +29,7 @@ def for_each_input(source: str, work: Callable[[Path, bool], None]) -> None:
         return
     first_failure: UserError | None = None
     count = 0
-    for path in _stdin_paths():
+    for path in stdin_paths():
         count += 1
         try:
             with out_of_memory_told():
@@ -45,7 +45,7 @@ def for_each_input(source: str, work: Callable[[Path, bool], None]) -> None:
         raise typer.Exit(first_failure.exit_code)
 
 
-def _stdin_paths() -> Iterator[Path]:
+def stdin_paths() -> Iterator[Path]:
     """Lines of standard input as paths, each as soon as it is complete; empty lines are passed over."""
     while line := sys.stdin.readline():
         if text := line.rstrip("\r\n"):

@@ -34,6 +34,17 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
     Raises:
         ValueError: lo and hi are not finite or not in order.
     """
+    picture = coloured(depth, lo=lo, hi=hi, colour_map=colour_map)
+    legend = _legend(meta, lo=lo, hi=hi, colour_map=colour_map, width=depth.shape[1])
+    sheet = np.full((len(picture) + len(legend), legend.shape[1], 3), _PAPER, dtype=np.uint8)
+    left = (legend.shape[1] - depth.shape[1]) // 2
+    sheet[: len(picture), left : left + depth.shape[1]] = picture
+    sheet[len(picture) :] = legend
+    return sheet
+
+
+def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.ndarray:
+    """The colours of `preview` without its legend, uint8 RGB (height, width, 3); arguments and errors as there."""
     if not -math.inf < lo <= hi < math.inf:
         raise ValueError(f"lo <= hi must be finite, got {lo}, {hi}")
     valid = np.isfinite(depth)
@@ -42,13 +53,7 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
     picture = levels_of(colour_map)[np.rint(level * 255).astype(np.uint8)]
     rows, columns = np.indices(depth.shape)
     picture[~valid] = _HATCH[(rows + columns) // 4 % 2][~valid]
-
-    legend = _legend(meta, lo=lo, hi=hi, colour_map=colour_map, width=depth.shape[1])
-    sheet = np.full((len(picture) + len(legend), legend.shape[1], 3), _PAPER, dtype=np.uint8)
-    left = (legend.shape[1] - depth.shape[1]) // 2
-    sheet[: len(picture), left : left + depth.shape[1]] = picture
-    sheet[len(picture) :] = legend
-    return sheet
+    return picture
 
 
 def beside(sheets: Sequence[np.ndarray]) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""One page about a training, or about several side by side."""

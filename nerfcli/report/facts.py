@@ -1,0 +1,144 @@
+"""What the folders of a run and of its scene tell: settings, log, numbers, poses, and what was warned about."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerfcli.errors import UserError
+from nerfcli.evaluate.protocol import METRICS
+from nerfcli.train.run_folder import FIELD, read_cameras, read_config, read_log
+
+POSES_REPORT = "poses_report.json"
+# Photos named in a warning; the others are counted.
+_NAMED = 6
+# Blur by the uncertainty of a pose that shows at the size of the photos.
+_VISIBLE_BLUR_PX = 1.0
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """One run.
+
+    Args:
+        path: its folder.
+        label: what it is called on the page.
+        config: RUN/config.json.
+        log: RUN/log.jsonl.
+        metrics: RUN/metrics.json; None before it was evaluated, or where it is of another checkpoint.
+        poses: the scene's poses_report.json; None where poses came from elsewhere or the scene has moved.
+        frames: of "train" and "test".
+        field_bytes: of the checkpoint.
+    """
+
+    path: Path
+    label: str
+    config: dict[str, Any]
+    log: list[dict[str, Any]]
+    metrics: dict[str, Any] | None
+    poses: dict[str, Any] | None
+    frames: dict[str, tuple[Any, ...]]
+    field_bytes: int
+
+
+def read_facts(run: Path, label: str, *, checkpoint_sha256: str) -> RunFacts:
+    """Everything that the folders tell of a run.
+
+    Args:
+        run: the folder that train wrote.
+        label: what it is called on the page.
+        checkpoint_sha256: of its field: numbers of another one are left out.
+
+    Raises:
+        UserError: it is not a run, or one of its files cannot be read.
+    """
+    config = read_config(run)
+    metrics = _json(run / METRICS)
+    if metrics is not None and metrics.get("checkpoint_sha256") != checkpoint_sha256:
+        metrics = None
+    return RunFacts(
+        path=run,
+        label=label,
+        config=config,
+        log=read_log(run),
+        metrics=metrics,
+        poses=_json(Path(config.get("scene", "")) / POSES_REPORT),
+        frames=read_cameras(run),
+        field_bytes=(run / FIELD).stat().st_size,
+    )
+
+
+def labels_of(runs: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that tell them apart."""
+    parts = [run.resolve().parts for run in runs]
+    for depth in range(1, max(map(len, parts)) + 1):
+        labels = ["/".join(part[-depth:]) for part in parts]
+        if len(set(labels)) == len(labels):
+            return labels
+    return [f"{run} ({index + 1})" for index, run in enumerate(runs)]
+
+
+def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
+    """(stage, text) of everything that was warned about on the way to this run, in the order of the stages."""
+    yield from _of_poses(facts.poses or {})
+    missing = facts.config.get("missing_photos", [])
+    if missing:
+        yield "scene", f"{len(missing)} photos are not there: {_listed(missing)}"
+    for note in facts.config.get("warnings", []):
+        yield "training", note
+    rollbacks = max((entry.get("rollbacks", 0) for entry in facts.log), default=0)
+    if rollbacks:
+        yield "training", f"numbers became non-finite {rollbacks} times; training went back and on with smaller steps"
+    if facts.metrics is None:
+        yield "evaluation", "no numbers of this checkpoint: nerfcli evaluate measures them"
+    else:
+        yield from (("evaluation", text) for text in facts.metrics.get("warnings", []))
+
+
+def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
+    """Why numbers of these runs must not be compared with each other."""
+    measured = [run for run in runs if run.metrics is not None]
+    if len({run.config.get("split_sha256") for run in runs}) > 1:
+        yield "the runs hold out different photos"
+    if len({(run.metrics or {}).get("protocol") for run in measured}) > 1:
+        yield "the runs were evaluated by different protocols"
+    if len({(run.metrics or {}).get("device") for run in measured}) > 1:
+        yield "the runs were evaluated on different machines or threads: compare errors, not times"
+
+
+def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    left_out = [image for image in poses.get("images", []) if not image.get("registered")]
+    if left_out:
+        told = _listed([f"{image['name']} ({image.get('reason') or 'no reason known'})" for image in left_out])
+        yield "poses", f"{len(left_out)} photos have no pose: {told}"
+    for failure in poses.get("verdict", {}).get("failures", []):
+        yield "poses", str(failure)
+    attempts = poses.get("attempts", [])
+    if len(attempts) > 1:
+        yield "poses", f"it took {len(attempts)} attempts: {', '.join(str(one.get('what')) for one in attempts)}"
+    blur = poses.get("pose_blur_px") or {}
+    if (blur.get("largest") or 0.0) > _VISIBLE_BLUR_PX:
+        yield "poses", f"the pose of {blur.get('photo')} is uncertain by {blur['largest']:.1f} px"
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
+
+
+def _json(path: Path) -> dict[str, Any] | None:
+    """The object in a file; None where there is no such file.
+
+    Raises:
+        UserError: it is there and is no JSON object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}", "write it again with the command that made it") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path} is no JSON object", "write it again with the command that made it")
+    return content

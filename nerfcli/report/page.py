@@ -1,0 +1,326 @@
+"""The page: what was captured, how it was posed and trained, what it shows of photos it has not seen, and how fast."""
+
+from collections.abc import Callable, Sequence
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from nerfcli.media.colour_maps import levels_of
+from nerfcli.media.depth import DepthMeta
+from nerfcli.pages import page
+from nerfcli.pages.pictures import data_uri, jpeg_bytes
+from nerfcli.pages.tables import table
+from nerfcli.report.drawings import Curve, curves, from_above
+from nerfcli.report.facts import RunFacts, mismatches_of, warnings_of
+from nerfcli.report.views import DEPTH_COLOURS, ERROR_COLOURS, ERROR_RANGE, Look, Seen
+
+# Curves of more runs than these share colours.
+COLOURS = 6
+_PICTURE_PX = 800
+_MEGA = 1e6
+
+
+def mark_of(runs: Sequence[Path]) -> page.Mark:
+    """Whose page a report on these runs is."""
+    return page.Mark("report", Path("|".join(str(run.resolve()) for run in runs)))
+
+
+def page_html(runs: Sequence[RunFacts], looks: Sequence[Look], *, depth: DepthMeta) -> str:
+    """The page's text.
+
+    Args:
+        runs: at least one.
+        looks: what each of them shows; photos of the same name stand side by side.
+        depth: the meaning of the depths, in the unit of the first run.
+    """
+    title = " against ".join(run.label for run in runs) if len(runs) < 4 else f"{len(runs)} runs"
+    body = _BODY.substitute(
+        title=escape(title),
+        count="a run" if len(runs) == 1 else f"{len(runs)} runs",
+        warnings=_warnings_html(runs),
+        numbers=_columns(runs, _NUMBERS) + _protocols_html(runs),
+        views=_views_html(runs, looks),
+        legends=_legends_html(runs, looks, depth),
+        curves=_curves_html(runs),
+        photos=_photos_html(runs),
+        capture=_columns(runs, _CAPTURE),
+        cameras=_cameras_html(runs),
+        settings=_settings_html(runs),
+    )
+    style = page.asset("compare.css") + _STYLE
+    script = page.asset("compare.js")
+    return page.page_html(title=title, mark=mark_of([run.path for run in runs]), style=style, body=body, script=script)
+
+
+def _warnings_html(runs: Sequence[RunFacts]) -> str:
+    rows = [("comparison", text) for text in mismatches_of(runs)]
+    for run in runs:
+        of = f"{run.label}: " if len(runs) > 1 else ""
+        rows += [(stage, of + text) for stage, text in warnings_of(run)]
+    items = "".join(f"<li><b>{escape(stage)}</b> {escape(text)}</li>" for stage, text in rows)
+    return f'<ul class="warned">{items}</ul>' if rows else "<p>Nothing was warned about.</p>"
+
+
+def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> str:
+    """A table with a column for each run; rows that no run has anything for are left out."""
+    cells = [(name, *(read(run) for run in runs)) for name, read in rows]
+    kept = [row for row in cells if any(row[1:])]
+    return table(("", *(run.label for run in runs)), kept, numbers=range(1, len(runs) + 1))
+
+
+def _protocols_html(runs: Sequence[RunFacts]) -> str:
+    """How the numbers were made, each way once."""
+    protocols = dict.fromkeys(str(run.metrics["protocol"]) for run in runs if run.metrics)
+    return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
+
+
+def _metric(key: str, form: str) -> Callable[[RunFacts], str]:
+    def read(run: RunFacts) -> str:
+        value = (run.metrics or {}).get("mean", {}).get(key)
+        return form.format(value) if isinstance(value, int | float) else ""
+
+    return read
+
+
+def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+    def read(run: RunFacts) -> str:
+        content: dict[str, Any] = (run.metrics if part in ("training", "render") else run.poses) or {}
+        value = content.get(part, content).get(key) if part else content.get(key)
+        return form.format(value / scale) if isinstance(value, int | float) else ""
+
+    return read
+
+
+def _last(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+    return lambda run: form.format(run.log[-1][key] / scale) if run.log and key in run.log[-1] else ""
+
+
+_NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
+    ("PSNR of held-out photos", _metric("psnr", "{:.2f} dB")),
+    ("SSIM", _metric("ssim", "{:.4f}")),
+    ("LPIPS", _metric("lpips", "{:.4f}")),
+    ("training", _last("seconds", "{:.1f} s")),
+    ("steps", _last("step", "{:,}")),
+    ("samples a second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),
+    ("peak memory", _last("peak_memory_bytes", "{:.0f} MB", _MEGA)),
+    ("checkpoint", lambda run: f"{run.field_bytes / _MEGA:.1f} MB"),
+    ("a picture takes", _of("render", "seconds_per_image", "{:.2f} s")),
+    ("measured on", lambda run: str((run.metrics or {}).get("device", ""))),
+)
+
+
+def _size(run: RunFacts) -> str:
+    cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames["train"], *run.frames["test"])}
+    return ", ".join(f"{width} x {height}" for width, height in sorted(cameras)[:4])
+
+
+def _unit(run: RunFacts) -> str:
+    source = run.config.get("unit_source")
+    return str(run.config.get("unit", "")) + (f" ({source})" if source else "")
+
+
+def _registered(run: RunFacts) -> str:
+    return f"{run.poses['registered']} of {run.poses['total']}" if run.poses and "registered" in run.poses else ""
+
+
+def _lenses(run: RunFacts) -> str:
+    return ", ".join(f"{lens['model']} ({lens['images']} photos)" for lens in (run.poses or {}).get("cameras", []))
+
+
+def _verdict(run: RunFacts) -> str:
+    verdict = (run.poses or {}).get("verdict")
+    return ("accepted on evidence" if verdict.get("accepted") else "not accepted") if verdict else ""
+
+
+_CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
+    ("scene", lambda run: Path(str(run.config.get("scene", ""))).name),
+    ("format", lambda run: str(run.config.get("scene_kind", ""))),
+    ("photos to train on", lambda run: str(len(run.frames["train"]))),
+    ("photos held out", lambda run: str(len(run.frames["test"]))),
+    ("size", _size),
+    ("unit of length", _unit),
+    ("poses found", _registered),
+    ("the result was", _verdict),
+    ("lenses", _lenses),
+    ("points", _of("", "points", "{:,}")),
+    ("mean reprojection error", _of("", "mean_reprojection_error_px", "{:.2f} px")),
+    ("blur by uncertain poses, median", _of("pose_blur_px", "median", "{:.2f} px")),
+    ("blur by uncertain poses, largest", _of("pose_blur_px", "largest", "{:.2f} px")),
+    ("structure from motion took", _of("seconds", "total", "{:.0f} s")),
+)
+
+
+def _views_html(runs: Sequence[RunFacts], looks: Sequence[Look]) -> str:
+    names = list(dict.fromkeys(view.name for look in looks for view in look.views))
+    layers, figures = [], []
+    for index, name in enumerate(names):
+        seen = [(run, view) for run, look in zip(runs, looks, strict=True) for view in look.views if view.name == name]
+        first = seen[0][1]
+        layers.append(_layers(first, seen, alone=len(runs) == 1))
+        height, width = first.photo.shape[:2]
+        told = "; ".join(
+            f"{run.label + ': ' if len(runs) > 1 else ''}{view.psnr:.2f} dB, SSIM {view.ssim:.3f}, "
+            f"depth in {100 * view.with_depth:.0f} % of the pixels"
+            for run, view in seen
+        )
+        figures.append(
+            f'<figure class="compare" data-view="{index}"><figcaption><b>{escape(name)}</b> {escape(told)}</figcaption>'
+            f'<div class="stage" style="aspect-ratio:{width}/{height}"><img alt=""><img alt="">'
+            '<div class="line"></div></div><input type="range" min="0" max="100" value="50" aria-label="border">'
+            '<div class="layers"><select aria-label="left"></select><select aria-label="right"></select></div></figure>'
+        )
+    if not figures:
+        return "<p>No photo was held out.</p>"
+    noscript = "<noscript><p>The pictures need JavaScript; nothing is loaded from elsewhere.</p></noscript>"
+    return f'{noscript}<div class="views">{"".join(figures)}</div>{page.data_element("views", layers)}'
+
+
+def _layers(first: Seen, seen: Sequence[tuple[RunFacts, Seen]], *, alone: bool) -> list[dict[str, str]]:
+    """What can be shown of a photo: it is compared from the bottom of the list, so the upper images come first."""
+
+    def layer(label: str, picture: Any) -> dict[str, str]:
+        return {"label": label, "uri": data_uri(jpeg_bytes(picture, longest_px=_PICTURE_PX), "jpeg")}
+
+    def named(kind: str, run: RunFacts) -> str:
+        return kind if alone else f"{run.label}: {kind}"
+
+    pictures = [layer(named("rendered", run), view.picture) for run, view in seen]
+    errors = [layer(named("error", run), view.error) for run, view in seen]
+    depths = [layer(named("depth", run), view.depth) for run, view in seen]
+    return [layer("photo", first.photo), *pictures, *errors, *depths]
+
+
+def _legends_html(runs: Sequence[RunFacts], looks: Sequence[Look], depth: DepthMeta) -> str:
+    rows = [_legend("error", ERROR_COLOURS, "0", f">= {ERROR_RANGE:g}", "mean absolute difference of sRGB in [0, 1]")]
+    for run, look in zip(runs, looks, strict=True):
+        low, high = look.depth_range
+        name = "depth" if len(runs) == 1 else f"depth, {run.label}"
+        rows.append(_legend(name, DEPTH_COLOURS, f"<= {low:.3g}", f">= {high:.3g}", depth.in_words()))
+    return "".join(rows)
+
+
+def _legend(name: str, colour_map: str, low: str, high: str, text: str) -> str:
+    stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in levels_of(colour_map)[::15].tolist())
+    return (
+        f'<p class="legend"><b>{escape(name)}</b> {escape(low)} '
+        f'<span style="background:linear-gradient(90deg,{stops})"></span> {escape(high)}; {escape(text)}</p>'
+    )
+
+
+def _curves_html(runs: Sequence[RunFacts]) -> str:
+    def drawn(key: str, *, scale: float = 1.0, dots: bool = False) -> list[Curve]:
+        found = []
+        for index, run in enumerate(runs):
+            entries = [entry for entry in run.log if isinstance(entry.get(key), int | float)]
+            x, y = [entry["seconds"] for entry in entries], [entry[key] / scale for entry in entries]
+            found.append(Curve(index % COLOURS, run.label, x, y, dots))
+        return found
+
+    charts = (
+        ("PSNR of held-out pixels, dB", curves(drawn("heldout_psnr", dots=True), x_title="s", y_title="dB")),
+        ("Loss", curves(drawn("loss"), x_title="s", y_title="loss", logarithmic=True)),
+        ("Samples a second, M", curves(drawn("samples_per_second", scale=_MEGA), x_title="s", y_title="M/s")),
+        ("Peak memory, MB", curves(drawn("peak_memory_bytes", scale=_MEGA), x_title="s", y_title="MB")),
+    )
+    key = "".join(
+        f'<span><i class="s{index % COLOURS}"></i>{escape(run.label)}</span>' for index, run in enumerate(runs)
+    )
+    sections = "".join(f'<section class="chart"><h3>{title}</h3>{chart}</section>' for title, chart in charts if chart)
+    if not sections:
+        return "<p>The log of the training is empty.</p>"
+    return (f'<p class="key">{key}</p>' if len(runs) > 1 else "") + f'<div class="charts pairs">{sections}</div>'
+
+
+def _photos_html(runs: Sequence[RunFacts]) -> str:
+    """PSNR and SSIM of every held-out photo by every run."""
+    by_run = [{image["name"]: image for image in (run.metrics or {}).get("images", [])} for run in runs]
+    names = sorted({name for images in by_run for name in images})
+    if not names:
+        return "<p>Not measured.</p>"
+    columns = ["photo"]
+    for run in runs:
+        of = f"{run.label}: " if len(runs) > 1 else ""
+        columns += [f"{of}PSNR, dB", f"{of}SSIM"]
+    rows = []
+    for name in names:
+        row = [name]
+        for images in by_run:
+            image = images.get(name, {})
+            row += [
+                f"{image['psnr']:.2f}" if "psnr" in image else "",
+                f"{image['ssim']:.4f}" if "ssim" in image else "",
+            ]
+        rows.append(row)
+    return table(columns, rows, numbers=range(1, len(columns)))
+
+
+def _cameras_html(runs: Sequence[RunFacts]) -> str:
+    """The cameras of every scene, once."""
+    drawn: dict[str, str] = {}
+    for run in runs:
+        scene = str(run.config.get("scene_fingerprint", run.path))
+        drawn.setdefault(scene, from_above(run.frames["train"], run.frames["test"]))
+    return "".join(f'<section class="chart">{drawing}</section>' for drawing in drawn.values() if drawing)
+
+
+def _settings_html(runs: Sequence[RunFacts]) -> str:
+    """Every setting and version; where runs differ, the row is marked and comes first."""
+    per_run = [
+        _flat({"settings": run.config.get("settings", {}), "versions": run.config.get("versions", {})}) for run in runs
+    ]
+    keys = list(dict.fromkeys(key for settings in per_run for key in settings))
+    rows = [(key, *(settings.get(key, "") for settings in per_run)) for key in keys]
+    differing = [row for row in rows if len(set(row[1:])) > 1]
+    same = [row for row in rows if len(set(row[1:])) == 1]
+    marked = [(f"differs: {row[0]}", *row[1:]) for row in differing]
+    return table(("", *(run.label for run in runs)), [*marked, *same], numbers=range(1, len(runs) + 1))
+
+
+def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    flat: dict[str, str] = {}
+    for key, value in content.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{name}.")
+        else:
+            flat[name] = "-" if value is None else str(value)
+    return flat
+
+
+_STYLE = """\
+.warned li{margin:2px 0}.warned b{color:var(--look);margin-right:6px}
+.pairs{grid-template-columns:repeat(auto-fill,minmax(min(100%,420px),1fr))}
+.chart polyline{fill:none;stroke-width:1.6;stroke-linejoin:round}
+.s0{stroke:#3b7dd8;fill:#3b7dd8;background:#3b7dd8}.s1{stroke:#d9822b;fill:#d9822b;background:#d9822b}
+.s2{stroke:#2c9a66;fill:#2c9a66;background:#2c9a66}.s3{stroke:#b6479b;fill:#b6479b;background:#b6479b}
+.s4{stroke:#7b61c9;fill:#7b61c9;background:#7b61c9}.s5{stroke:#8c8c35;fill:#8c8c35;background:#8c8c35}
+.key span{margin-right:18px}.key i{display:inline-block;width:12px;height:12px;border-radius:3px;margin-right:6px}
+.legend{font-size:13px;color:var(--soft);margin:8px 0}.legend b{color:var(--ink)}
+.legend span{display:inline-block;width:140px;height:10px;border-radius:3px;vertical-align:middle;margin:0 4px}
+.above{max-width:420px}.above .train{stroke:var(--bar);fill:var(--bar)}.above .test{stroke:var(--look);fill:var(--look)}
+"""
+
+_BODY = Template("""\
+<div class="top"><div><h1>$title</h1><p>nerfcli report on $count</p></div></div>
+<h2>Numbers</h2>
+$numbers
+<h2>What was warned about</h2>
+$warnings
+<h2>Photos that training did not see</h2>
+<p>Drag the border; the lists below each picture choose what stands on its left and on its right.</p>
+$views
+$legends
+<h2>Training</h2>
+$curves
+<h2>Every held-out photo</h2>
+$photos
+<h2>Capture and poses</h2>
+$capture
+<h2>Cameras</h2>
+<p>In the plane in which they lie best; lines point where they look. Marked: held-out photos.</p>
+<div class="charts pairs">$cameras</div>
+<h2>Settings and versions</h2>
+$settings
+<footer>Pictures are compared as sRGB in 8 bit. Depth and errors shown here are of the field, rendered anew for
+this page.</footer>""")

@@ -1,0 +1,208 @@
+"""Reports: numbers and pictures are those of the run, warnings are complete, and hostile names stay text."""
+
+import html
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fog import fog, foggy_cells
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.evaluate.protocol import HeldOut
+from nerfcli.export.settings import depth_meta
+from nerfcli.media.colour_maps import levels_of
+from nerfcli.render.depth import DepthRequest
+from nerfcli.report.drawings import Curve, curves, from_above
+from nerfcli.report.facts import RunFacts, labels_of, mismatches_of, warnings_of
+from nerfcli.report.page import page_html
+from nerfcli.report.views import ERROR_RANGE, Look, error_map, spread_evenly
+from nerfcli.report.views import look_at as look_through
+
+EVIL = "</script><script>alert(1)</script><b>\"'"
+DEPTH = DepthRequest("conditional", "z", min_opacity=0.1)
+
+
+def camera_at(name: str, place: tuple[float, float, float]) -> Frame:
+    pose = look_at(np.array(place), np.zeros(3), np.array([0.0, -1.0, 0.0]))
+    return Frame(name, Camera.pinhole(10, 8, 8.0), pose)
+
+
+def facts(label: str = "a run", **changes: Any) -> RunFacts:
+    run = RunFacts(
+        path=Path(label.replace("/", "_")),
+        label=label,
+        config={"scene": "kitchen-scene", "split_sha256": "1", "settings": {"seed": 0, "width": 32}},
+        log=[
+            {"step": 10, "seconds": 1.0, "loss": 0.1, "samples_per_second": 1e6, "peak_memory_bytes": 2e8},
+            {"step": 20, "seconds": 2.0, "loss": 0.01, "heldout_psnr": 21.5, "peak_memory_bytes": 3e8},
+        ],
+        metrics={
+            "protocol": "nerfcli-1",
+            "mean": {"psnr": 23.456, "ssim": 0.75},
+            "images": [{"name": "a.png", "psnr": 23.456, "ssim": 0.75}],
+            "training": {"samples_per_second": 1.5e6},
+            "render": {"seconds_per_image": 0.25},
+        },
+        poses=None,
+        frames={"train": (camera_at("b.png", (0, 0, -2)),), "test": (camera_at("a.png", (0, 0, -2)),)},
+        field_bytes=8_000_000,
+    )
+    return replace(run, **changes)
+
+
+@pytest.fixture(scope="module")
+def seen() -> tuple[Look, np.ndarray]:
+    """What a cube of fog shows of a grey photo."""
+    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
+    photo = np.full((8, 10, 3), 128, np.uint8)
+    shares: list[float] = []
+    held_out = [HeldOut(camera_at(name, (0.0, 0.0, -2.0)), photo, None) for name in ("a.png", EVIL)]
+    look = look_through(model, held_out, depth=DEPTH, on_share=shares.append)
+    assert shares == [0.5, 1.0]
+    return look, photo
+
+
+def test_views_hold_the_photo_and_what_the_field_shows_of_it(seen):
+    look, photo = seen
+    view = look.views[0]
+    np.testing.assert_array_equal(view.photo, photo)
+    assert view.picture.shape == view.error.shape == view.depth.shape == (8, 10, 3)
+    np.testing.assert_array_equal(view.picture[0, 0], np.rint(np.array([0.2, 0.4, 0.6]) * 255))  # beside the cube
+    difference = (view.picture.astype(float) - photo) / 255.0
+    assert view.psnr == pytest.approx(-10 * np.log10(np.square(difference).mean()), abs=1e-9)
+    assert 0.0 < view.with_depth < 1.0
+    low, high = look.depth_range
+    assert 1.5 <= low < high <= 2.5  # between the cube's front and back
+
+
+def test_errors_have_the_colours_of_their_size_and_what_does_not_count_is_grey():
+    photo = np.zeros((1, 4, 3), np.uint8)
+    picture = np.zeros_like(photo)
+    picture[0, 1] = round(255 * ERROR_RANGE / 2)
+    picture[0, 2] = 255
+    drawn = error_map(picture, photo, used=np.array([[True, True, True, False]]))
+    colours = levels_of("viridis")
+    np.testing.assert_array_equal(drawn[0, 0], colours[0])
+    np.testing.assert_allclose(drawn[0, 1].astype(int), colours[128], atol=2)
+    np.testing.assert_array_equal(drawn[0, 2], colours[255])
+    np.testing.assert_array_equal(drawn[0, 3], 128)
+
+
+def test_photos_are_chosen_from_the_worst_to_the_best():
+    names = [f"{index}.jpg" for index in range(9)]
+    quality = {name: float((5 * index) % 9) for index, name in enumerate(names)}
+    chosen = spread_evenly(names, 3, quality=quality)
+    assert sorted(quality[name] for name in chosen) == [0.0, 4.0, 8.0]
+    assert chosen == sorted(chosen)
+    assert spread_evenly(names, 20, quality={}) == names
+    assert spread_evenly(names, 3, quality={}) == ["0.jpg", "4.jpg", "8.jpg"]
+    assert spread_evenly(names, 0, quality=quality) == []
+
+
+def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
+    look, _ = seen
+    text = page_html([facts()], [look], depth=_meta())
+    for told in ("23.46 dB", "0.7500", "1.50 M", "0.25 s", "8.0 MB", "300 MB", "conditional depth along the optical"):
+        assert told in text
+    assert not re.search(r"(src|href)=\"?http", text)
+    data = re.search(r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL)
+    assert data is not None
+    layers = json.loads(data[1])
+    assert [layer["label"] for layer in layers[0]] == ["photo", "rendered", "error", "depth"]
+    assert all(layer["uri"].startswith("data:image/jpeg;base64,") for view in layers for layer in view)
+
+
+def test_what_comes_from_outside_stays_text(seen):
+    look, _ = seen
+    run = facts(EVIL, config={"scene": EVIL, "settings": {EVIL: EVIL}, "missing_photos": [EVIL], "unit": EVIL})
+    text = page_html([run], [look], depth=_meta())
+    assert "<script>alert" not in text
+    assert "<b>\"'" not in text
+    assert html.escape(EVIL) in text
+
+
+def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
+    look, _ = seen
+    other = facts("another", config={**facts().config, "settings": {"seed": 0, "width": 64}})
+    text = page_html([facts(), other], [look, look], depth=_meta())
+    assert "differs: settings.width" in text
+    assert text.index("differs: settings.width") < text.index(">settings.seed<")
+    assert "another: rendered" in text
+
+
+def test_numbers_that_must_not_be_compared_are_named():
+    one = facts()
+    assert list(mismatches_of([one, facts("b")])) == []
+    assert one.metrics is not None
+    foreign = replace(one, config={"split_sha256": "2"}, metrics={**one.metrics, "protocol": "x", "device": "cuda"})
+    told = list(mismatches_of([one, foreign]))
+    assert len(told) == 3
+    assert "hold out different photos" in told[0]
+
+
+def test_everything_that_was_warned_about_is_listed():
+    poses = {
+        "images": [{"name": "c.png", "registered": False, "reason": "too few matches"}, {"registered": True}],
+        "verdict": {"failures": ["the focal length is 9 times the width"]},
+        "attempts": [{"what": "default thresholds"}, {"what": "full size"}],
+        "pose_blur_px": {"largest": 3.21, "photo": "d.png"},
+    }
+    run = facts(poses=poses, metrics=None, config={"missing_photos": ["e.png"], "warnings": ["intrinsics were halved"]})
+    run.log.append({"step": 30, "seconds": 3.0, "rollbacks": 2})
+    told = [f"{stage}: {text}" for stage, text in warnings_of(run)]
+    for part in (
+        *("c.png (too few matches)", "9 times the width", "2 attempts", "d.png is uncertain by 3.2 px"),
+        *("e.png", "intrinsics were halved", "non-finite 2 times", "nerfcli evaluate"),
+    ):
+        assert sum(part in text for text in told) == 1, part
+    assert len(told) == 8
+    assert list(warnings_of(facts())) == []
+
+
+def test_labels_are_the_shortest_ends_that_differ():
+    assert labels_of([Path("/a/run")]) == ["run"]
+    assert labels_of([Path("/a/x/run"), Path("/a/y/run")]) == ["x/run", "y/run"]
+    assert labels_of([Path("/a/run"), Path("/a/run")]) == ["/a/run (1)", "/a/run (2)"]
+
+
+def test_curves_go_where_their_values_say():
+    """The first at the left, the last at the right; half of a linear axis half-way; decades evenly on the other."""
+
+    def rows(y: list[float], *, logarithmic: bool) -> np.ndarray:
+        drawn = curves([Curve(0, "a", [0, 1, 2], y)], x_title="s", y_title="y", logarithmic=logarithmic)
+        found = re.search(r'points="([^"]+)"', drawn)
+        assert found is not None
+        return np.array([point.split(",") for point in found[1].split()], float)
+
+    linear, decades = rows([0, 5, 10], logarithmic=False), rows([1, 10, 100], logarithmic=True)
+    for points in (linear, decades):
+        assert np.diff(points[:, 0]) == pytest.approx(np.diff(points[:, 0])[0], abs=0.11)
+        assert np.diff(points[:, 1]) == pytest.approx(np.diff(points[:, 1])[0], abs=0.11)
+        assert points[0, 1] > points[-1, 1]
+    assert curves([Curve(0, "a", [0.0], [float("nan")])], x_title="s", y_title="y") == ""
+    assert curves([Curve(0, "a", [0.0], [0.0])], x_title="s", y_title="y", logarithmic=True) == ""
+    assert "<circle" in curves([Curve(0, "a", [0.0], [1.0], dots=True)], x_title="s", y_title="y")
+
+
+def test_a_ring_of_cameras_is_drawn_as_a_ring_whichever_way_it_is_turned():
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    frames = [camera_at(f"{i}", tuple(turn @ (5 * np.cos(a), 0.0, 5 * np.sin(a)))) for i, a in enumerate(angles)]
+    drawn = from_above(frames[:9], frames[9:])
+    centres = np.array(re.findall(r'cx="([\d.]+)" cy="([\d.]+)"', drawn), float)
+    radii = np.linalg.norm(centres - 150.0, axis=1)
+    assert radii == pytest.approx(np.full(12, radii.mean()), rel=2e-3)
+    assert drawn.count('circle class="test"') == 3
+    assert from_above([], []) == ""
+
+
+def _meta() -> Any:
+    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    return depth_meta(fog(cells, Similarity.identity(), background=(0, 0, 0), step=1 / 32), DEPTH)
