@@ -21,7 +21,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.facts import RunFacts, labels_of, mismatches_of, warnings_of
 from nerfcli.report.page import page_html
-from nerfcli.report.views import ERROR_RANGE, Look, error_map, spread_evenly
+from nerfcli.report.views import ERROR_RANGE, Seen, common_names, depth_range, error_map, spread_evenly
 from nerfcli.report.views import look_at as look_through
 
 EVIL = "</script><script>alert(1)</script><b>\"'"
@@ -57,7 +57,7 @@ def facts(label: str = "a run", **changes: Any) -> RunFacts:
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[Look, np.ndarray]:
+def seen() -> tuple[list[Seen], np.ndarray]:
     """What a cube of fog shows of a grey photo."""
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
@@ -71,14 +71,15 @@ def seen() -> tuple[Look, np.ndarray]:
 
 def test_views_hold_the_photo_and_what_the_field_shows_of_it(seen):
     look, photo = seen
-    view = look.views[0]
+    view = look[0]
     np.testing.assert_array_equal(view.photo, photo)
-    assert view.picture.shape == view.error.shape == view.depth.shape == (8, 10, 3)
+    assert view.picture.shape == view.error.shape == (8, 10, 3)
     np.testing.assert_array_equal(view.picture[0, 0], np.rint(np.array([0.2, 0.4, 0.6]) * 255))  # beside the cube
     difference = (view.picture.astype(float) - photo) / 255.0
     assert view.psnr == pytest.approx(-10 * np.log10(np.square(difference).mean()), abs=1e-9)
     assert 0.0 < view.with_depth < 1.0
-    low, high = look.depth_range
+    assert view.with_depth == np.isfinite(view.depth).mean()
+    low, high = depth_range(look)
     assert 1.5 <= low < high <= 2.5  # between the cube's front and back
 
 
@@ -104,6 +105,17 @@ def test_photos_are_chosen_from_the_worst_to_the_best():
     assert spread_evenly(names, 20, quality={}) == names
     assert spread_evenly(names, 3, quality={}) == ["0.jpg", "4.jpg", "8.jpg"]
     assert spread_evenly(names, 0, quality=quality) == []
+
+
+def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
+    def holding(*names: str) -> RunFacts:
+        return facts(frames={"train": (), "test": tuple(camera_at(name, (0, 0, -2)) for name in names)})
+
+    assert common_names([holding("a.png", "b.png", "c.png"), holding("c.png", "a.png", "d.png")], 8) == [
+        "a.png",
+        "c.png",
+    ]
+    assert common_names([holding("a.png"), holding("b.png")], 8) == []
 
 
 def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
@@ -135,6 +147,14 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert "differs: settings.width" in text
     assert text.index("differs: settings.width") < text.index(">settings.seed<")
     assert "another: rendered" in text
+    farther = [replace(view, depth=view.depth + 1) for view in look]
+    (low, high), (_, highest) = depth_range(look), depth_range([*look, *farther])
+    assert f"&gt;= {highest:.3g}" in page_html(
+        [facts(), other], [look, farther], depth=_meta()
+    )  # one range for a scene
+    foreign = replace(other, config={"scene_fingerprint": "x"})
+    assert f"&gt;= {high:.3g}" in page_html([facts(), foreign], [look, farther], depth=_meta())
+    assert low < high < highest
 
 
 def test_numbers_that_must_not_be_compared_are_named():

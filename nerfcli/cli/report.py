@@ -80,23 +80,31 @@ def report_page(
     from nerfcli.render.model import load_model
     from nerfcli.report.facts import labels_of, read_facts
     from nerfcli.report.page import page_html
-    from nerfcli.report.views import held_out_of, look_at
+    from nerfcli.report.views import common_names, held_out_of, look_at
     from nerfcli.train.run_folder import FIELD, read_config
 
     torch.set_num_threads(threads)
-    for path in paths:
-        read_config(path)  # says what a folder lacks that is not a run, before anything is rendered
-    facts, looks, meanings = [], [], []
+    facts = []
+    for path, label in zip(paths, labels_of(paths), strict=True):
+        read_config(path)  # says what a folder lacks that is not a run
+        facts.append(read_facts(path, label, checkpoint_sha256=hashlib.sha256(_bytes_of(path / FIELD)).hexdigest()))
+    names = common_names(facts, views)
+    looks, meanings = [], []
     with console.progress("report") as update:
-        for index, (path, label) in enumerate(zip(paths, labels_of(paths), strict=True)):
+        for index, run in enumerate(facts):
 
-            def on_share(share: float, index: int = index, label: str = label) -> None:
+            def on_share(share: float, index: int = index, label: str = run.label) -> None:
                 update((index + share) / len(paths), label)
 
-            model = load_model(path / FIELD, device)
-            checkpoint = hashlib.sha256((path / FIELD).read_bytes()).hexdigest()
-            facts.append(read_facts(path, label, checkpoint_sha256=checkpoint))
-            held_out = held_out_of(facts[-1], views, threads=threads)
+            model = load_model(run.path / FIELD, device)
+            held_out = held_out_of(run, names, threads=threads)
             looks.append(look_at(model, held_out, depth=depth, on_share=on_share))
             meanings.append(depth_meta(model, depth))
     return page_html(facts, looks, depth=meanings[0])
+
+
+def _bytes_of(field: Path) -> bytes:
+    try:
+        return field.read_bytes()
+    except OSError as error:
+        raise UserError(f"{field} cannot be read: {error.strerror}", "train first, or give another run") from error

@@ -6,17 +6,21 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
+
 from nerfcli.media.colour_maps import levels_of
 from nerfcli.media.depth import DepthMeta
+from nerfcli.media.preview import coloured
 from nerfcli.pages import page
 from nerfcli.pages.pictures import data_uri, jpeg_bytes
 from nerfcli.pages.tables import table
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.facts import RunFacts, mismatches_of, warnings_of
-from nerfcli.report.views import DEPTH_COLOURS, ERROR_COLOURS, ERROR_RANGE, Look, Seen
+from nerfcli.report.views import ERROR_COLOURS, ERROR_RANGE, Seen, depth_range
 
 # Curves of more runs than these share colours.
 COLOURS = 6
+DEPTH_COLOURS = "turbo"
 _PICTURE_PX = 800
 _MEGA = 1e6
 
@@ -26,22 +30,23 @@ def mark_of(runs: Sequence[Path]) -> page.Mark:
     return page.Mark("report", Path("|".join(str(run.resolve()) for run in runs)))
 
 
-def page_html(runs: Sequence[RunFacts], looks: Sequence[Look], *, depth: DepthMeta) -> str:
+def page_html(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, depth: DepthMeta) -> str:
     """The page's text.
 
     Args:
         runs: at least one.
-        looks: what each of them shows; photos of the same name stand side by side.
+        looks: what each of them shows of photos of the same names.
         depth: the meaning of the depths, in the unit of the first run.
     """
+    ranges = _depth_ranges(runs, looks)
     title = " against ".join(run.label for run in runs) if len(runs) < 4 else f"{len(runs)} runs"
     body = _BODY.substitute(
         title=escape(title),
         count="a run" if len(runs) == 1 else f"{len(runs)} runs",
         warnings=_warnings_html(runs),
         numbers=_columns(runs, _NUMBERS) + _protocols_html(runs),
-        views=_views_html(runs, looks),
-        legends=_legends_html(runs, looks, depth),
+        views=_views_html(runs, looks, ranges),
+        legends=_legends_html(runs, ranges, depth),
         curves=_curves_html(runs),
         photos=_photos_html(runs),
         capture=_columns(runs, _CAPTURE),
@@ -151,51 +156,73 @@ _CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
 )
 
 
-def _views_html(runs: Sequence[RunFacts], looks: Sequence[Look]) -> str:
-    names = list(dict.fromkeys(view.name for look in looks for view in look.views))
+def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> list[tuple[float, float]]:
+    """The range of colours of each run's depths: the same for all runs of a scene."""
+    scenes = [run.config.get("scene_fingerprint") for run in runs]
+    return [
+        depth_range([view for other, look in zip(scenes, looks, strict=True) if other == scene for view in look])
+        for scene in scenes
+    ]
+
+
+def _views_html(
+    runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], ranges: Sequence[tuple[float, float]]
+) -> str:
     layers, figures = [], []
-    for index, name in enumerate(names):
-        seen = [(run, view) for run, look in zip(runs, looks, strict=True) for view in look.views if view.name == name]
+    for name in dict.fromkeys(view.name for look in looks for view in look):
+        seen = [
+            (run, view, limits)
+            for run, look, limits in zip(runs, looks, ranges, strict=True)
+            for view in look
+            if view.name == name
+        ]
         first = seen[0][1]
-        layers.append(_layers(first, seen, alone=len(runs) == 1))
         height, width = first.photo.shape[:2]
         told = "; ".join(
             f"{run.label + ': ' if len(runs) > 1 else ''}{view.psnr:.2f} dB, SSIM {view.ssim:.3f}, "
             f"depth in {100 * view.with_depth:.0f} % of the pixels"
-            for run, view in seen
+            for run, view, _ in seen
         )
         figures.append(
-            f'<figure class="compare" data-view="{index}"><figcaption><b>{escape(name)}</b> {escape(told)}</figcaption>'
+            f'<figure class="compare" data-view="{len(layers)}">'
+            f"<figcaption><b>{escape(name)}</b> {escape(told)}</figcaption>"
             f'<div class="stage" style="aspect-ratio:{width}/{height}"><img alt=""><img alt="">'
             '<div class="line"></div></div><input type="range" min="0" max="100" value="50" aria-label="border">'
             '<div class="layers"><select aria-label="left"></select><select aria-label="right"></select></div></figure>'
         )
+        layers.append(_layers(first, seen, alone=len(runs) == 1))
     if not figures:
         return "<p>No photo was held out.</p>"
     noscript = "<noscript><p>The pictures need JavaScript; nothing is loaded from elsewhere.</p></noscript>"
     return f'{noscript}<div class="views">{"".join(figures)}</div>{page.data_element("views", layers)}'
 
 
-def _layers(first: Seen, seen: Sequence[tuple[RunFacts, Seen]], *, alone: bool) -> list[dict[str, str]]:
-    """What can be shown of a photo: it is compared from the bottom of the list, so the upper images come first."""
+def _layers(
+    first: Seen, seen: Sequence[tuple[RunFacts, Seen, tuple[float, float]]], *, alone: bool
+) -> list[dict[str, str]]:
+    """What can be shown of a photo: itself, then pictures, errors and depths of all runs."""
 
-    def layer(label: str, picture: Any) -> dict[str, str]:
-        return {"label": label, "uri": data_uri(jpeg_bytes(picture, longest_px=_PICTURE_PX), "jpeg")}
+    def layer(kind: str, run: RunFacts, picture: np.ndarray) -> dict[str, str]:
+        return _layer(kind if alone else f"{run.label}: {kind}", picture)
 
-    def named(kind: str, run: RunFacts) -> str:
-        return kind if alone else f"{run.label}: {kind}"
+    depths = [(run, coloured(view.depth, lo=low, hi=high, colour_map=DEPTH_COLOURS)) for run, view, (low, high) in seen]
+    return [
+        _layer("photo", first.photo),
+        *(layer("rendered", run, view.picture) for run, view, _ in seen),
+        *(layer("error", run, view.error) for run, view, _ in seen),
+        *(layer("depth", run, picture) for run, picture in depths),
+    ]
 
-    pictures = [layer(named("rendered", run), view.picture) for run, view in seen]
-    errors = [layer(named("error", run), view.error) for run, view in seen]
-    depths = [layer(named("depth", run), view.depth) for run, view in seen]
-    return [layer("photo", first.photo), *pictures, *errors, *depths]
+
+def _layer(label: str, picture: np.ndarray) -> dict[str, str]:
+    return {"label": label, "uri": data_uri(jpeg_bytes(picture, longest_px=_PICTURE_PX), "jpeg")}
 
 
-def _legends_html(runs: Sequence[RunFacts], looks: Sequence[Look], depth: DepthMeta) -> str:
+def _legends_html(runs: Sequence[RunFacts], ranges: Sequence[tuple[float, float]], depth: DepthMeta) -> str:
     rows = [_legend("error", ERROR_COLOURS, "0", f">= {ERROR_RANGE:g}", "mean absolute difference of sRGB in [0, 1]")]
-    for run, look in zip(runs, looks, strict=True):
-        low, high = look.depth_range
-        name = "depth" if len(runs) == 1 else f"depth, {run.label}"
+    for low, high in dict.fromkeys(ranges):
+        of = [run.label for run, limits in zip(runs, ranges, strict=True) if limits == (low, high)]
+        name = "depth" if len(of) == len(runs) else f"depth, {', '.join(of)}"
         rows.append(_legend(name, DEPTH_COLOURS, f"<= {low:.3g}", f">= {high:.3g}", depth.in_words()))
     return "".join(rows)
 

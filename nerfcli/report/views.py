@@ -1,4 +1,4 @@
-"""Held-out photos beside what runs render of them: picture, error and depth, each as 8-bit colours."""
+"""Held-out photos beside what runs render of them: picture, error and depth."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,6 @@ import numpy as np
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
 from nerfcli.evaluate.protocol import HeldOut, over_white
 from nerfcli.media.colour_maps import levels_of
-from nerfcli.media.preview import coloured
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
@@ -17,8 +16,8 @@ from nerfcli.train.photos import load_photos
 
 # Mean absolute difference of the channels that has the last colour of error maps, sRGB in [0, 1].
 ERROR_RANGE = 0.2
-ERROR_COLOURS, DEPTH_COLOURS = "viridis", "turbo"
-# Of all valid depths of a run, the shares at the ends of its range of colours.
+ERROR_COLOURS = "viridis"
+# Of all depths, those at the ends of the range of colours.
 _RANGE_PERCENT = (1, 99)
 _WHITE = (1.0, 1.0, 1.0)
 
@@ -29,9 +28,9 @@ class Seen:
 
     Args:
         name: of the photo.
-        photo, picture, error, depth: (H, W, 3) uint8 sRGB; RGBA photos on white.
+        photo, picture, error: (H, W, 3) uint8 sRGB; RGBA photos on white.
+        depth: (H, W) in the unit of the scene, NaN where there is none.
         psnr, ssim: between picture and photo over the pixels that count, as in `evaluate`.
-        with_depth: share of the pixels that have a depth.
     """
 
     name: str
@@ -41,28 +40,31 @@ class Seen:
     depth: np.ndarray
     psnr: float
     ssim: float
-    with_depth: float
+
+    @property
+    def with_depth(self) -> float:
+        """The share of the pixels that have a depth."""
+        return float(np.isfinite(self.depth).mean())
 
 
-@dataclass(frozen=True)
-class Look:
-    """All that a run renders, and the range of depths that its colours span, in the unit of the scene."""
+def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
+    """At most `count` photos that all of the runs hold out, chosen by `spread_evenly` with the first known quality."""
+    names = [frame.name for frame in runs[0].frames["test"]]
+    for run in runs[1:]:
+        held_out = {frame.name for frame in run.frames["test"]}
+        names = [name for name in names if name in held_out]
+    measured = next((run.metrics for run in runs if run.metrics is not None), {})
+    quality = {image["name"]: image["psnr"] for image in measured.get("images", [])}
+    return spread_evenly(names, count, quality=quality)
 
-    views: tuple[Seen, ...]
-    depth_range: tuple[float, float]
 
-
-def held_out_of(run: RunFacts, count: int, *, threads: int) -> list[HeldOut]:
-    """At most `count` held-out photos of a run as it was trained on, chosen by `spread_evenly`.
-
-    Photos whose mask leaves nothing to compare are left out.
+def held_out_of(run: RunFacts, names: Sequence[str], *, threads: int) -> list[HeldOut]:
+    """Held-out photos of a run as it was trained on; without those whose mask leaves nothing to compare.
 
     Raises:
         UserError: a photo cannot be read.
     """
-    quality = {image["name"]: image["psnr"] for image in (run.metrics or {}).get("images", [])}
-    chosen = set(spread_evenly([frame.name for frame in run.frames["test"]], count, quality=quality))
-    frames = [frame for frame in run.frames["test"] if frame.name in chosen]
+    frames = [frame for frame in run.frames["test"] if frame.name in names]
     photos = load_photos(frames, factor=run.config["settings"]["downscale"], threads=threads)
     return [
         HeldOut(photo.frame, photo.pixels, photo.used) for photo in photos if photo.used is None or photo.used.any()
@@ -71,25 +73,20 @@ def held_out_of(run: RunFacts, count: int, *, threads: int) -> list[HeldOut]:
 
 def look_at(
     model: Model, held_out: Sequence[HeldOut], *, depth: DepthRequest, on_share: Callable[[float], None]
-) -> Look:
+) -> list[Seen]:
     """Render held-out photos of a run.
 
     Args:
         model: the trained model.
         held_out: the photos, whose masks leave pixels to compare.
-        depth: which depth to show; the same range of colours for all photos.
+        depth: which depth to show.
         on_share: called with how much of it is done, in [0, 1].
     """
-    pictures = []
+    views = []
     for photo in held_out:
         background = _WHITE if photo.pixels.shape[-1] == 4 else model.background
-        pictures.append(render_picture(model, photo.frame, background=background, depth=depth))
-        on_share(len(pictures) / len(held_out))
-    depths = [picture.depth for picture in pictures if picture.depth is not None]
-    valid = np.concatenate([values[np.isfinite(values)] for values in depths]) if depths else np.empty(0)
-    low, high = np.percentile(valid, _RANGE_PERCENT).tolist() if len(valid) else (0.0, 1.0)
-    views = []
-    for photo, picture, values in zip(held_out, pictures, depths, strict=True):
+        picture = render_picture(model, photo.frame, background=background, depth=depth)
+        assert picture.depth is not None
         used = picture.valid if photo.used is None else picture.valid & photo.used
         truth, rendered = over_white(photo.pixels), to_8_bit(picture.rgb)
         views.append(
@@ -98,13 +95,22 @@ def look_at(
                 photo=truth,
                 picture=rendered,
                 error=error_map(rendered, truth, used=used),
-                depth=coloured(values, lo=low, hi=high, colour_map=DEPTH_COLOURS),
+                depth=picture.depth,
                 psnr=psnr(rendered, truth, used=used),
                 ssim=ssim(rendered, truth, used=used),
-                with_depth=float(np.isfinite(values).mean()),
             )
         )
-    return Look(tuple(views), (low, high))
+        on_share(len(views) / len(held_out))
+    return views
+
+
+def depth_range(views: Sequence[Seen]) -> tuple[float, float]:
+    """The 1st and 99th percentile of all depths that are defined; (0, 1) where there is none."""
+    valid = np.concatenate([np.empty(0), *(view.depth[np.isfinite(view.depth)] for view in views)])
+    if not len(valid):
+        return 0.0, 1.0
+    low, high = np.percentile(valid, _RANGE_PERCENT).tolist()
+    return low, high
 
 
 def error_map(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
