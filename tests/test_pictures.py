@@ -44,11 +44,12 @@ def test_no_bit_depends_on_tiles_or_threads(samples, trained, monkeypatch):
     assert whole.depth is not None
     assert 0.1 < np.isfinite(whole.depth).mean() < 0.9
     for tile, threads in ((1, 2), (7, 1), (64, 2), (4095, 1)):
-        monkeypatch.setattr(pictures, "RAYS_PER_TILE", tile)
         torch.set_num_threads(threads)
         counts: list[int] = []
-        assert same_bits(render_picture(model, frame, on_tile=counts.append, **options), whole) == []
+        tiled = render_picture(model, frame, on_tile=counts.append, rays_per_tile=tile, **options)
+        assert same_bits(tiled, whole) == []
         assert sum(counts) == 16 * 12
+        assert len(counts) == -(-16 * 12 // max(1, tile // samples))
     monkeypatch.setattr(pictures, "RAYS_PER_BLOCK", 50)
     assert same_bits(render_picture(model, frame, **options), whole) == []
 
@@ -177,6 +178,15 @@ def test_straight_alpha_is_the_colour_of_what_is_there():
     np.testing.assert_allclose(rgba[there][:, :3], 0.5, rtol=1e-5)
     np.testing.assert_array_equal(rgba[~there], 0)
     np.testing.assert_array_equal(rgba[..., 3], picture.opacity)
+
+
+def test_steps_twice_as_long_are_the_steps_of_such_a_training(trained):
+    model, frame = trained
+    marching = replace(model.marching, shortest_step=2 * model.marching.shortest_step, growth=2 * model.marching.growth)
+    made = replace(model, marching=marching)
+    options = {"background": BLACK, "depth": DepthRequest("median", "z", 0.1)}
+    assert same_bits(*(render_picture(one, frame, **options) for one in (model.stretched(2.0), made))) == []
+    assert model.stretched(1.0) == model
 
 
 def test_refined_cuts_keep_the_cuts():

@@ -9,7 +9,6 @@ from fog import SIDE, STEP, fog, foggy_cells
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts, look_at, rotation_from_quaternion
-from nerfcli.render import pictures
 from nerfcli.render.depth import CONVENTIONS
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, Picture, render_picture
@@ -194,14 +193,15 @@ def test_rays_have_unit_length_and_start_at_the_camera():
 
 
 @pytest.mark.parametrize("tile", [5, 64])
-def test_tiles_leave_no_trace(tile, monkeypatch):
+def test_tiles_leave_no_trace(tile):
     frame = towards_slab()
     request = DepthRequest("conditional", "z", 0.1)
     model = fog(SLAB, SIMILARITY, step=1 / 64)
     whole = picture_of(model, frame, request)
     counts: list[int] = []
-    monkeypatch.setattr(pictures, "RAYS_PER_TILE", tile)
-    tiled = render_picture(model, frame, background=BACKGROUND, depth=request, on_tile=counts.append)
+    tiled = render_picture(
+        model, frame, background=BACKGROUND, depth=request, on_tile=counts.append, rays_per_tile=tile
+    )
     np.testing.assert_array_equal(tiled.rgb, whole.rgb)
     np.testing.assert_array_equal(tiled.opacity, whole.opacity)
     assert whole.depth is not None

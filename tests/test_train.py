@@ -15,6 +15,7 @@ from conftest import SPHERES
 
 from nerfcli import kernels
 from nerfcli import scene as scenes
+from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
@@ -354,3 +355,13 @@ def test_what_counts_as_the_same_run(views, tmp_path):
     assert config["settings"]["downscale"] == 4
     assert config["scene_fingerprint"] == scenes.fingerprint(views)
     assert set(config["versions"]) >= {"nerfcli", "python", "torch", "numpy"}
+
+
+def test_settings_that_an_earlier_version_did_not_write_down_were_the_defaults(views, tmp_path):
+    settings = replace(FEW, steps=1, downscale=4)
+    fit(views, tmp_path / "run", settings)
+    config = read_config(tmp_path / "run")
+    del config["settings"]["log2_rows"]
+    write_json(tmp_path / "run" / "config.json", config)
+    assert is_same_run(tmp_path / "run", views, settings)
+    assert not is_same_run(tmp_path / "run", views, replace(settings, log2_rows=15))

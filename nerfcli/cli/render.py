@@ -10,7 +10,7 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.depth_options import DepthFormat, DepthScale, depth_formats, finite, level_scale
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
 from nerfcli.cli.playing import frame_range, one_of, video_settings
-from nerfcli.cli.rendering import Rgba, SamplesPerPixel, Tolerance, tolerance_of
+from nerfcli.cli.rendering import Rgba, SamplesPerPixel, Step, Tolerance, tolerance_of
 from nerfcli.cli.views import Views, chosen_frames, file_fps, look_of, refuse_z_all_around, write_frames
 from nerfcli.errors import UserError
 
@@ -51,6 +51,7 @@ def render(
     depth_format: DepthFormat = "tiff",
     depth_scale: DepthScale = "auto",
     tolerance: Tolerance = "1/1020",
+    step: Step = 1.0,
     samples_per_pixel: SamplesPerPixel = 1,
     rgba: Rgba = False,
     colour_map: Annotated[str, typer.Option(help="Of depth to look at: turbo, viridis or grey.")] = "turbo",
@@ -152,6 +153,7 @@ def render(
     scale = level_scale(depth_scale, formats=formats)
     finite(background_distance, "--background-distance")
     finite(min_opacity, "--min-opacity")
+    finite(step, "--step")
     console = Console(quiet=quiet, json_lines=json)
     request = DepthRequest(
         convention=depth,
@@ -202,6 +204,7 @@ def render(
             settings=settings,
             device=device_name(device),
             threads=thread_count(threads),
+            step=step,
             jobs=jobs,
             part=part,
             overwrite=overwrite,
@@ -230,6 +233,7 @@ def render_run(
     threads: int,
     overwrite: bool,
     console: Console,
+    step: float = 1.0,
     jobs: int = 0,
     part: slice | None = None,
 ) -> list[Path]:
@@ -237,6 +241,7 @@ def render_run(
 
     Args:
         jobs: processes; 0 for `automatic_workers`.
+        step: length of the steps along rays, in those of the training.
         part: render these views alone, for a later call to find them.
 
     Returns:
@@ -256,7 +261,7 @@ def render_run(
     from nerfcli.train.run_folder import FIELD
 
     torch.set_num_threads(threads)
-    model = load_model(run / FIELD, device)
+    model = load_model(run / FIELD, device).stretched(step)
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
         farthest = model.marching.far / model.training_from_scene.scale
         settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
@@ -270,6 +275,8 @@ def render_run(
         "run": run.name,
         "field_sha256": hashlib.sha256((run / FIELD).read_bytes()).hexdigest(),
     }
+    if step != 1.0:
+        provenance["step"] = step
     order = Order(tuple(frames), settings, provenance)
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:

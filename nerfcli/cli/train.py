@@ -44,6 +44,12 @@ def train(
     include: Include = None,
     exclude: Exclude = None,
     downscale: Downscale = "auto",
+    log2_rows: Annotated[
+        int, typer.Option(help="Rows of each of the field's tables, as a power of two.", min=4, max=24)
+    ] = 16,
+    levels: Annotated[int, typer.Option(help="Tables of the field; other numbers than 8 are slow.", min=1)] = 8,
+    width: Annotated[int, typer.Option(help="Neurons of its layers; other numbers than 32 are slow.", min=1)] = 32,
+    batch: Annotated[int, typer.Option(help="Samples of a step at the end of the training.", min=2**8)] = 2**16,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint to the new total.")] = False,
     device: Device = "auto",
     seed: Seed = 0,
@@ -83,6 +89,11 @@ def train(
         device=device_name(device),
         threads=thread_count(threads),
         components=choose(Components(), included=include or (), excluded=exclude or ()),
+        first_samples_per_step=min(TrainSettings.first_samples_per_step, batch),
+        samples_per_step=batch,
+        levels=levels,
+        log2_rows=log2_rows,
+        width=width,
     )
 
     def work(folder: Path, one_of_many: bool) -> None:

@@ -1,6 +1,6 @@
 """A trained field with everything that is needed to look at it: the frame it lives in, where it is empty, the steps."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,10 @@ class Marching:
         """(S + 2,) distances."""
         return step_edges(self.near, self.far, shortest_step=self.shortest_step, growth=self.growth)
 
+    def stretched(self, factor: float) -> "Marching":
+        """The same span in steps `factor` times as long, > 0."""
+        return replace(self, shortest_step=factor * self.shortest_step, growth=factor * self.growth)
+
 
 @dataclass(frozen=True)
 class Model:
@@ -56,6 +60,10 @@ class Model:
     @property
     def device(self) -> torch.device:
         return self.occupied.device
+
+    def stretched(self, factor: float) -> "Model":
+        """The same field, looked at in steps along rays `factor` times as long as those of the training."""
+        return replace(self, marching=self.marching.stretched(factor))
 
 
 def save_model(path: Path, model: Model) -> None:

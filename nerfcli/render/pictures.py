@@ -71,6 +71,7 @@ def render_picture(
     depth: DepthRequest | None = None,
     quality: Quality = Quality(),
     on_tile: Callable[[int], None] | None = None,
+    rays_per_tile: int = RAYS_PER_TILE,
 ) -> Picture:
     """Render one frame; every bit of it is the same for any size of tiles and any number of threads.
 
@@ -84,6 +85,7 @@ def render_picture(
         depth: which depth to compute along with the colour.
         quality: how much work to put into it.
         on_tile: called with the number of pixels after each tile.
+        rays_per_tile: how many are rendered at a time; a matter of speed and memory alone.
     """
     if depth is not None and depth.convention == "background" and depth.background_distance is None:
         raise ValueError("the background convention needs a background distance")
@@ -91,7 +93,7 @@ def render_picture(
     places = places_in_pixel(count)
     behind = torch.tensor(background, dtype=torch.float32, device=model.device)
     columns: list[tuple[Tensor, ...]] = []
-    block, tile = max(1, RAYS_PER_BLOCK // count), max(1, RAYS_PER_TILE // count)
+    block, tile = max(1, RAYS_PER_BLOCK // count), max(1, rays_per_tile // count)
     for first in range(0, width * height, block):
         chosen = np.arange(first, min(first + block, width * height))
         rays = pixel_rays(frame, model.training_from_scene, pixels=chosen, places=places, device=model.device)

@@ -71,8 +71,14 @@ class Fitting:
         self.settings = settings
         self.step = 0
         self.components = settings.components
-        field = HashFieldSettings(unbounded=unbounded, view_degree=self.components.view)
-        self.field = fresh_field(field).to(device)
+        size = HashFieldSettings(
+            unbounded=unbounded,
+            levels=settings.levels,
+            log2_rows=settings.log2_rows,
+            width=settings.width,
+            view_degree=self.components.view,
+        )
+        self.field = fresh_field(size).to(device)
         behind = self.components.background
         self.random_background = behind == "random" or (behind == "auto" and pool.has_alpha)
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)

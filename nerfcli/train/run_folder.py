@@ -141,12 +141,12 @@ def _frame_from_json(entry: dict[str, Any], run: Path) -> Frame:
 
 def is_same_run(run: Path, scene: Scene, settings: TrainSettings) -> bool:
     """Whether `run` was trained from this scene with these settings; threads and device aside, an automatic downscale
-    counting as whatever was chosen."""
+    counting as whatever was chosen. Settings that a run of an earlier version does not name were the defaults."""
     config = read_config(run)
     wanted = {key: value for key, value in settings.to_json().items() if key not in ("device", "threads")}
     if settings.downscale is None:
         del wanted["downscale"]
-    trained = config.get("settings", {})
+    trained = {**TrainSettings().to_json(), **config.get("settings", {})}
     return config.get("scene_fingerprint") == fingerprint(scene) and all(
         trained.get(key) == value for key, value in wanted.items()
     )

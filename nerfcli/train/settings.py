@@ -26,6 +26,8 @@ class TrainSettings:
             number of rays follows. Small steps learn more from a sample, large ones cost less each.
         learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
         warmup_steps: steps over which the learning rate rises from 0.
+        levels, log2_rows, width: size of the field; see `HashFieldSettings`. There are compiled kernels for 8 levels
+            and width 32; other sizes train in plain torch, many times slower.
         components: what is in the model and in its loss.
 
     Raises:
@@ -43,9 +45,15 @@ class TrainSettings:
     learning_rate: float = 1e-2
     final_learning_rate: float = 1e-3
     warmup_steps: int = 50
+    levels: int = 8
+    log2_rows: int = 16
+    width: int = 32
     components: Components = field(default_factory=Components)
 
     def __post_init__(self) -> None:
+        if min(self.levels, self.width) < 1 or not 4 <= self.log2_rows <= 24:
+            sizes = f"levels {self.levels}, log2-rows {self.log2_rows}, width {self.width}"
+            raise UserError(f"no field has {sizes}", "levels and width are 1 or more, log2-rows from 4 to 24")
         if self.budget_seconds is None and self.steps is None:
             raise UserError("training without an end", "give --budget, --steps, or both")
         if (self.budget_seconds or 1) <= 0 or (self.steps or 1) <= 0:
