@@ -23,7 +23,7 @@ test: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/basedpyright
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 .venv/installed: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP_INSTALL) -e .

@@ -1,6 +1,10 @@
 """Shared fixtures, the trained run that several files look at, and the one table of tolerances."""
 
+import os
 from pathlib import Path
+
+# Threads of two test processes on two cores must not spin while they wait; to be said before torch is imported.
+os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import pytest
 import torch
