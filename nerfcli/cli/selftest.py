@@ -13,6 +13,18 @@ if TYPE_CHECKING:
     from nerfcli.selftest.measure import Errors, Row
 
 _COLUMNS = ("#", "case", "operation", "in", "error", "gradient", "bound", "verdict", "textbook", "gradient", "ms")
+_FORMULAS = (
+    "#",
+    "textbook formula",
+    "worst where",
+    "operation",
+    "in",
+    "error",
+    "gradient",
+    "here",
+    "gradient",
+    "bound",
+)
 _STYLES = {"met": "green", "not met": "bold red", "does not occur": "dim"}
 
 
@@ -20,6 +32,12 @@ _STYLES = {"met": "green", "not met": "bold red", "does not occur": "dim"}
 def selftest(
     device: Device = "auto",
     threads: Threads = 0,
+    textbook: Annotated[
+        bool,
+        typer.Option(
+            "--textbook", help="Show a row per textbook formula, where it is worst, with this program's error."
+        ),
+    ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="A line of JSON per row on stdout instead of the table.")
     ] = False,
@@ -36,11 +54,12 @@ def selftest(
     \b
     Examples:
       nerfcli selftest
+      nerfcli selftest --textbook
       nerfcli selftest --device cpu --json | jq 'select(.verdict == "not met")'
     """
     import torch
 
-    from nerfcli.selftest.measure import MET, NOT_MET
+    from nerfcli.selftest.measure import MET, NOT_MET, by_formula
     from nerfcli.selftest.suite import rows
 
     console = Console(quiet=quiet, json_lines=json)
@@ -48,16 +67,22 @@ def selftest(
     begin, measured = time.perf_counter(), []
     for row in rows(device_name(device), console.note):
         measured.append(row)
-        if json:
+        if json and not textbook:
             console.fact(row.to_json())
-    if not json:
+    formulas = by_formula(measured)
+    if json and textbook:
+        for row in formulas:
+            console.fact(row.to_json())
+    elif textbook:
+        console.fact_table(_FORMULAS, [_formula_cells(row) for row in formulas], styles=_STYLES)
+    elif not json:
         console.fact_table(_COLUMNS, [_cells(row) for row in measured], styles=_STYLES)
     met = sum(row.verdict == MET for row in measured)
     failed = [row for row in measured if row.verdict == NOT_MET]
-    worse = sum(row.textbook is not None and not row.holds(row.textbook) for row in measured)
     console.note(
-        f"{met} of {met + len(failed)} rows within their bounds, the textbook formulas beyond them in {worse}; "
-        f"{len(measured) - met - len(failed)} cases do not occur here; {time.perf_counter() - begin:.1f} s"
+        f"{met} of {met + len(failed)} rows within their bounds; {sum(row.textbook_fails for row in formulas)} of "
+        f"{len(formulas)} textbook formulas are beyond them somewhere; {len(measured) - met - len(failed)} cases do not "
+        f"occur here; {time.perf_counter() - begin:.1f} s"
     )
     if failed:
         row = failed[0]
@@ -69,15 +94,23 @@ def selftest(
         )
 
 
-def _cells(row: "Row") -> tuple[str, ...]:
-    def pair(errors: "Errors | None") -> tuple[str, str]:
-        return (_number(errors.value), _number(errors.gradient)) if errors else ("", "")
+def _pair(errors: "Errors | None") -> tuple[str, str]:
+    return (_number(errors.value), _number(errors.gradient)) if errors else ("", "")
 
+
+def _formula_cells(row: "Row") -> tuple[str, ...]:
+    numbers = ",".join(map(str, row.hard_cases))
+    bound = "" if row.bounds is None else _number(row.bounds.value)
+    shown = (*_pair(row.textbook), *_pair(row.errors), bound)
+    return (numbers, row.formula, row.case, row.operation, row.precision, *shown)
+
+
+def _cells(row: "Row") -> tuple[str, ...]:
     numbers = ",".join(map(str, row.hard_cases))
     bound = "" if row.bounds is None else _number(row.bounds.value)
     milliseconds = "" if row.seconds is None else f"{1e3 * row.seconds:.1f}"
     case = row.case if row.errors else f"{row.case}: {row.reason}"
-    shown = (*pair(row.errors), bound, row.verdict, *pair(row.textbook), milliseconds)
+    shown = (*_pair(row.errors), bound, row.verdict, *_pair(row.textbook), milliseconds)
     return (numbers, case, row.operation, row.precision, *shown)
 
 

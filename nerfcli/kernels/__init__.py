@@ -75,7 +75,7 @@ def hash_encode(
     if numba_cpu is not None and numba_cpu.can_hash_encode(points, table, resolutions):
         return numba_cpu.hash_encode(points, table, resolutions, sink, known)
     if sink is not None and table.requires_grad and torch.is_grad_enabled():
-        leaf = table.detach().requires_grad_()
+        leaf = table.detach().to(sink.dtype).requires_grad_()  # half precision's gradients go on unrounded
 
         def add_to_sink(given: Tensor) -> None:
             if given.grad is not None:

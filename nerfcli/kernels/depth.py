@@ -118,17 +118,21 @@ def conditional(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
     return torch.where(defined, moment(weights, means, offsets) / torch.where(defined, total, 1.0), torch.nan)
 
 
-def spread(weights: Tensor, means: Tensor, variances: Tensor, *, offsets: Tensor) -> Tensor:
+def spread(weights: Tensor, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor) -> Tensor:
     """Standard deviation (R,) of the distance where light ends, given that it ends; NaN where none does.
 
-    Variance = sum_i w_i (variance_i + (mean_i - mean)^2) / sum_i w_i: around the mean, so that nothing cancels.
+    Variance = sum_i w_i (variance_i + (mean_i - mean)^2) / sum_i w_i: around the mean, so that nothing cancels. Places
+    count from where the heaviest interval starts: a far, thin surface would be narrower than its distance's last digit.
     Differentiable where it is defined and above 0.
     """
-    total = sum_along_rays(weights, offsets)
+    total, lengths, rays = sum_along_rays(weights, offsets), ends - starts, ray_indices(offsets)
     defined = total > 0
-    middle = torch.where(defined, sum_along_rays(weights * means, offsets) / torch.where(defined, total, 1.0), 0.0)
-    apart = variances + (means - middle[ray_indices(offsets)]).square()
-    variance = sum_along_rays(weights * apart, offsets) / torch.where(defined, total, 1.0)
+    total = torch.where(defined, total, 1.0)
+    anchors = max_weight(weights.detach(), starts.detach(), offsets)
+    places = starts - torch.where(defined, anchors, 0.0)[rays] + lengths * mean_fraction(density * lengths)
+    middle = sum_along_rays(weights * places, offsets) / total
+    apart = interval_variances(density, lengths) + (places - middle[rays]).square()
+    variance = sum_along_rays(weights * apart, offsets) / total
     wide = variance > 0
     root = torch.where(wide, torch.where(wide, variance, 1.0).sqrt(), 0.0)
     return torch.where(defined, root, torch.nan)
@@ -181,7 +185,7 @@ def light_ends(
     weights, transmittance = interval_weights(density, lengths, offsets)
     means = interval_means(density, starts, ends)
     mean = conditional(weights, means, offsets)
-    width = spread(weights, means, interval_variances(density, lengths), offsets=offsets)
+    width = spread(weights, density, starts, ends, offsets=offsets)
     total = opacity(sum_along_rays(density * lengths, offsets))
     columns = [quantile(density, starts, ends, offsets=offsets, share=share) for share in shares]
     quantiles = torch.stack(columns, dim=-1) if columns else density.new_empty(len(offsets) - 1, 0)

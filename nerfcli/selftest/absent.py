@@ -6,7 +6,6 @@ from nerfcli.selftest.measure import Row
 
 # Number, what is hard elsewhere, why it does not happen here.
 _ABSENT = (
-    (9, "gradients below half precision's smallest", "every gradient and every state of training is float32"),
     (10, "Adam's state in half precision", "the moments are float32, always; see the row above for their smallest"),
     (
         19,

@@ -1,7 +1,9 @@
 """The answers for rays in 60 decimal digits, by the definitions, from the very numbers that the kernels get."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
+from itertools import accumulate
 
 from nerfcli.selftest.rays import Intervals, Ray
 
@@ -79,6 +81,40 @@ def composited(
         )
 
 
+def optical_depths(ray: Intervals) -> list[float]:
+    """The optical depth in front of each interval of a ray, and that of the whole ray."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        parts = (Decimal(sigma) * Decimal(length) for sigma, length in zip(ray.density, ray.lengths, strict=True))
+        return [float(depth) for depth in accumulate(parts, initial=Decimal(0))]
+
+
+def mixture_quantile(rays: Sequence[Ray], share: float) -> float:
+    """Where the share of all light of the rays together has ended, by bisection; NaN where so much never does."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        columns = [
+            [tuple(map(Decimal, values)) for values in zip(ray.density, ray.starts, ray.ends, strict=True)]
+            for ray in rays
+        ]
+        wanted = 1 - Decimal(share)
+
+        def passed(t: Decimal) -> Decimal:
+            depths = (
+                sum((sigma * min(max(t - start, Decimal(0)), end - start) for sigma, start, end in ray), Decimal(0))
+                for ray in columns
+            )
+            return sum(((-depth).exp() for depth in depths), Decimal(0)) / len(rays)
+
+        low, high = Decimal(0), max(end for ray in columns for _, _, end in ray)
+        if passed(high) > wanted:
+            return float("nan")
+        while high - low > high * Decimal("1e-25"):
+            middle = (low + high) / 2
+            low, high = (low, middle) if passed(middle) <= wanted else (middle, high)
+        return float(high)
+
+
 def distortion(weights: list[float], starts: list[float], ends: list[float]) -> tuple[float, list[float]]:
     """sum_ij w_i w_j |m_i - m_j| + sum_i w_i^2 length_i / 3 of one ray, and its gradient by the weights."""
     with localcontext() as context:
@@ -101,7 +137,7 @@ def light_ends(ray: Ray, *, far: float) -> dict[str, float]:
 
     Returns:
         opacity, transmittance, moment, background, conditional, spread, max-weight, median and the quantiles of
-        `SHARES`; NaN where undefined.
+        `SHARES`; NaN where undefined. anchor: where the interval starts in which most light ends.
     """
     with localcontext() as context:
         context.prec = DIGITS
@@ -116,7 +152,7 @@ def light_ends(ray: Ray, *, far: float) -> dict[str, float]:
                 tiny = own < Decimal("1e-15")
                 mean = start + (length / 2 - own * length / 12 if tiny else 1 / sigma - length / (own.exp() - 1))
                 wide = length**2 / 12 if tiny else 1 / sigma**2 - length**2 * own.exp() / (own.exp() - 1) ** 2
-                samples.append((weight, mean, wide))
+                samples.append((weight, mean, wide, start))
                 moment, mass = moment + weight * mean, mass + weight
             for share in SHARES:
                 target = -(1 - Decimal(share)).ln()
@@ -129,11 +165,11 @@ def light_ends(ray: Ray, *, far: float) -> dict[str, float]:
         middle = moment / mass if mass else Decimal("nan")
         values["conditional"] = middle
         values["spread"] = (
-            (sum(w * (v + (m - middle) ** 2) for w, m, v in samples) / mass).sqrt() if mass else Decimal("nan")
+            (sum(w * (v + (m - middle) ** 2) for w, m, v, _ in samples) / mass).sqrt() if mass else Decimal("nan")
         )
-        heaviest = max((w for w, _, _ in samples), default=Decimal(0))
+        heaviest = max((w for w, *_ in samples), default=Decimal(0))
         # Equal weights are told apart by rounding alone; then the nearest counts.
-        near = [m for w, m, _ in samples if w >= heaviest * (1 - Decimal("1e-15"))]
-        values["max-weight"] = near[0] if near else Decimal("nan")
+        near = [(m, s) for w, m, _, s in samples if w >= heaviest * (1 - Decimal("1e-15"))]
+        values["max-weight"], values["anchor"] = near[0] if near else (Decimal("nan"), Decimal("nan"))
         values |= {"median": quantiles[0.5], "quantile:0.05": quantiles[0.05], "quantile:0.95": quantiles[0.95]}
         return {name: float(value) for name, value in values.items()}

@@ -58,7 +58,7 @@ def _density_row(precision: Precision) -> Row:
         bounds=Errors(bound, bound),
         reason="4 u of exp within 15, compiled 8 u; constant beyond, with a gradient that does not vanish",
         formula="exp",
-        textbook=errors(of_textbook, plain.grad),
+        textbook=None if precision.compiled else errors(of_textbook, plain.grad),
         seconds=seconds,
     )
 
@@ -96,7 +96,7 @@ def _adam_row(precision: Precision) -> Row:
         bounds=Errors(16 / (1 - BETAS[1]) * precision.unit),
         reason="16 u / (1 - beta2): 1 - beta2 of a rounded beta2; eps = 1e-15 counts, as the state is float32",
         formula="state in float16",
-        textbook=Errors(largest_error(plain, wanted, tiny=precision.tiny)),
+        textbook=None if precision.compiled else Errors(largest_error(plain, wanted, tiny=precision.tiny)),
         seconds=seconds,
     )
 

@@ -1,4 +1,4 @@
-"""Weights, colours, depths and distortion of hard rays, with gradients, in every precision."""
+"""Weights, colours and distortion of hard rays, with gradients, in every precision."""
 
 import functools
 import math
@@ -10,13 +10,11 @@ import torch
 from torch import Tensor
 
 from nerfcli import kernels
-from nerfcli.kernels import depth as depth_reference
 from nerfcli.kernels import reference
-from nerfcli.kernels.depth import LightEnds
 from nerfcli.selftest import exact, textbook
 from nerfcli.selftest.exact import Composited
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
-from nerfcli.selftest.rays import Group, Intervals, Ray, depth_rays, groups
+from nerfcli.selftest.rays import Group, Intervals, groups, lit
 
 # In bfloat16 a sum of more terms than this has no digits left.
 MOST_IN_BFLOAT16 = 16
@@ -25,7 +23,6 @@ MEANINGLESS = 0.25
 BACKGROUND = [1.0, 0.5, 0.25]
 COLOUR_GRADIENT = [1.0, 0.5, 0.25]
 TRANSMITTANCE_GRADIENT = 0.5
-FAR = 300.0
 
 COMPILED_BOUND = "8 roundings u of the result: sums in float64; of a gradient 16, relative to its terms"
 REFERENCE_BOUND = (
@@ -56,7 +53,6 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
     yield from _subtraction_rows(precisions)
     for precision in precisions:
         if precision.dtype != torch.bfloat16:
-            yield from _depth_rows(precision)
             yield _distortion_row(precision)
 
 
@@ -99,24 +95,10 @@ def _packed(rays: list[Intervals], precision: Precision) -> _Packed:
     )
 
 
-def _lit(rays: list[Intervals], precision: Precision) -> tuple[int, float]:
-    """The most intervals that light comes to, and the optical depth it comes through."""
-    counts, depths = [0], [0.0]
-    for ray in rays:
-        depth, count = 0.0, 0
-        for sigma, length in zip(ray.density, ray.lengths, strict=True):
-            if depth > precision.deepest:
-                break
-            depth, count = depth + sigma * length, count + 1
-        counts.append(count)
-        depths.append(min(depth, precision.deepest))
-    return max(counts), max(depths)
-
-
 def _bounds(rays: list[Intervals], precision: Precision) -> tuple[Errors, str]:
     if precision.compiled:
         return Errors(8 * precision.unit, 16 * precision.unit), COMPILED_BOUND
-    samples, depth = _lit(rays, precision)
+    samples, depth = lit(rays, precision)
     bound = precision.unit * (8 + (samples + 2) * (1 + depth))
     return Errors(bound, 2 * bound), REFERENCE_BOUND
 
@@ -141,7 +123,9 @@ def _composite_row(group: Group, answers: list[Composited], precision: Precision
         bounds=bounds,
         reason=reason,
         formula=NERF,
-        textbook=_composite_errors(textbook.composite, rays, wanted, precision=precision)[0],
+        textbook=None
+        if precision.compiled
+        else _composite_errors(textbook.composite, rays, wanted, precision=precision)[0],
         seconds=seconds,
     )
 
@@ -218,84 +202,9 @@ def _subtraction_rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
             bounds=bounds,
             reason=reason,
             formula="colour less the running sum",
-            textbook=Errors(0.0, error(subtracted)),
+            textbook=None if precision.compiled else Errors(0.0, error(subtracted)),
             seconds=seconds,
         )
-
-
-# The depths, by what is hard about them: name of the group, cases, columns.
-_DEPTHS: tuple[tuple[str, tuple[int, ...], tuple[str, ...]], ...] = (
-    ("opacity and transmittance from 1e-12 to opaque", (2, 3), ("opacity", "transmittance")),
-    ("mean depth, of next to no light and of none", (5, 23), ("conditional",)),
-    ("spread of depth, of shells and fog", (23,), ("spread",)),
-    ("median and quantiles, not reached and inside intervals", (6,), ("median", "quantile:0.05", "quantile:0.95")),
-)
-
-
-def _depth_rows(precision: Precision) -> Iterator[Row]:
-    rays = [_single(ray) for ray in depth_rays()]
-    wanted = [exact.light_ends(ray, far=FAR) for ray in rays]
-    offsets = torch.tensor([0, *torch.tensor([len(ray.density) for ray in rays]).cumsum(0).tolist()])
-    density, starts, ends = (
-        precision.tensor([x for ray in rays for x in column(ray)])
-        for column in (lambda ray: ray.density, lambda ray: ray.starts, lambda ray: ray.ends)
-    )
-    offsets = offsets.to(precision.device)
-    module = kernels if precision.compiled else depth_reference
-    start = time.perf_counter()
-    seen = module.light_ends(density, starts, ends, offsets=offsets, shares=exact.SHARES)
-    seconds = time.perf_counter() - start
-    got = _columns(seen)
-    plain = textbook.depth(density, starts, ends, offsets=offsets)
-    plain = {**plain, "conditional": plain["mean"]}
-    for name, cases, columns in _DEPTHS:
-        allowed = _depth_bound(rays, wanted, columns, precision=precision)
-
-        def error(answers: dict[str, Tensor], columns: tuple[str, ...] = columns) -> float:
-            shown = [column for column in columns if column in answers]
-            return max(
-                largest_error(answers[column], [one[column] for one in wanted], tiny=precision.tiny) for column in shown
-            )
-
-        yield Row(
-            hard_cases=cases,
-            case=name,
-            operation="light_ends",
-            precision=precision.name,
-            errors=Errors(error(got)),
-            bounds=Errors(allowed),
-            reason="u (16 + (n + 2) (1 + tau)), times place / width of what is asked for; compiled 16 u",
-            formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
-            textbook=Errors(error(plain)),
-            seconds=seconds,
-        )
-
-
-def _depth_bound(
-    rays: list[Ray], wanted: list[dict[str, float]], columns: tuple[str, ...], *, precision: Precision
-) -> float:
-    """The largest bound over the rays: a spread is as much more sensitive as it is smaller than its distance."""
-    largest = 0.0
-    for ray, answer in zip(rays, wanted, strict=True):
-        lengths = tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True))
-        samples, depth = _lit([Intervals(tuple(ray.density), lengths)], precision)
-        own = 16.0 if precision.compiled else 16 + (samples + 2) * (1 + depth)
-        if "spread" in columns and answer["spread"] > 0 and not precision.compiled:
-            own *= 1 + answer["conditional"] / answer["spread"]
-        largest = max(largest, own)
-    return largest * precision.unit
-
-
-def _columns(seen: LightEnds) -> dict[str, Tensor]:
-    named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
-    named |= {"conditional": seen.mean, "median": seen.quantiles[:, 0]}
-    return named | {f"quantile:{share:g}": seen.quantiles[:, i] for i, share in enumerate(exact.SHARES) if i}
-
-
-def _single(ray: Ray) -> Ray:
-    """The ray with the numbers that float32 holds."""
-    columns = (torch.tensor(v, dtype=torch.float32).tolist() for v in (ray.density, ray.starts, ray.ends))
-    return Ray(ray.name, *columns)
 
 
 def _distortion_row(precision: Precision) -> Row:
@@ -332,6 +241,6 @@ def _distortion_row(precision: Precision) -> Row:
         bounds=Errors(bound, bound),
         reason="3 n u: sums of n terms that are all positive; compiled 8 u: sums in float64",
         formula="difference of running sums",
-        textbook=errors(of_textbook, plain.grad),
+        textbook=None if precision.compiled else errors(of_textbook, plain.grad),
         seconds=seconds,
     )

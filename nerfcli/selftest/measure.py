@@ -62,7 +62,7 @@ class Row:
         bounds: what they may be.
         reason: where the bounds come from, or why the case does not occur.
         formula: what textbooks do; "" where there is none.
-        textbook: its errors on the same numbers.
+        textbook: its errors on the same numbers; None also for the compiled kernels, whose float32 has its own row.
         seconds: one run of the operation, forward and backward.
     """
 
@@ -90,6 +90,11 @@ class Row:
         pairs = ((errors.value, self.bounds.value), (errors.gradient, self.bounds.gradient))
         return all(error <= bound for error, bound in pairs if error is not None and bound is not None)
 
+    @property
+    def textbook_fails(self) -> bool:
+        """Whether the textbook's formula is beyond the bounds of this row."""
+        return self.textbook is not None and not self.holds(self.textbook)
+
     def to_json(self) -> dict[str, Any]:
         """Plain numbers; what is not finite by name, as JSON knows no such numbers."""
 
@@ -99,6 +104,25 @@ class Row:
             return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
         return {**plain(asdict(self)), "verdict": self.verdict}
+
+
+def by_formula(rows: Sequence[Row]) -> list[Row]:
+    """One row for each textbook formula: the one in which it is farthest beyond the bounds, of float32 if it has any."""
+    formulas: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.textbook is not None:
+            formulas.setdefault(row.formula, []).append(row)
+    single = ([row for row in own if row.precision == "float32"] or own for own in formulas.values())
+    return [max(own, key=_beyond) for own in single]
+
+
+def _beyond(row: Row) -> float:
+    """How many times its bounds the textbook's errors are."""
+    assert row.textbook is not None
+    assert row.bounds is not None
+    pairs = ((row.textbook.value, row.bounds.value), (row.textbook.gradient, row.bounds.gradient))
+    known = [(error, bound) for error, bound in pairs if error is not None and bound is not None]
+    return max(error / bound if bound else math.inf * error if error else 0.0 for error, bound in known)
 
 
 def largest_error(values: Any, wanted: Sequence[Any], *, tiny: float, scale: Sequence[Any] | None = None) -> float:

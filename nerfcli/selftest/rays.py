@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import torch
 
+from nerfcli.selftest.measure import Precision
+
 # The largest number of bfloat16, which float32 holds too.
 LARGEST = 3.3895313892515355e38
 
@@ -119,6 +121,20 @@ def groups() -> tuple[Group, ...]:
             ),
         ),
     )
+
+
+def lit(rays: list[Intervals], precision: Precision) -> tuple[int, float]:
+    """The most intervals that light comes to, and the optical depth it comes through."""
+    counts, depths = [0], [0.0]
+    for ray in rays:
+        depth, count = 0.0, 0
+        for sigma, length in zip(ray.density, ray.lengths, strict=True):
+            if depth > precision.deepest:
+                break
+            depth, count = depth + sigma * length, count + 1
+        counts.append(count)
+        depths.append(min(depth, precision.deepest))
+    return max(counts), max(depths)
 
 
 def even(name: str, density: list[float], near: float, length: float) -> Ray:

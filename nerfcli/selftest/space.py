@@ -123,7 +123,7 @@ def _axis_row(precision: Precision) -> Row:
         bounds=Errors(0.0),
         reason="steps of 2^-7 are kept or not by their middles; nothing is divided by a direction",
         formula="slabs: (side - origin) / direction",
-        textbook=Errors(largest_error(np.array(near), [0.0], tiny=precision.tiny)),
+        textbook=None if precision.compiled else Errors(largest_error(np.array(near), [0.0], tiny=precision.tiny)),
         seconds=seconds,
     )
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import torch
 
 from nerfcli import kernels
-from nerfcli.selftest import absent, learning, light, space, views
+from nerfcli.selftest import absent, depths, learning, light, lookup, space, views
 from nerfcli.selftest.measure import Precision, Row
 
 
@@ -24,6 +24,8 @@ def rows(device: str, notify: Callable[[str], None]) -> Iterator[Row]:
     kernels.prepare(notify)
     tried = precisions(device)
     yield from light.rows(tried)
+    yield from depths.rows(tried)
+    yield from lookup.rows(tried)
     yield from learning.rows(tried)
     yield from space.rows(tried)
     yield from views.rows()

@@ -47,6 +47,16 @@ def depth(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor) -> 
     return {name: torch.stack(values) for name, values in answers.items()}
 
 
+def optical_depth_before(density: Tensor, lengths: Tensor, *, offsets: Tensor) -> Tensor:
+    """The cumulative sum of density length, less the own part."""
+    return torch.cat([(d * n).cumsum(0) - d * n for d, n in _split(offsets, density, lengths)])
+
+
+def line_integral(attenuation: Tensor, lengths: Tensor, *, offsets: Tensor) -> Tensor:
+    """-log of the product of exp(-attenuation length), as one takes it from a picture of what has passed."""
+    return torch.stack([-torch.exp(-d * n).prod().log() for d, n in _split(offsets, attenuation, lengths)])
+
+
 def gradient_by_subtraction(density: Tensor, lengths: Tensor, values: Tensor, colour: Tensor) -> Tensor:
     """d colour / d density of one ray: what lies behind a sample taken as the colour less the running sum."""
     weights = _weights(density, lengths)
