@@ -1,6 +1,7 @@
 # What to do with a fresh copy of this project:
 #   make demo    photos of a desk -> poses, field, numbers, depth maps and a flight around it, in demo/
 #   make test    what CI runs: format, lint, types, tests
+#   make test-slow    the long tests, and 2,000 examples of every property
 #   make clean   remove .venv, demo/ and all caches
 # Demo and test make .venv first, once. With a Python of your choice: make test PYTHON=/opt/python/bin/python3.13
 
@@ -8,7 +9,7 @@ PYTHON =
 BIN = .venv/bin
 PIP_INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test clean
+.PHONY: demo test test-slow clean
 
 demo: .venv/installed
 	$(BIN)/nerfcli run sample_scenes/desk/images -o demo --budget 90s --downscale 2 --count 48 --max-size 400
@@ -24,6 +25,9 @@ test: .venv/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/basedpyright
 	$(BIN)/pytest -n 2 --dist loadfile
+
+test-slow: .venv/installed-dev
+	$(BIN)/pytest -n 2 --dist worksteal -m 'slow or hypothesis' --hypothesis-profile=thorough
 
 .venv/installed: $(BIN)/python pyproject.toml constraints.txt
 	$(PIP_INSTALL) -e .

@@ -1,5 +1,6 @@
 """Shared fixtures, the trained run that several files look at, and the one table of tolerances."""
 
+import fcntl
 import os
 from pathlib import Path
 
@@ -8,6 +9,8 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 import pytest
 import torch
+from examples import MANY
+from hypothesis import settings
 
 from nerfcli import scene
 from nerfcli.train.loop import train
@@ -18,6 +21,13 @@ TOLERANCE = {torch.float64: 1e-12, torch.float32: 5e-6}
 
 # Five balls and a box with known geometry: 21 views to train on, 3 held out, 96 x 72 RGBA.
 SPHERES = Path(__file__).parent.parent / "sample_scenes" / "spheres"
+
+
+# Machines may be slow, and the first example of a test may import or compile: no example has a deadline.
+settings.register_profile("quick", deadline=None)
+# What `make test-slow` asks for: this many examples of every property. See `examples.py`.
+settings.register_profile("thorough", deadline=None, max_examples=MANY)
+settings.load_profile("quick")
 
 
 @pytest.fixture
@@ -38,8 +48,15 @@ def spheres() -> scene.Scene:
 
 @pytest.fixture(scope="session")
 def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short but real training on the spheres. Look at it, do not write into it."""
-    run = tmp_path_factory.mktemp("trained") / "spheres-run"
-    settings = TrainSettings(budget_seconds=None, steps=250, samples_per_step=2**13, threads=2)
-    train(spheres, run, settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
+    """A short but real training on the spheres, one for all processes of pytest-xdist. Do not write into it."""
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    run = shared / "trained" / "spheres-run"
+    run.parent.mkdir(exist_ok=True)
+    training = TrainSettings(budget_seconds=None, steps=250, samples_per_step=2**13, threads=2)
+    with (run.parent / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not run.exists():
+            train(spheres, run, training, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
     return run

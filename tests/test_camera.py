@@ -5,7 +5,8 @@ import json
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.cameras import rigid
@@ -135,7 +136,7 @@ def test_opencv_fisheye_agrees_with_opencv():
 
 
 @given(k=st.integers(-600, 600).map(lambda thousandth: thousandth / 1000), radius=st.floats(0.01, 1.5))
-@settings(max_examples=60, deadline=None)
+@examples(60)
 def test_simple_radial_bearing_is_the_smallest_root_of_its_cubic_or_invalid(k, radius):
     """r (1 + k r^2) = radius: closed form through the roots of the cubic, at any strength of the distortion."""
     camera = Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, (100.0, 50.0, 40.0, k))

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -114,7 +115,7 @@ def random_capture(rng: np.random.Generator, kind: str) -> Capture:
 
 
 @given(seed=st.integers(0, 2**32 - 1), kind=st.sampled_from(["perspective", "fisheye", "equirectangular"]))
-@settings(max_examples=30, deadline=None)
+@examples(30)
 def test_round_trip(tmp_path_factory, seed, kind):
     before = random_capture(np.random.default_rng(seed), kind)
     assert losses_camera_path(before) == ()

@@ -15,7 +15,8 @@ import OpenEXR
 import pytest
 import tifffile
 from depth_maps import ALL, FLOATS, FULL_META, META, plain_depth
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -172,7 +173,7 @@ def test_a_full_disk_leaves_the_earlier_file_as_it_was(suffix, tmp_path):
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(largest=st.floats(1e-6, 1e6), unit=st.sampled_from(["metre", "arbitrary"]))
 def test_the_chosen_scale_holds_the_clip_and_is_the_finest_round_one(largest, unit):
     scale = chosen_scale(largest, unit)
@@ -193,7 +194,7 @@ def test_scales_in_metres_are_millimetres_where_those_fit():
     assert chosen_scale(0.0, "arbitrary") == 1.0
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(seed=st.integers(0, 2**32 - 1), size=st.floats(1e-3, 1e5))
 def test_levels_are_within_half_a_level_of_the_depth(seed, size, tmp_path_factory):
     path = tmp_path_factory.mktemp("levels") / "a.png"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import TOLERANCE
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from oracles import quadrature_of_end_density, quadrature_of_squares
 
@@ -44,7 +44,6 @@ def test_one_place_per_interval_is_not_the_moment():
     assert abs(mean.item() - 1.5) > 0.4
 
 
-@settings(deadline=None)  # the first call imports
 @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 4), at=st.floats(0.01, 0.99), exponent=st.floats(-12.0, 6.0))
 def test_splitting_an_interval_changes_nothing_but_max_weight(seed, cut, at, exponent):
     density, starts, ends, offsets = ray(seed, scale=10.0**exponent)

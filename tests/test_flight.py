@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +15,7 @@ from nerfcli.cameras.names import frames_named
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 
-few = settings(max_examples=25, deadline=None)
+few = examples(25)
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image, ImageCms, ImageOps
@@ -265,7 +266,7 @@ def test_unreadable_files_are_told_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF"])
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(examples(30), derandomize=True)
 @given(data=st.data())
 def test_a_photo_with_any_byte_changed_is_read_or_refused(data, tmp_path_factory, kind):
     """No damage to header or EXIF leads to another exception, or to a warning (an error in tests)."""

@@ -3,7 +3,8 @@
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions, random_pixels
 
@@ -14,8 +15,8 @@ from nerfcli.cameras.lens import DISTORTIONS
 seeds = st.integers(0, 2**32 - 1)
 strengths = st.sampled_from([0.0, 1.0, 5.0, 20.0])
 models = st.sampled_from(MODELS)
-many = settings(max_examples=300, deadline=None)
-few = settings(max_examples=40, deadline=None)
+many = examples(100)
+few = examples(40)
 
 POLYNOMIAL = [model for model in MODELS if DISTORTIONS[model]]
 

@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions, random_pixels
 
@@ -12,7 +13,7 @@ from nerfcli.cameras.camera import Camera
 
 seeds = st.integers(0, 2**32 - 1)
 models = st.sampled_from(MODELS)
-many = settings(max_examples=150, deadline=None)
+many = examples(60)
 
 # Central differences of sixth order: f'(0) = sum of weight * f(offset * step) / step.
 STENCIL = {-3: -1 / 60, -2: 3 / 20, -1: -3 / 4, 1: 3 / 4, 2: -3 / 20, 3: 1 / 60}

@@ -4,15 +4,16 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import assume, given, settings
+from examples import examples
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from lenses import HEIGHT, MODELS, WIDTH, random_camera, random_directions
 
 from nerfcli.cameras.camera import Camera, parameter_names
 
 seeds = st.integers(0, 2**32 - 1)
-many = settings(max_examples=200, deadline=None)
-few = settings(max_examples=40, deadline=None)
+many = examples(100)
+few = examples(40)
 
 # COLMAP projects these on all sides; of the others it turns what is behind the camera over.
 ALL_AROUND_IN_COLMAP = ("EUCM", "SIMPLE_DIVISION", "DIVISION", "EQUIRECTANGULAR")

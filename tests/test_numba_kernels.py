@@ -45,6 +45,10 @@ def threads(request):
     torch.set_num_threads(2)
 
 
+# For what sets the threads itself, or has none.
+once = pytest.mark.parametrize("threads", [1], ids=["1 thread"], indirect=True)
+
+
 @pytest.mark.parametrize("samples", SIZES)
 @pytest.mark.parametrize("magnitude", [1e-6, 1.0, 1e6])
 def test_hash_encode(samples, magnitude, generator):
@@ -288,6 +292,7 @@ def test_adam_rows_is_adam_where_every_row_is_touched(generator):
     assert_close(ours[0], parameter.detach(), "table")
 
 
+@once
 def test_exponential_and_sigmoid_in_every_range():
     @numba.njit(error_model="numpy")
     def evaluate(x, values):
@@ -330,6 +335,7 @@ def test_pixel_rays(count, channels, generator):
         assert_close(actual, expected, name)
 
 
+@once
 def test_starting_numba_leaves_the_thread_count_alone():
     # Both libraries share one OpenMP: without care, the first compiled loop gave --threads 1 two threads.
     program = (
@@ -340,6 +346,7 @@ def test_starting_numba_leaves_the_thread_count_alone():
     assert told.stdout.split() == ["1", "1"]
 
 
+@once
 def test_numba_follows_when_the_thread_count_changes():
     # Its own count used to stay where the last loop had left it, and loops that asked for two threads got one.
     for wanted in (1, 2, 1, 2):

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -16,7 +17,7 @@ from nerfcli.errors import UserError
 
 UP = np.array([0.0, 0.0, 1.0])
 LENS = Camera("OPENCV", 64, 48, (50, 52, 33, 23, -0.1, 0.02, 0.001, 0.002))
-few = settings(max_examples=20, deadline=None)
+few = examples(20)
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib import colormaps
 from skimage.color import rgb2lab
@@ -60,7 +61,7 @@ def test_the_legend_tells_convention_axis_and_unit(other):
     assert (preview(depth, META, lo=0, hi=1)[4:] != preview(depth, META, lo=0, hi=2)[4:]).any()
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(lo=st.floats(-1e30, 1e30), span=st.one_of(st.just(0.0), st.floats(0, 1e30)), width=st.integers(1, 200))
 def test_preview_draws_any_range_within_its_sheet(lo, span, width):
     """The margin of the legend stays white: no number leaves the sheet."""

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.media.quantiles import quantiles
@@ -10,7 +11,7 @@ from nerfcli.media.quantiles import quantiles
 SHARES = (0.0, 0.01, 0.5, 0.99, 1.0)
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(
     lists=st.lists(st.lists(st.floats(width=32), max_size=30), max_size=5),
     share=st.floats(0, 1),

@@ -4,7 +4,8 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -15,7 +16,7 @@ from nerfcli.errors import UserError
 
 seeds = st.integers(0, 2**32 - 1)
 exponents = st.integers(-6, 6)
-few = settings(max_examples=40, deadline=None)
+few = examples(40)
 
 
 def random_pose(rng: np.random.Generator, size: float = 1.0) -> np.ndarray:
@@ -103,7 +104,7 @@ angles = st.one_of(
 
 
 @given(seed=seeds, angle=angles)
-@settings(max_examples=200, deadline=None)
+@examples(200)
 def test_exp_and_log_of_rotations_are_inverse_from_0_to_pi(seed, angle):
     """To rounding at pi too: the half angle is found by atan2 of the quaternion's two parts, never by acos."""
     axis = np.random.default_rng(seed).normal(size=3)
@@ -134,7 +135,7 @@ def test_rotations_about_one_axis_add_up_and_the_log_turns_with_the_frame(seed):
 
 
 @given(seed=seeds, angle=angles)
-@settings(max_examples=100, deadline=None)
+@examples(100)
 def test_exp_of_a_twist_is_the_matrix_exponential_and_log_its_inverse(seed, angle):
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)

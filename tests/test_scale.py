@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
@@ -25,7 +26,7 @@ from nerfcli.scale.edges import refined_corners
 from nerfcli.scale.estimate import ScaleEstimate, in_metres
 from nerfcli.scale.gps import Position, east_north_up, ecef, gps_positions, scale_from_gps
 
-few = settings(max_examples=20, deadline=None)
+few = examples(20)
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +15,7 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.cameras.world import WORLD_AXES, moved_to_origin, smallest_rotation, transformed, turned_up
 from nerfcli.errors import UserError
 
-few = settings(max_examples=30, deadline=None)
+few = examples(30)
 seeds = st.integers(0, 2**32 - 1)
 LENS = Camera("OPENCV", 64, 48, (50, 52, 33, 23, -0.1, 0.02, 0.001, 0.002))
 

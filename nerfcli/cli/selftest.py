@@ -79,10 +79,11 @@ def selftest(
         console.fact_table(_COLUMNS, [_cells(row) for row in measured], styles=_STYLES)
     met = sum(row.verdict == MET for row in measured)
     failed = [row for row in measured if row.verdict == NOT_MET]
+    absent = len(measured) - met - len(failed)
     console.note(
         f"{met} of {met + len(failed)} rows within their bounds; {sum(row.textbook_fails for row in formulas)} of "
-        f"{len(formulas)} textbook formulas are beyond them somewhere; {len(measured) - met - len(failed)} cases do not "
-        f"occur here; {time.perf_counter() - begin:.1f} s"
+        f"{len(formulas)} textbook formulas are beyond them somewhere; {absent} cases do not occur here; "
+        f"{time.perf_counter() - begin:.1f} s"
     )
     if failed:
         row = failed[0]

@@ -104,9 +104,7 @@ def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> 
         inside = (scaled - cell)[:, None, :]  # (N, 1, 3)
         weights = torch.where(corners == 1, inside, 1.0 - inside).prod(-1)  # (N, 8)
         index = corner_rows(cell.long()[:, None, :] + corners, resolution, rows)  # (N, 8)
-        # In the wider of the two precisions before it is read: gradients of a half-precision table are rounded once.
-        features = table[level].to(torch.promote_types(table.dtype, weights.dtype))[index]
-        encoded.append((features * weights[..., None]).sum(1))
+        encoded.append((table[level][index] * weights[..., None]).sum(1))
     return torch.cat(encoded, dim=-1)
 
 

@@ -64,7 +64,9 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
                 max(largest_error(answers[c][i : i + 1], [one[c]], tiny=precision.tiny) for c in shown)
                 for i, one in enumerate(wanted)
             ]
-            return max(zip(errors, allowed, strict=True), key=lambda pair: pair[0] / pair[1])
+            ratios = [error / bound for error, bound in zip(errors, allowed, strict=True)]
+            worst = ratios.index(max(ratios))
+            return errors[worst], allowed[worst]
 
         error, bound = nearest(_columns(seen))
         yield Row(
@@ -74,8 +76,8 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
             precision=precision.name,
             errors=Errors(error),
             bounds=Errors(bound),
-            reason="of the ray nearest to its bound: u (16 + (n + 2) (1 + tau)), of a spread times 1 + the mean over it, "
-            "from where most light ends; compiled 16 u",
+            reason="of the ray nearest to its bound: u (16 + (n + 2) (1 + tau)), of a spread times 1 + the mean, from "
+            "where most light ends, over the spread; compiled 16 u",
             formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
             textbook=None if precision.compiled else Errors(nearest({**plain, "conditional": plain["mean"]})[0]),
             seconds=seconds,

@@ -153,8 +153,8 @@ def _encode_row(case: str, points: tuple[Point, ...], precision: Precision, *, g
         precision=precision.name,
         errors=_errors(encoded, table.grad, wanted, tiny=precision.tiny),
         bounds=Errors(16 * precision.unit, bound),
-        reason="16 u, of a gradient 16 + n, relative to their terms; where a place in cells is rounded, relative to what "
-        "moving by a cell's share u resolution does",
+        reason="16 u, of a gradient 16 + n, relative to their terms; where places are rounded as they are counted in "
+        "cells, relative to the resolution times the largest feature",
         formula="places, table and sums in float16",
         textbook=half,
         seconds=seconds,

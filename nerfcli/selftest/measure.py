@@ -107,7 +107,7 @@ class Row:
 
 
 def by_formula(rows: Sequence[Row]) -> list[Row]:
-    """One row for each textbook formula: the one in which it is farthest beyond the bounds, of float32 if it has any."""
+    """One row for each textbook formula: where it is farthest beyond the bounds, in float32 if it has such rows."""
     formulas: dict[str, list[Row]] = {}
     for row in rows:
         if row.textbook is not None:
