@@ -89,11 +89,6 @@ def desk_views() -> list[View]:
     ]
 
 
-def desk(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
-    """As it is: nothing beyond the default is needed."""
-    return desk_views(), {}
-
-
 def log_gains(views: list[View], generator: np.random.Generator) -> np.ndarray:
     """(views, 3) logarithms of gains in linear light; their mean over the training photos is 0."""
     common = np.clip(generator.normal(0.0, EXPOSURE_SPREAD, (len(views), 1)), -0.6, 0.6)
@@ -102,12 +97,12 @@ def log_gains(views: list[View], generator: np.random.Generator) -> np.ndarray:
 
 
 def exposed(view: View, gain: np.ndarray) -> np.ndarray:
-    return to_8_bit(srgb(linear(view.pixels / 255.0) * np.exp(gain)))
+    light = srgb(linear(view.pixels[..., :3] / 255.0) * np.exp(gain))
+    return np.concatenate([to_8_bit(light), view.pixels[..., 3:]], axis=-1)
 
 
-def exposure(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def exposure(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
     """Exposure and white balance drift from photo to photo, and no EXIF tells; held-out photos have the mean."""
-    views = desk_views()
     gains = log_gains(views, generator)
     changed = [
         view if view.test else replace(view, pixels=exposed(view, gain))
@@ -116,9 +111,8 @@ def exposure(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]
     return changed, {"log_gains": {v.name: g.tolist() for v, g in zip(views, gains, strict=True) if not v.test}}
 
 
-def exposure_exif(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def exposure_exif(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
     """Exposure drifts, that of held-out photos too, and EXIF tells the shutter times."""
-    views = desk_views()
     gains = log_gains(views, generator).mean(axis=1, keepdims=True)
     changed = [
         replace(view, pixels=exposed(view, gain), exposure_seconds=math.exp(gain[0]) / 60)
@@ -127,9 +121,9 @@ def exposure_exif(generator: np.random.Generator) -> tuple[list[View], dict[str,
     return changed, {"log_gains": {v.name: [g[0]] * 3 for v, g in zip(views, gains, strict=True)}}
 
 
-def poses(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def poses(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
     """Training photos are turned by half a degree about a random axis through their centres."""
-    views, changed, angles = desk_views(), [], {}
+    changed, angles = [], {}
     for view in views:
         axis = generator.normal(size=3)
         turn = math.radians(POSE_NOISE_DEG) * axis / np.linalg.norm(axis)
@@ -142,9 +136,8 @@ def poses(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
     return changed, {"turned_by_rad": angles, "world_from_cam": truth}
 
 
-def focal(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def focal(views: list[View], generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
     """The focal length of the training photos is 2 % too long."""
-    views = desk_views()
     camera = views[0].camera
     wrong = replace(camera, params=(camera.params[0] * (1 + FOCAL_ERROR), *camera.params[1:]))
     return [view if view.test else replace(view, camera=wrong) for view in views], {"params": list(camera.params)}
@@ -256,35 +249,35 @@ def surface_normals(tracer: ModuleType, points: np.ndarray) -> np.ndarray:
     return normals
 
 
-def alpha(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def alpha() -> list[View]:
     """A matt object in RGBA: colours depend on the point alone, and behind it is nothing."""
-    return ball_views(), {}
+    return ball_views()
 
 
-def glossy(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def glossy() -> list[View]:
     """The same object, polished: lamps wander over it with the view."""
-    return ball_views(gloss=0.7), {}
+    return ball_views(gloss=0.7)
 
 
-def unbounded(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def unbounded() -> list[View]:
     """The object in front of what is infinitely far: colours behind it depend on the direction alone."""
-    return ball_views(behind=surroundings), {}
+    return ball_views(behind=surroundings)
 
 
-def turntable(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def turntable() -> list[View]:
     """The object turns in front of a camera that stands still: what is behind it contradicts the poses. With masks,
     whose black is empty space; held-out photos are RGBA."""
     clean = ball_views()
     views = ball_views(moving_behind=surroundings)
-    return [a if a.test else b for a, b in zip(clean, views, strict=True)], {}
+    return [a if a.test else b for a, b in zip(clean, views, strict=True)]
 
 
-def few(generator: np.random.Generator) -> tuple[list[View], dict[str, Any]]:
+def few() -> list[View]:
     """Six photos to learn from, with points and where they were seen, as structure from motion gives them."""
     views = ball_views(behind=surroundings)
     kept = set(np.linspace(0, len(views) - 1, FEW_VIEWS).round().astype(int).tolist())
     chosen = [replace(view, test=index not in kept) for index, view in enumerate(views) if index in kept or view.test]
-    return chosen, {}
+    return chosen
 
 
 def ball_points(views: list[View], generator: np.random.Generator) -> tuple[np.ndarray, Observations]:
@@ -316,23 +309,31 @@ def ball_points(views: list[View], generator: np.random.Generator) -> tuple[np.n
 
 # --- writing ----------------------------------------------------------------------------------------------------------
 
-MAKERS: dict[str, Callable[[np.random.Generator], tuple[list[View], dict[str, Any]]]] = {
-    "desk": desk,
+Change = Callable[[list[View], np.random.Generator], tuple[list[View], dict[str, Any]]]
+
+CHANGES: dict[str, Change] = {
     "exposure": exposure,
     "exposure-exif": exposure_exif,
     "poses": poses,
     "focal": focal,
-    "alpha": alpha,
-    "glossy": glossy,
-    "unbounded": unbounded,
-    "turntable": turntable,
-    "few": few,
+}
+# The scenes: views, and what is done to them.
+MAKERS: dict[str, tuple[Callable[[], list[View]], Change | None]] = {
+    "desk": (desk_views, None),
+    **{name: (desk_views, change) for name, change in CHANGES.items()},
+    "alpha": (alpha, None),
+    **{f"{name}-balls": (alpha, change) for name, change in CHANGES.items()},
+    "glossy": (glossy, None),
+    "unbounded": (unbounded, None),
+    "turntable": (turntable, None),
+    "few": (few, None),
 }
 
 
 def write_photo(view: View, path: Path) -> None:
     """JPEG or PNG by the name's ending, with the exposure time in EXIF where it is known."""
     exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 1  # Pillow leaves out what has no entry of its own in a PNG
     if view.exposure_seconds is not None:
         camera = exif.get_ifd(ExifTags.IFD.Exif)
         camera[ExifTags.Base.ExposureTime] = view.exposure_seconds
@@ -348,7 +349,8 @@ def write_photo(view: View, path: Path) -> None:
 def make(name: str, folder: Path, seed: int) -> None:
     """Write the scene `name` into a folder."""
     generator = np.random.default_rng([seed, list(MAKERS).index(name)])
-    views, truth = MAKERS[name](generator)
+    take, change = MAKERS[name]
+    views, truth = change(take(), generator) if change is not None else (take(), {})
     images, masks = folder / "images", folder / "masks"
     images.mkdir(parents=True, exist_ok=True)
     for view in views:

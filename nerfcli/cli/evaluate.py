@@ -53,6 +53,7 @@ def evaluate_run(
     from nerfcli.atomic import write_json
     from nerfcli.evaluate.protocol import METRICS, HeldOut, evaluate_model
     from nerfcli.render.model import load_model
+    from nerfcli.train.exif_exposure import relative_log_exposures
     from nerfcli.train.photos import load_photos
     from nerfcli.train.run_folder import FIELD, LOG, read_cameras, read_config, read_log
 
@@ -72,7 +73,11 @@ def evaluate_run(
     if not log:
         raise UserError(f"{run} has no {LOG}, which tells the time of the training", "train again with --overwrite")
     photos = load_photos(cameras["test"], factor=config["settings"]["downscale"], threads=threads)
-    held_out = [HeldOut(photo.frame, photo.pixels, photo.used) for photo in photos]
+    gains = relative_log_exposures(cameras["test"], model.log_exposure)
+    held_out = [
+        HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))
+        for photo, gain in zip(photos, gains, strict=True)
+    ]
     with console.progress("evaluate") as update:
         metrics = evaluate_model(
             model, held_out, on_image=lambda done, total: update(done / total, f"{done}/{total} rays")

@@ -64,9 +64,10 @@ def train(
     transforms_train.json (Blender) or poses_bounds.npy (LLFF). Every 8th photo is held out. Writes SCENE-run/.
     Ctrl-C saves a checkpoint; --resume goes on from it.
 
-    Components, for --with and --without: background (auto, black, random: what is behind the field), view (0 to 3: the
-    degree to which colours depend on the direction), near (smaller gradients near cameras), distortion (a weight:
-    the light of a ray in one place).
+    Components, for --with and --without: background (auto, black, constant, random, sphere: what is behind the
+    field), view (0 to 3: the degree to which colours depend on the direction), exposure (none, exif, learned:
+    brightness and white balance of each photo), near (smaller gradients near cameras), distortion (a weight: the light
+    of a ray in one place).
 
     \b
     Examples:

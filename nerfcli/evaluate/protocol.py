@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
+from nerfcli.field.exposure import exposed
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
 
@@ -27,11 +29,13 @@ class HeldOut:
         frame: its camera and pose.
         pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
         used: (H, W) bool; None for all pixels.
+        log_gain: logarithm of its exposure relative to the model's photos, as EXIF tells it; see `field.exposure`.
     """
 
     frame: Frame
     pixels: np.ndarray
     used: np.ndarray | None
+    log_gain: float = 0.0
 
 
 def evaluate_model(
@@ -74,7 +78,7 @@ def evaluate_model(
             raise UserError(
                 f"no pixel of {photo.frame.name} is left to compare", "check that its mask is white where pixels count"
             )
-        rendered, truth = to_8_bit(picture.rgb), over_white(photo.pixels)
+        rendered, truth = to_8_bit(_as_exposed(picture.rgb, photo.log_gain)), over_white(photo.pixels)
         images.append(
             {
                 "name": photo.frame.name,
@@ -96,6 +100,13 @@ def evaluate_model(
     }
 
 
+def _as_exposed(rgb: np.ndarray, log_gain: float) -> np.ndarray:
+    """A picture as a photo of another exposure shows it, clipped."""
+    if log_gain == 0.0:
+        return rgb
+    return exposed(torch.from_numpy(rgb), torch.tensor(log_gain)).clamp(0.0, 1.0).numpy()
+
+
 def over_white(pixels: np.ndarray) -> np.ndarray:
     """RGBA on white as 8-bit RGB, as the published tables have it; RGB as it is."""
     if pixels.shape[-1] == 3:
@@ -107,8 +118,9 @@ def over_white(pixels: np.ndarray) -> np.ndarray:
 def _protocol_name(held_out: Sequence[HeldOut]) -> str:
     sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in held_out})
     names = hashlib.sha256("\n".join(photo.frame.name for photo in held_out).encode()).hexdigest()[:12]
+    known = ", exposures by EXIF" if any(photo.log_gain for photo in held_out) else ""
     alpha = ", RGBA on white" if any(photo.pixels.shape[-1] == 4 for photo in held_out) else ""
     return (
         f"nerfcli-1: {len(held_out)} held-out photos (names sha256 {names}) at {' '.join(sizes)}, area-averaged, "
-        f"sRGB 8 bit{alpha}, mean of per-image PSNR, SSIM with Gaussian window 1.5 (scikit-image)"
+        f"sRGB 8 bit{alpha}{known}, mean of per-image PSNR, SSIM with Gaussian window 1.5 (scikit-image)"
     )

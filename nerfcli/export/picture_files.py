@@ -10,6 +10,7 @@ from nerfcli import __version__
 from nerfcli.export.depth_files import write_maps
 from nerfcli.export.names import with_suffix
 from nerfcli.export.settings import ExportSettings
+from nerfcli.field.background import Background, SphereBackground
 from nerfcli.media.depth import DepthMeta
 from nerfcli.media.images import write_png
 from nerfcli.render.pictures import Picture
@@ -22,7 +23,7 @@ def write_picture(
     *,
     settings: ExportSettings,
     meta: DepthMeta,
-    background: tuple[float, float, float],
+    background: Background,
 ) -> list[Path]:
     """Write what `settings` asks for; each file atomically.
 
@@ -32,7 +33,7 @@ def write_picture(
         name: without suffix, with "/" between folders.
         settings: the outputs, and the formats of depth.
         meta: what the depth of this frame means, see `depth_files.frame_meta`.
-        background: sRGB that the picture stands on.
+        background: what the picture stands on.
 
     Returns:
         The files, complete.
@@ -50,11 +51,10 @@ def write_picture(
     return written
 
 
-def _write_rgb(
-    rgb: np.ndarray, stem: Path, *, background: tuple[float, float, float], bounds: Mapping[str, Any]
-) -> list[Path]:
+def _write_rgb(rgb: np.ndarray, stem: Path, *, background: Background, bounds: Mapping[str, Any]) -> list[Path]:
     path = with_suffix(stem, ".png")
-    behind = str(background) if rgb.shape[-1] == 3 else "none: straight alpha"
+    behind = "learned, by direction" if isinstance(background, SphereBackground) else str(background)
+    behind = behind if rgb.shape[-1] == 3 else "none: straight alpha"
     error = {f"error {name}": str(value) for name, value in bounds.items()}
     metadata = {"colour": "sRGB", "background": behind, **error, "nerfcli": __version__}
     write_png(path, _to_bytes(rgb), metadata=metadata)

@@ -71,6 +71,7 @@ class Exif:
     iso: float | None
     gps: tuple[float, float, float | None] | None
     taken: float | None = None
+    f_number: float | None = None
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -197,6 +198,7 @@ def read_exif(path: Path) -> Exif:
         iso=_positive(camera.get(ExifTags.Base.ISOSpeedRatings)),
         gps=_position(gps),
         taken=_clock(camera.get(ExifTags.Base.DateTimeOriginal), camera.get(ExifTags.Base.SubsecTimeOriginal)),
+        f_number=_positive(camera.get(ExifTags.Base.FNumber)),
     )
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.field.background import colours_behind
 from nerfcli.render.depth import DepthRequest, requested, shares
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Picture
@@ -124,7 +125,7 @@ def _renderings(
     """Colours (4, P, 3) and depths (4, P) of pixels: as rendered; then tightly with intervals whole, halved, in 4."""
     rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
     directions, cosines = rays.directions[rays.valid], rays.cosines[rays.valid]
-    background = directions.new_tensor(model.background)
+    background = colours_behind(model.background, directions)
     cuts = uniform_cuts(model.marching)
     seen = [
         render_cut_rays(

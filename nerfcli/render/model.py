@@ -9,12 +9,14 @@ from torch import Tensor
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
+from nerfcli.field.background import Background, SphereBackground
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.interface import Field
 from nerfcli.field.kinds import fresh_field, settings_from_json
 from nerfcli.render.sampling import step_edges
 
 FORMAT = "nerfcli field 1"
+BACKGROUND = "background.logits"
 
 
 @dataclass(frozen=True)
@@ -43,19 +45,22 @@ class Model:
         field: the radiance field, on points of the training frame.
         occupied: (G, G, G) bool over the field's unit cube.
         marching: the steps along rays.
-        background: (3,) sRGB behind everything, for pictures without alpha.
+        background: sRGB behind everything, for pictures without alpha.
         training_from_scene: the invertible normalisation.
         unit: unit of length of the scene's own frame, "arbitrary" or "metre".
         unit_source: how a metre is known; None where nobody wrote it down.
+        log_exposure: the mean of the training photos by EXIF, if the model knows photos of different exposures; see
+            `train.exif_exposure`.
     """
 
     field: Field
     occupied: Tensor
     marching: Marching
-    background: tuple[float, float, float]
+    background: Background
     training_from_scene: Similarity
     unit: str
     unit_source: str | None = None
+    log_exposure: float | None = None
 
     @property
     def device(self) -> torch.device:
@@ -68,16 +73,20 @@ class Model:
 
 def save_model(path: Path, model: Model) -> None:
     """Write the model to one file."""
+    behind, tensors = model.background, {**model.field.state_dict(), "occupied": model.occupied}
+    if isinstance(behind, SphereBackground):
+        tensors[BACKGROUND] = behind.logits
     description: dict[str, Any] = {
         "format": FORMAT,
         "field": model.field.settings.to_json(),
         "marching": vars(model.marching),
-        "background": list(model.background),
+        "background": {"side": behind.logits.shape[-1]} if isinstance(behind, SphereBackground) else list(behind),
         "training_from_scene": model.training_from_scene.to_json(),
         "unit": model.unit,
         "unit_source": model.unit_source,
+        "log_exposure": model.log_exposure,
     }
-    save_tensors(path, {**model.field.state_dict(), "occupied": model.occupied}, description)
+    save_tensors(path, tensors, description)
 
 
 def load_model(path: Path, device: str) -> Model:
@@ -93,15 +102,26 @@ def load_model(path: Path, device: str) -> Model:
             "train again with this version of nerfcli",
         )
     occupied = tensors.pop("occupied")
+    background = _background(description["background"], tensors)
     field = fresh_field(settings_from_json(description["field"])).to(device)
     field.load_state_dict(tensors)
-    red, green, blue = description["background"]
     return Model(
         field=field,
         occupied=occupied,
         marching=Marching(**description["marching"]),
-        background=(red, green, blue),
+        background=background,
         training_from_scene=Similarity.from_json(description["training_from_scene"]),
         unit=description["unit"],
         unit_source=description.get("unit_source"),
+        log_exposure=description.get("log_exposure"),
     )
+
+
+def _background(described: Any, tensors: dict[str, Tensor]) -> Background:
+    """The background that `save_model` described; its tensor is taken out of `tensors`."""
+    if isinstance(described, dict):
+        sphere = SphereBackground(described["side"])
+        sphere.logits.data = tensors.pop(BACKGROUND)
+        return sphere
+    red, green, blue = described
+    return red, green, blue

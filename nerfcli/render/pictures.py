@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.field.background import Background, colours_behind
 from nerfcli.render.depth import DepthRequest, disagreement, requested, shares, spread
 from nerfcli.render.model import Model
 from nerfcli.render.pixels import pixels_of_rays
@@ -15,7 +16,7 @@ from nerfcli.render.rays import Rays, pixel_rays, places_in_pixel
 from nerfcli.render.tracing import TOLERANCE, render_rays
 
 RAYS_PER_TILE = 8192
-# Rays are made for this many at a time, whatever the tile: their last bits must not depend on it.
+# Rays and what is behind them are made for this many at a time: their last bits must not depend on the tile.
 RAYS_PER_BLOCK = 2**18
 
 
@@ -67,7 +68,7 @@ def render_picture(
     model: Model,
     frame: Frame,
     *,
-    background: tuple[float, float, float],
+    background: Background,
     depth: DepthRequest | None = None,
     quality: Quality = Quality(),
     on_tile: Callable[[int], None] | None = None,
@@ -81,7 +82,7 @@ def render_picture(
     Args:
         model: the trained model.
         frame: camera and pose in the scene's frame.
-        background: sRGB behind everything.
+        background: behind everything.
         depth: which depth to compute along with the colour.
         quality: how much work to put into it.
         on_tile: called with the number of pixels after each tile.
@@ -91,12 +92,12 @@ def render_picture(
         raise ValueError("the background convention needs a background distance")
     width, height, count = frame.camera.width, frame.camera.height, quality.samples_per_pixel
     places = places_in_pixel(count)
-    behind = torch.tensor(background, dtype=torch.float32, device=model.device)
     columns: list[tuple[Tensor, ...]] = []
     block, tile = max(1, RAYS_PER_BLOCK // count), max(1, rays_per_tile // count)
     for first in range(0, width * height, block):
         chosen = np.arange(first, min(first + block, width * height))
         rays = pixel_rays(frame, model.training_from_scene, pixels=chosen, places=places, device=model.device)
+        behind = colours_behind(background, rays.directions)
         for begin in range(0, len(chosen), tile):
             part = slice(begin * count, min((begin + tile) * count, len(rays.directions)))
             columns.append(_render_tile(model, rays, part, background=behind, depth=depth, quality=quality))
@@ -131,11 +132,12 @@ def _render_tile(
     """Colour, opacity, truncation error, validity of the pixels of some rays; depth, spread, disagreement if wanted."""
     directions, count = rays.directions[part], quality.samples_per_pixel
     wanted = shares(depth) if depth is not None else ()
+    behind = background[part]
     seen = render_rays(
         model,
         rays.origin.expand_as(directions),
         directions,
-        background=background,
+        background=behind,
         shares=wanted,
         tolerance=quality.tolerance,
     )
@@ -145,9 +147,7 @@ def _render_tile(
     if depth is not None and depth.axis == "z":
         ahead = rays.cosines[part] > 0
         factor = torch.where(ahead, rays.cosines[part], 1.0) / scale
-    pixels = pixels_of_rays(
-        seen, valid=rays.valid[part], background=background, factor=factor, shares=wanted, count=count
-    )
+    pixels = pixels_of_rays(seen, valid=rays.valid[part], background=behind, factor=factor, shares=wanted, count=count)
     colours = (pixels.rgb.clamp(0.0, 1.0), pixels.ends.opacity, pixels.truncation_error, pixels.valid)
     if depth is None:
         return colours

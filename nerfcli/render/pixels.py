@@ -41,7 +41,7 @@ def pixels_of_rays(
     Args:
         seen: of R rays, with the quantiles `shares`.
         valid: (R,) rays that exist.
-        background: (3,) sRGB.
+        background: (R, 3) sRGB; a pixel that does not exist has that of its first ray.
         factor: (R,) > 0, from distances along the ray to those wanted.
         shares: of the quantiles.
         count: rays per pixel, a divisor of R.
@@ -54,7 +54,7 @@ def pixels_of_rays(
         passing = seen.ends.transmittance.view(-1, count) + torch.finfo(factor.dtype).tiny
         to_background = (passing * factor.view(-1, count)).sum(1) / passing.sum(1)
     return Pixels(
-        rgb=torch.where(valid[:, None], rgb, background),
+        rgb=torch.where(valid[:, None], rgb, background[::count]),
         ends=ends._replace(opacity=torch.where(valid, ends.opacity, 0.0)),
         truncation_error=torch.where(valid, error, 0.0),
         to_background=to_background,

@@ -68,7 +68,7 @@ def render_rays(
     Args:
         model: the trained model.
         origins, directions: (R, 3) in the training frame, unit directions.
-        background: (3,) sRGB.
+        background: (3,) or (R, 3) sRGB.
         shares: quantiles to compute.
         tolerance: bound on what is left out of a colour, > 0.
     """
@@ -118,7 +118,7 @@ def render_cut_rays(
     )
     light = kernels.light_ends(density, starts, ends, offsets=offsets, shares=shares)
     stopped = transmittance <= math.exp(-stop) * (1 + 1e-5)  # rounding must not hide a stop
-    behind = torch.maximum(background, 1.0 - background).max()  # how far any colour is from the background's
+    behind = torch.maximum(background, 1.0 - background).amax(-1)  # how far any colour is from the background's
     left_out = UNSEEN * kernels.sum_along_rays(torch.where(unseen, weights, 0.0), offsets)
     error = left_out + torch.where(stopped, transmittance * behind, 0.0)
     return RaysSeen(colour, light, error, Intervals(density, starts, ends, offsets))

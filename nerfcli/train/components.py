@@ -13,7 +13,8 @@ from nerfcli.errors import UserError
 Value = bool | int | float | str
 
 # What may be behind all that the field holds.
-BACKGROUNDS = ("auto", "black", "random")
+BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
+EXPOSURES = ("none", "exif", "learned")
 # Spherical harmonics up to this degree: 16 of them.
 MOST_DEGREES = 3
 
@@ -23,10 +24,11 @@ class Components:
     """What is in the model and in its loss. The defaults are what nearly every scene needs.
 
     Args:
-        background: behind the field: "black"; "random" colours in training, for photos with alpha; "auto" is random
-            for photos with alpha and black for all others.
+        background: behind the field: "black"; a learned colour, "constant" or by direction ("sphere"); "random" colours
+            in training, for photos with alpha; "auto" is random for photos with alpha and black for all others.
         view: how colours depend on the direction they are seen from: the highest degree of the spherical harmonics
             that the colour network is told, 0 to 3. 0: not at all.
+        exposure: gains of the photos, see `field.exposure`: "none", those that "exif" tells, or "learned" from there.
         near: whether gradients near a camera are scaled down; see `fitting.scale_gradients`.
         distortion: weight of `losses.distortion_loss`; 0.05 is best or as good as any on real and synthetic
             captures.
@@ -34,6 +36,7 @@ class Components:
 
     background: str = "auto"
     view: int = MOST_DEGREES
+    exposure: str = "none"
     near: bool = True
     distortion: float = 0.05
 
@@ -78,8 +81,9 @@ class Choice:
 
 
 CHOICES = {
-    "background": Choice("what is behind the field", "black", "random", BACKGROUNDS),
+    "background": Choice("what is behind the field", "black", "sphere", BACKGROUNDS),
     "view": Choice("colour by direction, degree", 0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
+    "exposure": Choice("brightness and white balance of photos", "none", "learned", EXPOSURES),
     "near": Choice("smaller gradients near cameras", False, True, (False, True)),
     "distortion": Choice("light of a ray in one place, weight", 0.0, 0.05, None),
 }

@@ -13,8 +13,9 @@ from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
-from nerfcli.train.losses import colour_loss, distortion_loss, over_background
-from nerfcli.train.optimiser import FieldOptimiser
+from nerfcli.train.losses import colour_loss, distortion_loss
+from nerfcli.train.optimiser import FieldOptimiser, PartsOptimiser
+from nerfcli.train.parts import Parts
 from nerfcli.train.photos import Drawn, PixelPool
 from nerfcli.train.settings import TrainSettings
 
@@ -63,6 +64,7 @@ class Fitting:
         *,
         unbounded: bool,
         settings: TrainSettings,
+        log_gains: Tensor | None = None,
     ):
         device = pool.colours.device
         torch.manual_seed(settings.seed)
@@ -79,13 +81,14 @@ class Fitting:
             view_degree=self.components.view,
         )
         self.field = fresh_field(size).to(device)
-        behind = self.components.background
-        self.random_background = behind == "random" or (behind == "auto" and pool.has_alpha)
+        gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
+        self.parts = Parts(self.components, pool, log_gains=gains)
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
         self.optimiser = FieldOptimiser(self.field)
+        self.parts_optimiser = PartsOptimiser(self.parts.groups())
         self.samples_per_ray = float(len(self.edges) - 2)
 
     def advance(self, share: float) -> StepResult:
@@ -106,12 +109,14 @@ class Fitting:
         stride = next(stride for until, stride in STRIDES if share <= until)
         loss, samples = self._loss(drawn, edges=self.edges[::stride].contiguous())
         self.optimiser.zero_grad()
+        self.parts_optimiser.zero_grad()
         if samples > 0:
             loss.backward()
         self._check_finite(loss)
         rate = self.learning_rate(share)
         self.step += 1
         self.optimiser.step(self.step, rate)
+        self.parts_optimiser.step(rate)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         return StepResult(loss=loss.item(), samples=samples, rays=rays)
 
@@ -124,14 +129,10 @@ class Fitting:
 
     def _loss(self, drawn: Drawn, *, edges: Tensor) -> tuple[Tensor, int]:
         """Loss over some rays, and the number of samples it took."""
-        origins, directions, colours, _ = drawn
+        origins, directions = drawn.origins, drawn.directions
         components, device = self.components, origins.device
         jitter = torch.rand(len(origins), generator=self.generator, device=device)
-        # Photos with alpha are shown on random colours, so that only opacity explains them. Others fill the frame:
-        # behind them is black, as random colours shining through the fog of the start would drown all else.
-        background = torch.zeros(len(origins), 3, device=device)
-        if self.random_background:
-            background = torch.rand(len(origins), 3, generator=self.generator, device=device)
+        background = self.parts.behind(len(origins), self.generator)
         samples = self.field.visible_samples(
             origins, directions, edges, jitter=jitter, occupied=self.occupied, deepest=DEEPEST
         )
@@ -141,8 +142,10 @@ class Fitting:
         )
         if components.near:
             scale_gradients(density, rgb, distance=starts)
-        rendered, _, weights = kernels.composite(density, rgb, ends - starts, offsets=offsets, background=background)
-        loss = colour_loss(rendered, over_background(colours, background))
+        rendered, transmittance, weights = kernels.composite(
+            density, rgb, ends - starts, offsets=offsets, background=background
+        )
+        loss = colour_loss(*self.parts.compared(rendered, transmittance, drawn, behind=background))
         if components.distortion:
             loss = loss + components.distortion * distortion_loss(weights, starts, ends, offsets)
         return loss, len(starts)
@@ -168,7 +171,8 @@ class Fitting:
         return self.occupancy.above(threshold)
 
     def _check_finite(self, loss: Tensor) -> None:
-        gradients = {f"gradient of {name}": tensor for name, tensor in self.optimiser.gradients().items()}
+        given = {**self.optimiser.gradients(), **self.parts.gradients()}
+        gradients = {f"gradient of {name}": tensor for name, tensor in given.items()}
         for name, tensor in {"loss": loss, **gradients}.items():
             # A sum is non-finite if any term is.
             if not math.isfinite(tensor.sum().item()):
@@ -185,6 +189,8 @@ class Fitting:
             **self.occupancy.state(),
             **self.optimiser.state(),
         }
+        tensors.update({f"parts.{name}": value for name, value in self.parts.state_dict().items()})
+        tensors.update(self.parts_optimiser.state())
         return tensors, {"step": self.step, "samples_per_ray": self.samples_per_ray}
 
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
@@ -192,6 +198,8 @@ class Fitting:
         self.generator.set_state(tensors["generator"].cpu())
         self.occupancy.restore(tensors)
         self.optimiser.restore(tensors)
+        self.parts.load_state_dict({name: tensors[f"parts.{name}"] for name in self.parts.state_dict()})
+        self.parts_optimiser.restore(tensors)
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.occupied = self._open_cells()

@@ -3,9 +3,12 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.field.background import colours_behind
+from nerfcli.field.exposure import exposed
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import render_rays
 from nerfcli.train.losses import over_background
@@ -16,18 +19,30 @@ SEED = 1
 
 
 class HeldoutPixels:
-    """The same few thousand random pixels of the held-out photos, whenever it is asked."""
+    """The same few thousand random pixels of the held-out photos, whenever it is asked.
 
-    def __init__(self, photos: Sequence[Photo], training_from_scene: Similarity, device: torch.device):
+    Args:
+        photos: held out.
+        training_from_scene: the normalisation.
+        device: where to keep them.
+        log_gains: (photos,) logarithms of their exposures relative to the mean photo, as far as EXIF tells; else 0.
+    """
+
+    def __init__(
+        self, photos: Sequence[Photo], training_from_scene: Similarity, device: torch.device, *, log_gains: np.ndarray
+    ):
         pool = PixelPool(photos, training_from_scene, device)
         generator = torch.Generator(device=device).manual_seed(SEED)
-        self.origins, self.directions, self.colours, _ = pool.draw(PIXELS, generator)
+        self.origins, self.directions, self.colours, numbers = pool.draw(PIXELS, generator)
+        self.log_gains = torch.as_tensor(log_gains, dtype=torch.float32, device=device)[pool.photo_of(numbers)]
 
     @torch.no_grad()
     def psnr(self, model: Model) -> float:
         """PSNR in dB over these pixels together, clipped to [0, 1], on the model's background."""
-        background = self.colours.new_tensor(model.background)
+        background = colours_behind(model.background, self.directions)
         rendered = render_rays(model, self.origins, self.directions, background=background).rgb
-        wanted = over_background(self.colours, background.expand(len(self.colours), 3))
+        wanted = over_background(self.colours, background)
+        if self.log_gains.any():
+            rendered = exposed(rendered, self.log_gains[:, None])
         error = (rendered.clamp(0.0, 1.0) - wanted).square().mean().item()
         return -10.0 * math.log10(max(error, 1e-12))

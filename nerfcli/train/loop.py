@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from nerfcli import kernels
@@ -16,6 +17,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.scene import Scene
+from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.heldout import HeldoutPixels
 from nerfcli.train.normalisation import training_frame
@@ -86,7 +88,11 @@ def train(
     similarity, marching = training_frame(scene, unbounded=unbounded)
     device = torch.device(settings.device)
     pool = PixelPool(photos, similarity, device)
-    heldout = HeldoutPixels(test_photos, similarity, device) if test_photos else None
+    reference = None if settings.components.exposure == "none" else mean_log_exposure(scene.train_frames)
+    heldout = None
+    if test_photos:
+        gains = relative_log_exposures(scene.test_frames, reference)
+        heldout = HeldoutPixels(test_photos, similarity, device, log_gains=gains)
     notify(
         f"{len(photos)} photos to train on, {len(test_photos)} held out, "
         f"{photos[0].frame.camera.width}x{photos[0].frame.camera.height} (1/{factor}), "
@@ -95,7 +101,12 @@ def train(
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
 
-    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings)
+    if reference is not None:
+        known = log_exposures(scene.train_frames)
+        notify(f"EXIF tells the exposure of {np.isfinite(known).sum()} of {len(known)} photos")
+    gains = relative_log_exposures(scene.train_frames, reference)
+    log_gains = torch.from_numpy(gains)[:, None].expand(-1, 3)
+    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings, log_gains=log_gains)
     totals = _Totals()
     if resume:
         totals = _restore(fitting, run)
@@ -109,10 +120,19 @@ def train(
             raise cannot_write(run, error) from error
     write_json(run / CONFIG, describe_run(scene, settings, factor))
     write_cameras(run, scene.train_frames, scene.test_frames)
-    background = ALPHA_BACKGROUND if pool.has_alpha else OPAQUE_BACKGROUND
+    background = fitting.parts.background or (ALPHA_BACKGROUND if pool.has_alpha else OPAQUE_BACKGROUND)
 
     def model() -> Model:
-        return Model(fitting.field, fitting.occupied, marching, background, similarity, scene.unit, scene.unit_source)
+        return Model(
+            fitting.field,
+            fitting.occupied,
+            marching,
+            background,
+            similarity,
+            scene.unit,
+            scene.unit_source,
+            log_exposure=reference,
+        )
 
     def checkpoint() -> None:
         save_model(run / FIELD, model())

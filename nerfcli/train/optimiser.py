@@ -1,5 +1,8 @@
 """Adam for a field: on all parameters that take part in every sample, and on the rows that a step has touched."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -55,19 +58,58 @@ class FieldOptimiser:
         if self._first is not None and self._second is not None:
             tensors |= {"table_first": self._first, "table_second": self._second}
         if self._adam is not None:
-            for index, entry in self._adam.state_dict()["state"].items():
-                tensors |= {f"adam.{index}.{name}": value for name, value in entry.items()}
+            tensors |= _moments(self._adam, "adam")
         return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take up what `state` gave; other tensors may stand beside it."""
         if self._first is not None:
             self._first, self._second = tensors["table_first"], tensors["table_second"]
-        if self._adam is None:
-            return
-        entries: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith("adam."):
-                _, index, name = key.split(".")
-                entries.setdefault(int(index), {})[name] = value
-        self._adam.load_state_dict({**self._adam.state_dict(), "state": entries})
+        if self._adam is not None:
+            _restore_moments(self._adam, tensors, "adam")
+
+
+class PartsOptimiser:
+    """Adam for what is learned besides the field.
+
+    Args:
+        groups: "params" and, as "multiple", their learning rate as a multiple of the field's.
+    """
+
+    def __init__(self, groups: Sequence[dict[str, Any]]):
+        self._adam = torch.optim.Adam([dict(group) for group in groups], betas=BETAS, eps=EPS) if groups else None
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        if self._adam is not None:
+            self._adam.zero_grad(set_to_none=True)
+
+    def step(self, rate: float) -> None:
+        """One step at multiples of a learning rate."""
+        if self._adam is not None:
+            for group in self._adam.param_groups:
+                group["lr"] = rate * group["multiple"]
+            self._adam.step()
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs; the parts' own numbers are not in it."""
+        return {} if self._adam is None else _moments(self._adam, "parts_adam")
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take up what `state` gave; other tensors may stand beside it."""
+        if self._adam is not None:
+            _restore_moments(self._adam, tensors, "parts_adam")
+
+
+def _moments(adam: torch.optim.Adam, prefix: str) -> dict[str, Tensor]:
+    state = adam.state_dict()["state"]
+    return {f"{prefix}.{index}.{name}": value for index, entry in state.items() for name, value in entry.items()}
+
+
+def _restore_moments(adam: torch.optim.Adam, tensors: dict[str, Tensor], prefix: str) -> None:
+    entries: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        if key.startswith(f"{prefix}."):
+            _, index, name = key.split(".")
+            entries.setdefault(int(index), {})[name] = value
+    adam.load_state_dict({**adam.state_dict(), "state": entries})

@@ -1,0 +1,154 @@
+"""What each component gains on the scene that needs it, and costs: the same seeds and steps with and without.
+
+    python benchmarks/component_scenes.py scenes
+    python benchmarks/components.py scenes -o components
+    python benchmarks/components.py scenes -o exposure --only exposure --steps 600
+
+Held-out PSNR is the mean over whole photos, as `nerfcli evaluate` has it. Seconds are processor time of the training
+alone, so that other work on the machine counts little. Prints a table and writes OUT.csv.
+"""
+
+import csv
+import statistics
+import tempfile
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from nerfcli import kernels, scene
+from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.render.model import load_model
+from nerfcli.train.components import Components, choose
+from nerfcli.train.exif_exposure import relative_log_exposures
+from nerfcli.train.loop import Progress, train
+from nerfcli.train.photos import load_photos
+from nerfcli.train.run_folder import FIELD
+from nerfcli.train.settings import TrainSettings
+
+# Scene, downscale, and what is compared: the first is what it is compared with. "-name" is --without.
+CASES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
+    ("exposure-balls", 1, ("", "exposure")),
+    ("exposure-exif-balls", 1, ("", "exposure=exif", "exposure")),
+    ("alpha", 1, ("", "exposure", "-view", "-near", "-distortion", "background=black")),
+    ("exposure", 2, ("", "exposure")),
+    ("glossy", 1, ("-view", "view=1", "view=2", "")),
+    ("unbounded", 1, ("", "background=constant", "background")),
+)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One training and its held-out numbers."""
+
+    scene: str
+    components: str
+    seed: int
+    steps: int
+    psnr: float
+    ssim: float
+    cpu_seconds: float
+    samples: float
+
+
+def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, samples_per_step: int) -> Trained:
+    """Train with one choice of components, and measure."""
+    names = choice.split()
+    components = choose(
+        Components(),
+        included=[name for name in names if not name.startswith("-")],
+        excluded=[name[1:] for name in names if name.startswith("-")],
+    )
+    settings = TrainSettings(
+        budget_seconds=None,
+        steps=steps,
+        downscale=downscale,
+        seed=seed,
+        samples_per_step=samples_per_step,
+        components=components,
+    )
+    capture = scene.load(folder)
+    began = used = 0.0
+    samples = 0.0
+
+    def clock(progress: Progress) -> None:
+        nonlocal began, used, samples
+        began = began or time.process_time()
+        used = time.process_time() - began
+        samples = progress.samples_per_second * progress.seconds
+
+    with tempfile.TemporaryDirectory() as run:
+        train(capture, Path(run), settings, resume=False, notify=lambda text: None, on_progress=clock)
+        model = load_model(Path(run) / FIELD, "cpu")
+    photos = load_photos(capture.test_frames, factor=downscale, threads=1)
+    gains = relative_log_exposures(capture.test_frames, model.log_exposure)
+    held_out = [
+        HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))
+        for photo, gain in zip(photos, gains, strict=True)
+    ]
+    mean = evaluate_model(model, held_out, on_image=lambda done, total: None)["mean"]
+    return Trained(folder.name, choice or "default", seed, steps, mean["psnr"], mean["ssim"], used, samples)
+
+
+def print_table(trained: list[Trained]) -> None:
+    """A line per scene and choice: means over the seeds, and gains over the first choice, seed by seed."""
+    table = Table(title=f"{trained[0].steps} steps")
+    for name in ("scene", "components", "PSNR dB", "gain dB", "spread of it", "SSIM", "CPU s", "seeds"):
+        table.add_column(name, justify="left" if name in ("scene", "components") else "right")
+    for place in dict.fromkeys(t.scene for t in trained):
+        of_scene = [t for t in trained if t.scene == place]
+        first = {t.seed: t.psnr for t in of_scene if t.components == of_scene[0].components}
+        for choice in dict.fromkeys(t.components for t in of_scene):
+            mine = [t for t in of_scene if t.components == choice]
+            gains = [t.psnr - first[t.seed] for t in mine]
+            table.add_row(
+                place,
+                choice,
+                f"{statistics.fmean(t.psnr for t in mine):.2f}",
+                f"{statistics.fmean(gains):+.2f}",
+                f"{max(gains) - min(gains):.2f}",
+                f"{statistics.fmean(t.ssim for t in mine):.3f}",
+                f"{statistics.fmean(t.cpu_seconds for t in mine):.1f}",
+                str(len(mine)),
+            )
+    Console(width=110).print(table)
+
+
+def main(
+    scenes: Annotated[Path, typer.Argument(help="What component_scenes.py wrote.")],
+    output: Annotated[Path, typer.Option("-o", help="Where to write, without suffix.")],
+    only: Annotated[list[str] | None, typer.Option(help="Scenes; all by default.")] = None,
+    choices: Annotated[str | None, typer.Option(help="Instead of those of the scene, separated by commas.")] = None,
+    seeds: Annotated[int, typer.Option(help="Trainings of each.")] = 3,
+    steps: Annotated[int, typer.Option(help="Of each training.")] = 500,
+    samples: Annotated[int, typer.Option(help="Samples of the last steps.")] = 2**14,
+) -> None:
+    """Compare trainings with and without components."""
+    torch.set_num_threads(1)
+    kernels.prepare(Console(stderr=True).print)
+    trained: list[Trained] = []
+    with output.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Trained)])
+        writer.writeheader()
+        for name, downscale, listed in CASES:
+            if only and name not in only:
+                continue
+            for seed in range(seeds):
+                for choice in [text.strip() for text in choices.split(",")] if choices else listed:
+                    trained.append(
+                        fit(
+                            scenes / name, choice, seed=seed, steps=steps, downscale=downscale, samples_per_step=samples
+                        )
+                    )
+                    writer.writerow(asdict(trained[-1]))
+                    file.flush()
+    print_table(trained)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,40 @@
+"""What is infinitely far, beyond all that the field holds: a colour by direction."""
+
+import torch
+from torch import Tensor, nn
+
+Colour = tuple[float, float, float]
+
+# Vertices per axis of the grid of a sphere: its cells are 3.7 degrees wide.
+SPHERE_SIDE = 32
+
+
+class SphereBackground(nn.Module):
+    """sRGB by direction: trilinear interpolation, at the direction's place on the unit sphere, of a grid over the cube
+    around it, then a sigmoid. There is no seam and no pole, and a grid of a single vertex is one learned colour.
+
+    Args:
+        side: vertices per axis.
+    """
+
+    def __init__(self, side: int = SPHERE_SIDE):
+        super().__init__()
+        self.logits = nn.Parameter(torch.zeros(3, side, side, side))
+
+    def forward(self, directions: Tensor) -> Tensor:
+        """(R, 3) in (0, 1) for unit directions (R, 3). Differentiable in the grid."""
+        places = directions[None, None, None]  # (1, 1, 1, R, 3)
+        values = torch.nn.functional.grid_sample(
+            self.logits[None], places, mode="bilinear", padding_mode="border", align_corners=True
+        )  # (1, 3, 1, 1, R)
+        return torch.sigmoid(values[0, :, 0, 0].t())
+
+
+Background = Colour | SphereBackground
+
+
+def colours_behind(background: Background, directions: Tensor) -> Tensor:
+    """(R, 3) sRGB behind the field along directions (R, 3)."""
+    if isinstance(background, SphereBackground):
+        return background(directions)
+    return directions.new_tensor(background).expand(len(directions), 3)

@@ -1,0 +1,91 @@
+"""What is learned besides the field: what is infinitely far, and the exposures of the photos."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from nerfcli.errors import UserError
+from nerfcli.field.background import SphereBackground
+from nerfcli.field.exposure import Exposure
+from nerfcli.train.components import Components
+from nerfcli.train.losses import over_background
+from nerfcli.train.photos import Drawn, PixelPool
+
+# Learning rates as multiples of the field's.
+BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 0.3
+# From here on a photo's level says only that the light was at least that bright.
+SATURATED = 254.5 / 255
+
+
+class Parts(nn.Module):
+    """The parts that the components ask for, and how they enter the colour of a ray.
+
+    Args:
+        components: what is in the model.
+        pool: the training photos.
+        log_gains: (photos, 3) logarithms of their exposures to start from.
+
+    Raises:
+        UserError: a background is to be learned behind photos with alpha.
+    """
+
+    def __init__(self, components: Components, pool: PixelPool, *, log_gains: Tensor):
+        super().__init__()
+        device = pool.colours.device
+        kind = components.background
+        if kind in ("constant", "sphere") and pool.has_alpha:
+            raise UserError(
+                f"--with background={kind}: these photos have alpha, which tells that nothing is behind",
+                "leave it out, or train on photos without alpha",
+            )
+        self.background: SphereBackground | None = None
+        if kind in ("constant", "sphere"):
+            self.background = (SphereBackground(1) if kind == "constant" else SphereBackground()).to(device)
+        self.exposure: Exposure | None = None
+        if components.exposure != "none":
+            self.exposure = Exposure(log_gains.to(device, torch.float32))
+            self.exposure.requires_grad_(components.exposure == "learned")
+        self.is_random = kind == "random" or (kind == "auto" and pool.has_alpha)
+        self._pool = pool
+
+    def groups(self) -> list[dict[str, Any]]:
+        """What is to be optimised, with its learning rate as a multiple of the field's."""
+        rates = ((self.background, BACKGROUND_RATE), (self.exposure, EXPOSURE_RATE))
+        learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
+        return [{"params": tensors, "multiple": rate} for tensors, rate in learned if tensors[0].requires_grad]
+
+    def gradients(self) -> dict[str, Tensor]:
+        """By name, those that there are."""
+        return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
+
+    def behind(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count, 3) what rays are composited on: black or random colours.
+
+        Photos with alpha are shown on random colours, so that only opacity explains them. Others fill the frame: behind
+        them is black, as random colours shining through the fog of the start would drown all else.
+        """
+        device = self._pool.colours.device
+        if self.is_random:
+            return torch.rand(count, 3, generator=generator, device=device)
+        return torch.zeros(count, 3, device=device)
+
+    def compared(
+        self, rendered: Tensor, transmittance: Tensor, drawn: Drawn, *, behind: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What the field and these parts say of pixels, and what the photos say, both (R, 3) sRGB.
+
+        Args:
+            rendered: (R, 3) composited on `behind`.
+            transmittance: (R,) the share of light that passes the field.
+            drawn: the pixels.
+            behind: (R, 3).
+        """
+        if self.background is not None:
+            rendered = rendered + transmittance[:, None] * self.background(drawn.directions)
+        if self.exposure is None:
+            return rendered, over_background(drawn.colours, behind)
+        photos = self._pool.photo_of(drawn.numbers)
+        rendered = self.exposure(rendered, photos)
+        measured = over_background(drawn.colours, self.exposure(behind, photos).detach())
+        return torch.where(measured < SATURATED, rendered, rendered.clamp_max(1.0)), measured

@@ -1,0 +1,230 @@
+"""Exposures of photos and learned backgrounds: closed forms, gradients, and that a run keeps them."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import ExifTags, Image
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.field.background import SphereBackground, colours_behind
+from nerfcli.field.checkpoint import load_tensors
+from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
+from nerfcli.render.model import load_model
+from nerfcli.render.pictures import render_picture
+from nerfcli.scene import Scene
+from nerfcli.train.components import Components
+from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
+from nerfcli.train.loop import Progress, train
+from nerfcli.train.parts import Parts
+from nerfcli.train.photos import Drawn, Photo, PixelPool
+from nerfcli.train.settings import TrainSettings
+
+CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
+LEARNED = Components(background="sphere", exposure="learned")
+SHORT = TrainSettings(
+    budget_seconds=None, steps=6, first_samples_per_step=2**9, samples_per_step=2**9, threads=2, components=LEARNED
+)
+
+
+def pose(x: float) -> np.ndarray:
+    """A camera at x, 2 in front of the origin, that looks along z."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = (x, 0.0, -2.0)
+    return matrix
+
+
+def save_photo(path: Path, *, seconds: float | None, iso: int | None = 100, f_number: float = 4.0) -> Path:
+    """Random levels, with EXIF."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 1  # Pillow leaves out what has no entry of its own in a PNG
+    entries = exif.get_ifd(ExifTags.IFD.Exif)
+    if seconds is not None:
+        entries[ExifTags.Base.ExposureTime] = seconds
+    if iso is not None:
+        entries[ExifTags.Base.ISOSpeedRatings] = iso
+    entries[ExifTags.Base.FNumber] = f_number
+    levels = np.random.default_rng(len(path.name)).integers(0, 256, (8, 12, 3), dtype=np.uint8)
+    Image.fromarray(levels).save(path, exif=exif)
+    return path
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Scene:
+    """Four photos, each exposed twice as long as the one before; the first is held out."""
+    frames = tuple(
+        Frame(f"{i}.png", CAMERA, pose(0.2 * i), save_photo(tmp_path / f"{i}.png", seconds=2.0**i / 100))
+        for i in range(4)
+    )
+    return Scene(tmp_path, "colmap", frames, frozenset({"0.png"}), np.zeros((0, 3)), ())
+
+
+def fit(scene: Scene, run: Path, settings: TrainSettings, *, resume: bool = False, stop_at: int = -1) -> list[float]:
+    """The losses of a training."""
+    losses: list[float] = []
+
+    def record(progress: Progress) -> None:
+        losses.append(progress.loss)
+        if progress.step == stop_at:
+            raise KeyboardInterrupt
+
+    train(scene, run, settings, resume=resume, notify=lambda text: None, on_progress=record)
+    return losses
+
+
+def test_the_srgb_curve_is_that_of_the_standard_and_its_own_inverse():
+    # IEC 61966-2-1: 0.5 is 21.404 % of linear light, 0.04 lies on the straight piece.
+    levels = torch.tensor([0.0, 0.04, 0.5, 1.0], dtype=torch.float64)
+    assert linear_from_srgb(levels).tolist() == pytest.approx([0.0, 0.04 / 12.92, 0.21404114, 1.0], abs=1e-8)
+    dense = torch.linspace(0.0, 1.5, 1001, dtype=torch.float64)
+    assert torch.allclose(
+        srgb_from_linear(linear_from_srgb(dense)), dense, atol=1e-7, rtol=0
+    )  # the pieces meet to 1e-8
+
+
+def test_a_gain_multiplies_linear_light_and_its_gradient_is_right():
+    rgb = torch.rand(5, 3, dtype=torch.float64, requires_grad=True)
+    gains = torch.tensor([math.log(2), 0.0, -math.log(3)], dtype=torch.float64, requires_grad=True)
+    expected = linear_from_srgb(rgb) * torch.tensor([2.0, 1.0, 1 / 3])
+    assert torch.allclose(linear_from_srgb(exposed(rgb, gains)), expected, atol=1e-7)
+    assert torch.autograd.gradcheck(exposed, (rgb, gains))
+    black = torch.zeros(1, 3, requires_grad=True)
+    exposed(black, torch.zeros(3)).sum().backward()  # a power alone has an infinite slope there
+    assert black.grad is not None
+    assert black.grad.tolist() == [[1.0, 1.0, 1.0]]
+
+
+def test_only_differences_between_photos_are_learned():
+    start = torch.randn(7, 3)
+    one, other = Exposure(start), Exposure(start + torch.tensor([5.0, -1.0, 0.3]))
+    assert one.log_gains().mean(0).tolist() == pytest.approx([0.0] * 3, abs=1e-6)
+    assert torch.allclose(one.log_gains(), other.log_gains(), atol=1e-5)
+    one(torch.rand(4, 3), torch.tensor([0, 3, 3, 6])).square().sum().backward()
+    assert one.free.grad is not None
+    assert one.free.grad.sum(0).abs().max() < 1e-5  # no pull on what all photos share
+
+
+def test_exif_tells_stops_between_photos(capture, tmp_path):
+    stops = log_exposures(capture.frames) / math.log(2)
+    assert np.diff(stops).tolist() == pytest.approx([1.0, 1.0, 1.0])
+    save_photo(tmp_path / "wide.png", seconds=0.01, iso=400, f_number=2.0)  # 2 stops by ISO and 2 by the aperture
+    save_photo(tmp_path / "silent.png", seconds=None)
+    others = [Frame(name, CAMERA, pose(0), tmp_path / name) for name in ("wide.png", "silent.png")]
+    assert (log_exposures(others) / math.log(2) - stops[0])[0] == pytest.approx(4.0)
+    reference = mean_log_exposure(capture.train_frames)
+    assert relative_log_exposures([*capture.test_frames, others[1]], reference).tolist() == pytest.approx(
+        [-2 * math.log(2), 0.0]  # what is silent counts as the mean
+    )
+    assert mean_log_exposure(others[1:]) is None
+    assert relative_log_exposures(capture.frames, None).tolist() == [0.0] * 4
+
+
+def test_a_sphere_interpolates_its_grid_and_one_vertex_is_one_colour():
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
+    sphere = SphereBackground(5).double()
+    axis = torch.linspace(-1, 1, 5, dtype=torch.float64)
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    with torch.no_grad():
+        sphere.logits.copy_(torch.stack([x, 2 * y - z, 0 * x + 3]))  # linear functions are interpolated exactly
+    expected = torch.stack([directions[:, 0], 2 * directions[:, 1] - directions[:, 2], torch.full((50,), 3.0)], dim=-1)
+    assert torch.allclose(sphere(directions), torch.sigmoid(expected))
+    single = SphereBackground(1).double()
+    with torch.no_grad():
+        single.logits.copy_(torch.tensor([-1.0, 0.0, 2.0]).view(3, 1, 1, 1))
+    assert torch.equal(single(directions), torch.sigmoid(torch.tensor([-1.0, 0.0, 2.0]).double()).expand(50, 3))
+    small = SphereBackground(2).double()
+
+    def of_grid(logits: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(small, {"logits": logits}, (directions[:3],))
+
+    assert torch.autograd.gradcheck(of_grid, (torch.randn(3, 2, 2, 2, dtype=torch.float64, requires_grad=True),))
+    assert torch.equal(
+        colours_behind((0.1, 0.2, 0.3), directions), directions.new_tensor([0.1, 0.2, 0.3]).expand(50, 3)
+    )
+
+
+def parts_of(components: Components, colours: torch.Tensor, gains: list[float]) -> tuple[Parts, Drawn]:
+    """Parts over photos of one pixel each."""
+    photos = [
+        Photo(Frame(f"{i}", Camera("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5)), np.eye(4)), level.numpy(), None)
+        for i, level in enumerate((colours * 255).round().to(torch.uint8)[:, None, None])
+    ]
+    from nerfcli.cameras.rigid import Similarity
+
+    pool = PixelPool(photos, Similarity(1.0, np.eye(3), np.zeros(3)), torch.device("cpu"))
+    log_gains = torch.tensor(gains)[:, None].expand(-1, 3)
+    return Parts(components, pool, log_gains=log_gains), pool.rays_of(torch.arange(len(photos)))
+
+
+def test_a_ray_sees_the_background_through_what_the_field_lets_pass_as_its_photo_is_exposed():
+    parts, drawn = parts_of(replace(LEARNED, background="constant"), torch.full((2, 3), 0.5), [math.log(2), 0.0])
+    rendered, transmittance = torch.full((2, 3), 0.25), torch.tensor([0.5, 0.5])
+    seen, measured = parts.compared(rendered, transmittance, drawn, behind=torch.zeros(2, 3))
+    # An untrained background is grey, 0.5; the mean of the two gains is half a stop.
+    expected = [exposed(torch.tensor(0.5), torch.tensor(sign * math.log(2) / 2)).item() for sign in (1, -1)]
+    assert seen[:, 0].tolist() == pytest.approx(expected)
+    assert torch.equal(measured, drawn.colours)
+    seen.sum().backward()
+    assert parts.background is not None
+    assert parts.background.logits.grad is not None
+    assert (parts.background.logits.grad > 0).all()
+
+
+def test_a_saturated_pixel_says_only_that_the_light_was_at_least_that_bright():
+    parts, drawn = parts_of(replace(LEARNED, background="auto"), torch.tensor([[1.0] * 3, [0.9] * 3]), [1.0, 1.0])
+    rendered = torch.tensor([[1.4] * 3, [1.4] * 3], requires_grad=True)
+    seen, measured = parts.compared(rendered, torch.zeros(2), drawn, behind=torch.zeros(2, 3))
+    (seen - measured).square().sum().backward()
+    assert rendered.grad is not None
+    assert rendered.grad[0].tolist() == [0.0] * 3
+    assert (rendered.grad[1] > 0).all()
+
+
+def test_behind_photos_with_alpha_nothing_is_learned():
+    with pytest.raises(UserError, match="these photos have alpha"):
+        parts_of(LEARNED, torch.rand(2, 4), [0.0, 0.0])
+
+
+def test_a_run_keeps_background_and_exposures_and_goes_on_bit_for_bit(capture, tmp_path):
+    straight = fit(capture, tmp_path / "straight", SHORT)
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, tmp_path / "parts", SHORT, stop_at=3)
+    assert fit(capture, tmp_path / "parts", SHORT, resume=True) == straight[3:]
+    states = [load_tensors(tmp_path / name / "state.safetensors", "cpu")[0] for name in ("straight", "parts")]
+    assert torch.equal(states[0]["parts.exposure.free"], states[1]["parts.exposure.free"])
+    assert states[0]["parts.exposure.free"][:, 0].tolist() == pytest.approx(
+        [-math.log(2), 0.0, math.log(2)],
+        abs=0.05,  # from EXIF, and a few small steps on
+    )
+    model = load_model(tmp_path / "parts" / "field.safetensors", "cpu")
+    assert isinstance(model.background, SphereBackground)
+    assert torch.equal(model.background.logits, states[0]["parts.background.logits"])
+    assert model.log_exposure == pytest.approx(mean_log_exposure(capture.train_frames))
+
+
+def test_empty_space_shows_the_background_by_direction_whatever_the_tile(capture, tmp_path, monkeypatch):
+    fit(capture, tmp_path / "run", replace(SHORT, steps=1))
+    model = load_model(tmp_path / "run" / "field.safetensors", "cpu")
+    assert isinstance(model.background, SphereBackground)
+    with torch.no_grad():
+        model.background.logits.copy_(torch.randn_like(model.background.logits))
+    empty = replace(model, occupied=torch.zeros_like(model.occupied))
+    frame = capture.frames[1]
+    picture = render_picture(empty, frame, background=empty.background)
+    bearings = torch.from_numpy(CAMERA.pixel_bearings()[0]).float()  # the camera's axes are those of the world
+    expected = model.background(bearings).detach().numpy().reshape(8, 12, 3)
+    assert picture.rgb == pytest.approx(expected, abs=1e-6)
+    monkeypatch.setattr("nerfcli.render.pictures.RAYS_PER_TILE", 7)
+    assert np.array_equal(render_picture(empty, frame, background=empty.background).rgb, picture.rgb)
+    # Held-out photos of known exposure are compared as they were exposed, and the protocol says so.
+    truth = np.round(255 * exposed(torch.from_numpy(picture.rgb), torch.tensor(0.5)).clamp(0, 1).numpy())
+    photo = HeldOut(frame, truth.astype(np.uint8), None, log_gain=0.5)
+    measured = evaluate_model(empty, [photo], on_image=lambda done, total: None)
+    assert measured["mean"]["psnr"] > 50
+    assert "exposures by EXIF" in measured["protocol"]
