@@ -248,3 +248,18 @@ def test_colour_loss_is_quadratic_for_noise_and_linear_for_outliers():
     measured = torch.zeros(1, 3)
     for error, expected in ((0.0, 0.0), (0.02, 0.5 * 0.02**2 / 0.1), (0.8, 0.8 - 0.05)):
         assert colour_loss(measured + error, measured).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_pixel_is_found_again_by_its_number():
+    # Every pixel of two photos of different size has its own colour.
+    photos = []
+    for name, width, height, first in (("a.png", 7, 5, 0), ("b.png", 4, 6, 100)):
+        pixels = np.zeros((height, width, 3), dtype=np.uint8)
+        pixels[..., 0] = np.arange(first, first + width * height).reshape(height, width)
+        camera = Camera("SIMPLE_PINHOLE", width, height, (5.0, width / 2, height / 2))
+        photos.append(Photo(Frame(name, camera, np.eye(4)), pixels, None))
+    pool = PixelPool(photos, SIMILARITY, CPU)
+    by_name = {photo.frame.name: photo.pixels for photo in photos}
+    for number in range(len(pool.colours)):
+        name, x, y = pool.place(number)
+        assert by_name[name][y, x, 0] == pool.colours[number, 0]

@@ -25,11 +25,13 @@ def info(
     Of a depth file (TIFF, EXR, NPZ, NPY, PNG), a picture, a video or a folder of renders: which depth it is, along
     which axis, in which unit and how that is known, what stands for no value, which camera saw it, which run it is of,
     and the range of its numbers. Of depth that another program wrote: what can be known, and what nobody states.
+    Of a failure that a training kept: which numbers became non-finite, where, and whether they do again.
 
     \b
     Examples:
       nerfcli info photos-scene
       nerfcli info photos-scene-run --json
+      nerfcli info photos-scene-run/failure-1200.safetensors
       nerfcli info photos-scene-run/renders/test-conditional-z/depth/a.tiff
     """
     console = Console(quiet=True, json_lines=True)
@@ -52,6 +54,8 @@ def describe(folder: Path) -> dict[str, Any]:
 
     if folder.name == RENDERS:
         folder = folder.parent
+    if folder.is_file() and folder.suffix == ".safetensors":
+        return _describe_tensors(folder)
     if folder.is_file() and folder.suffix.lower() != ".json":
         return file_facts(folder)
     if (folder / RENDERS).exists():
@@ -114,6 +118,24 @@ def _describe_run(folder: Path) -> dict[str, Any]:
     if (folder / METRICS).exists():
         content["metrics"] = json_module.loads((folder / METRICS).read_text(encoding="utf-8"))["mean"]
     return content
+
+
+def _describe_tensors(path: Path) -> dict[str, Any]:
+    """A field, the state of a training, or the state before a failure, whose step is taken again."""
+    from nerfcli.field.checkpoint import load_tensors
+    from nerfcli.train.sentinel import FAILURE_FORMAT, replay
+
+    tensors, description = load_tensors(path, "cpu")
+    facts: dict[str, Any] = {
+        "kind": description.get("format"),
+        "bytes": path.stat().st_size,
+        "tensors": {name: f"{str(tensor.dtype)[6:]} {list(tensor.shape)}" for name, tensor in tensors.items()},
+    }
+    if description.get("format") != FAILURE_FORMAT:
+        return facts
+    _, bad = replay(path)
+    again = None if bad is None else f"{bad.name}: {bad.count} of {bad.total} numbers"
+    return {**facts, "failure": description["told"], "pixels": description["pixels"], "repeated_now": again}
 
 
 def _text(value: Any) -> str:

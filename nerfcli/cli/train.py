@@ -27,6 +27,7 @@ from nerfcli.cli.options import (
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
+    from nerfcli.scene import Scene
     from nerfcli.train.settings import TrainSettings
 
 DEFAULT_BUDGET = "2m"
@@ -115,10 +116,8 @@ def train_scene(
     """
     from nerfcli import scene as scenes
     from nerfcli.cameras.orientation import rescaling_told
-    from nerfcli.evaluate.protocol import METRICS
-    from nerfcli.train.loop import Progress
-    from nerfcli.train.loop import train as fit
-    from nerfcli.train.run_folder import CONFIG, FIELD, is_complete, is_same_run, read_config
+    from nerfcli.exclusive import exclusive
+    from nerfcli.train.run_folder import LOCK
 
     scene = scenes.load(folder)
     if scene.missing:
@@ -127,24 +126,58 @@ def train_scene(
         console.warn(f"{len(scene.missing)} photos of {folder} are not there and are left out: {listed}{more}")
     for text in rescaling_told(scene.rescaled):
         console.note(text)
+
+    def is_kept() -> bool:
+        if not _keeps(run, scene, settings, resume=resume, overwrite=overwrite):
+            return False
+        console.note(f"{run} is kept: it was trained with these settings; --overwrite trains again")
+        return True
+
+    if is_kept():
+        return
+    with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
+        if is_kept():  # by one that has just ended
+            return
+        _fit(scene, run, settings, resume=resume, overwrite=overwrite, console=console)
+
+
+def _keeps(run: Path, scene: "Scene", settings: "TrainSettings", *, resume: bool, overwrite: bool) -> bool:
+    """Whether `run` is already what was asked for.
+
+    Raises:
+        UserError: it is something else, which is not ours to replace; or nothing to resume.
+    """
+    from nerfcli import scene as scenes
+    from nerfcli.train.run_folder import CONFIG, FIELD, LOCK, STATE, is_complete, is_same_run, read_config
+
     trained = (run / FIELD).exists()
-    if resume and not trained:
+    if resume and not trained and not (run / STATE).exists():
         raise UserError(f"nothing to resume in {run}", "leave --resume out to start, or give the run with -o")
     if resume and read_config(run).get("scene_fingerprint") != scenes.fingerprint(scene):
-        raise UserError(f"{run} was trained on another scene than {folder}", "choose another place with -o")
+        raise UserError(f"{run} was trained on another scene than {scene.root}", "choose another place with -o")
     if trained and not resume and not overwrite:
         if is_same_run(run, scene, settings) and is_complete(run, settings):
-            console.note(f"{run} is kept: it was trained with these settings; --overwrite trains again")
-            return
+            return True
         raise UserError(
             f"{run} exists", "add --resume to go on, --overwrite to replace it, or choose another place with -o"
         )
-    if run.is_file() or (run.is_dir() and not (run / CONFIG).exists() and any(run.iterdir())):
+    others = run.is_dir() and not (run / CONFIG).exists() and any(path.name != LOCK for path in run.iterdir())
+    if run.is_file() or others:
         raise UserError(f"{run} is not a run, but something else", "choose another place with -o")
+    return False
+
+
+def _fit(
+    scene: "Scene", run: Path, settings: "TrainSettings", *, resume: bool, overwrite: bool, console: Console
+) -> None:
+    from nerfcli.evaluate.protocol import METRICS
+    from nerfcli.train.loop import Progress
+    from nerfcli.train.loop import train as fit
+    from nerfcli.train.run_folder import STATE
 
     if overwrite:
         (run / METRICS).unlink(missing_ok=True)  # they belong to the field that goes
-    with console.progress(f"train {folder.name}") as update:
+    with console.progress(f"train {scene.root.name}") as update:
 
         def on_progress(progress: Progress) -> None:
             detail = (
@@ -157,8 +190,8 @@ def train_scene(
         try:
             fit(scene, run, settings, resume=resume, notify=console.note, on_progress=on_progress)
         except KeyboardInterrupt:
-            if (run / FIELD).exists():
-                paths = f"{shlex.quote(str(folder))} -o {shlex.quote(str(run))}"
+            if (run / STATE).exists():
+                paths = f"{shlex.quote(str(scene.root))} -o {shlex.quote(str(run))}"
                 console.note(f"checkpoint saved; go on with: nerfcli train {paths} --resume")
             raise
 

@@ -1,23 +1,28 @@
-"""Tensors with a JSON description in one safetensors file: no pickle, no code on load."""
+"""Tensors with a JSON description in one safetensors file: no pickle, no code on load, no damage unnoticed."""
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, uint8
 
 from nerfcli.atomic import atomic_path
-from nerfcli.errors import UserError
+from nerfcli.errors import NON_FINITE, UserError
+
+# Of the file's metadata. The format has no checksum: a bit that flips on a disk would be a slightly other field.
+_DESCRIPTION, _DIGEST = "description", "blake2b"
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-    """Write tensors and their description; the file appears whole or not at all."""
+    """Write tensors and their description with a digest of both; the file appears whole or not at all."""
     content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    text = json.dumps(description, allow_nan=False)
     with atomic_path(path) as partial:
         try:
-            save_file(content, partial, metadata={"description": json.dumps(description, allow_nan=False)})
+            save_file(content, partial, metadata={_DESCRIPTION: text, _DIGEST: _digest(content, text)})
             partial.chmod(0o644)  # safetensors makes files that only their owner can read
         except SafetensorError as error:  # a full disk comes as this, not as OSError
             raise OSError(str(error)) from error
@@ -27,18 +32,54 @@ def load_tensors(path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, 
     """What `save_tensors` wrote, on `device`.
 
     Raises:
-        UserError: the file is missing, cut short, or not one of ours.
+        UserError: the file is missing, cut short, damaged, or not one of ours.
     """
     try:
-        with safe_open(path, framework="pt", device=device) as file:
+        with safe_open(path, framework="pt", device="cpu") as file:
             metadata = file.metadata() or {}
-            return {name: file.get_tensor(name) for name in file.keys()}, json.loads(metadata["description"])  # noqa: SIM118
+            text = metadata[_DESCRIPTION]
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        description = json.loads(text)
     except FileNotFoundError as error:
         raise UserError(
             f"{path} does not exist", "train first (nerfcli train SCENE), or give the folder that train wrote"
         ) from error
-    except (SafetensorError, KeyError, OSError, json.JSONDecodeError) as error:
+    except (SafetensorError, KeyError, OSError, ValueError) as error:
         raise UserError(
             f"{path} is not a readable checkpoint: {error}",
             "train again with --overwrite, or restore the file",
         ) from error
+    # Files of earlier versions have no digest.
+    if _DIGEST in metadata and metadata[_DIGEST] != _digest(tensors, text):
+        raise UserError(
+            f"{path} is damaged: its content is not what was written",
+            "train again with --overwrite, or restore the file; the disk may have more damage",
+        )
+    return {name: tensor.to(device) for name, tensor in tensors.items()}, description
+
+
+def refuse_non_finite(tensors: dict[str, Tensor], path: Path) -> None:
+    """Refuse weights that no picture can come from.
+
+    Raises:
+        UserError: a tensor holds NaN or infinity; the message names the first one.
+    """
+    for name, tensor in tensors.items():
+        if count := int((~tensor.isfinite()).sum()):
+            raise UserError(
+                f"{name} in {path} is not finite in {count} of {tensor.numel()} places",
+                "the field is broken: train again with --overwrite and, if it comes back, another --seed",
+                NON_FINITE,
+            )
+
+
+def _digest(tensors: dict[str, Tensor], description: str) -> str:
+    """Of names, types, shapes and bytes of all tensors (on the CPU), and of the description."""
+    digest = hashlib.blake2b(description.encode(), digest_size=16)
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        # As bytes: NumPy has no bfloat16. A tensor without numbers has no view of another type.
+        if tensor.numel():
+            digest.update(tensor.reshape(-1).view(uint8).numpy().data)
+    return digest.hexdigest()

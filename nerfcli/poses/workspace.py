@@ -7,16 +7,14 @@
 Whoever works in the folder holds its lock. A process that is killed lets go of it, and the next one goes on.
 """
 
-import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfcli.atomic import atomic_folder, cannot_write
-from nerfcli.errors import UserError
+from nerfcli.atomic import atomic_folder
+from nerfcli.exclusive import exclusive
 from nerfcli.poses.job import database_path
 from nerfcli.scene import SCENE_FILE
 
@@ -39,20 +37,8 @@ def workspace(scene_dir: Path) -> Iterator[Workspace]:
         UserError: another process works there, or nothing can be written there.
     """
     folder = scene_dir / "work"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    except OSError as error:
-        raise cannot_write(scene_dir, error) from error
-    try:
-        if not _take(lock):
-            raise UserError(
-                f"another nerfcli poses is at work on {scene_dir}",
-                "wait until it is done, or choose another folder with -o",
-            )
+    with exclusive(folder / _LOCK, f"nerfcli poses is at work on {scene_dir}") as lock:
         yield Workspace(folder, lock)
-    finally:
-        os.close(lock)
 
 
 def is_in_the_making(scene_dir: Path) -> bool:
@@ -87,24 +73,3 @@ def drop_database(scene_dir: Path) -> None:
         path.unlink()
     if is_in_the_making(scene_dir):
         shutil.rmtree(scene_dir / "work")
-
-
-if sys.platform == "win32":
-    import msvcrt
-
-    def _take(lock: int) -> bool:
-        try:
-            msvcrt.locking(lock, msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        return True
-
-else:
-    import fcntl
-
-    def _take(lock: int) -> bool:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        return True

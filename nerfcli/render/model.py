@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.field.background import Background, SphereBackground
-from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
 from nerfcli.field.interface import Field
 from nerfcli.field.kinds import fresh_field, settings_from_json
 from nerfcli.render.sampling import step_edges
@@ -93,7 +93,7 @@ def load_model(path: Path, device: str) -> Model:
     """Read what `save_model` wrote.
 
     Raises:
-        UserError: the file is missing or is not a field of this version.
+        UserError: the file is missing, damaged, not a field of this version, or holds weights that are not finite.
     """
     tensors, description = load_tensors(path, device)
     if description.get("format") != FORMAT:
@@ -102,6 +102,7 @@ def load_model(path: Path, device: str) -> Model:
             "train again with this version of nerfcli",
         )
     occupied = tensors.pop("occupied")
+    refuse_non_finite(tensors, path)
     background = _background(description["background"], tensors)
     field = fresh_field(settings_from_json(description["field"])).to(device)
     field.load_state_dict(tensors)

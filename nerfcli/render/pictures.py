@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.background import Background, colours_behind
 from nerfcli.render.depth import DepthRequest, disagreement, requested, shares, spread
 from nerfcli.render.model import Model
@@ -87,6 +88,9 @@ def render_picture(
         quality: how much work to put into it.
         on_tile: called with the number of pixels after each tile.
         rays_per_tile: how many are rendered at a time; a matter of speed and memory alone.
+
+    Raises:
+        UserError: the field gives numbers that are not finite.
     """
     if depth is not None and depth.convention == "background" and depth.background_distance is None:
         raise ValueError("the background convention needs a background distance")
@@ -107,6 +111,7 @@ def render_picture(
         torch.cat(column).reshape(height, width, *column[0].shape[1:]).cpu().numpy()
         for column in zip(*columns, strict=True)
     )
+    _refuse_non_finite(frame, {"rgb": rgb, "opacity": opacity, "truncation error": error})
     depth_map, spread_map, disagreement_map = distances if depth is not None else (None, None, None)
     return Picture(
         rgb=rgb,
@@ -117,6 +122,18 @@ def render_picture(
         truncation_error=error,
         valid=valid,
     )
+
+
+def _refuse_non_finite(frame: Frame, maps: dict[str, np.ndarray]) -> None:
+    for name, values in maps.items():
+        bad = ~np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1)
+        if bad.any():
+            y, x = np.argwhere(bad)[0]
+            raise UserError(
+                f"{name} of {frame.name} is not finite at pixel ({x}, {y}), of {bad.sum()} in all",
+                "the field overflows there: train again with --overwrite and another --seed, and please report it",
+                NON_FINITE,
+            )
 
 
 def straight_rgba(picture: Picture) -> np.ndarray:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from nerfcli import kernels
-from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.render.model import Marching
@@ -16,8 +15,9 @@ from nerfcli.render.occupancy import Occupancy
 from nerfcli.train.losses import colour_loss, distortion_loss
 from nerfcli.train.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.train.parts import Parts
-from nerfcli.train.photos import Drawn, PixelPool
+from nerfcli.train.photos import Drawn, Pool
 from nerfcli.train.settings import TrainSettings
+from nerfcli.train.watch import UNWATCHED, NonFiniteError, Watch
 
 OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
@@ -59,7 +59,7 @@ class Fitting:
 
     def __init__(
         self,
-        pool: PixelPool,
+        pool: Pool,
         marching: Marching,
         *,
         unbounded: bool,
@@ -90,44 +90,61 @@ class Fitting:
         self.optimiser = FieldOptimiser(self.field)
         self.parts_optimiser = PartsOptimiser(self.parts.groups())
         self.samples_per_ray = float(len(self.edges) - 2)
+        self.rate_factor, self.rollbacks = 1.0, 0
+        self.in_step = False
 
-    def advance(self, share: float) -> StepResult:
+    def advance(self, share: float, watch: Watch = UNWATCHED) -> StepResult:
         """One optimiser step.
 
         Args:
             share: how much of the budget is used, in [0, 1]; it drives the learning rate.
+            watch: is shown every tensor of the step, before and after it.
 
         Raises:
-            UserError: a loss or a gradient is not finite; the message names the tensor and the step.
+            NonFiniteError: the loss or a gradient of the weights is not finite. The state is then that of no step.
         """
-        settings = self.settings
-        if self.step % REFRESH_EVERY == 0:
-            self._refresh_occupancy()
-        wanted = settings.first_samples_per_step + share * (settings.samples_per_step - settings.first_samples_per_step)
-        rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
-        drawn = self.pool.draw(rays, self.generator)
+        self.in_step = True
+        watch.state(self.state)
+        drawn = self.draw(share)
+        rays = len(drawn.origins)
         stride = next(stride for until, stride in STRIDES if share <= until)
-        loss, samples = self._loss(drawn, edges=self.edges[::stride].contiguous())
+        loss, samples = self._loss(drawn, edges=self.edges[::stride].contiguous(), watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
         if samples > 0:
             loss.backward()
-        self._check_finite(loss)
+        self._check_finite(loss, watch)
         rate = self.learning_rate(share)
         self.step += 1
         self.optimiser.step(self.step, rate)
         self.parts_optimiser.step(rate)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
+        watch.state(self.state)
+        self.in_step = False
         return StepResult(loss=loss.item(), samples=samples, rays=rays)
+
+    def draw(self, share: float) -> Drawn:
+        """The pixels of the next step, after looking at what fills space if it is time."""
+        settings = self.settings
+        if self.step % REFRESH_EVERY == 0:
+            self._refresh_occupancy()
+        wanted = settings.first_samples_per_step + share * (settings.samples_per_step - settings.first_samples_per_step)
+        rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
+        return self.pool.draw(rays, self.generator)
+
+    def smaller_steps(self) -> None:
+        """Halve the learning rate from here on, as numbers became non-finite."""
+        self.rate_factor /= 2
+        self.rollbacks += 1
 
     def learning_rate(self, share: float) -> float:
         """Linear warm-up, then an exponential from the first to the final rate over the budget."""
         settings = self.settings
         decay = math.log(settings.final_learning_rate / settings.learning_rate)
         warmup = min(1.0, (self.step + 1) / settings.warmup_steps)
-        return settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
+        return self.rate_factor * settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
 
-    def _loss(self, drawn: Drawn, *, edges: Tensor) -> tuple[Tensor, int]:
+    def _loss(self, drawn: Drawn, *, edges: Tensor, watch: Watch) -> tuple[Tensor, int]:
         """Loss over some rays, and the number of samples it took."""
         origins, directions = drawn.origins, drawn.directions
         components, device = self.components, origins.device
@@ -137,9 +154,8 @@ class Fitting:
             origins, directions, edges, jitter=jitter, occupied=self.occupied, deepest=DEEPEST
         )
         starts, ends, offsets = samples.starts, samples.ends, samples.offsets
-        density, rgb = self.field.radiance_of_samples(
-            samples, directions, kernels.ray_indices(offsets), sink=self.optimiser.sink
-        )
+        rays = kernels.ray_indices(offsets)
+        density, rgb = self.field.radiance_of_samples(samples, directions, rays, sink=self.optimiser.sink)
         if components.near:
             scale_gradients(density, rgb, distance=starts)
         rendered, transmittance, weights = kernels.composite(
@@ -148,6 +164,17 @@ class Fitting:
         loss = colour_loss(*self.parts.compared(rendered, transmittance, drawn, behind=background))
         if components.distortion:
             loss = loss + components.distortion * distortion_loss(weights, starts, ends, offsets)
+        shown = {
+            "coordinates of samples": samples.coordinates,
+            "code of samples": samples.code,
+            "density of samples": density,
+            "colour of samples": rgb,
+            "weights of samples along rays": weights,
+        }
+        for name, tensor in shown.items():
+            watch.rows(name, tensor, rays)
+        watch.rows("rendered colour", rendered, torch.arange(len(rendered), device=device))
+        watch.values("loss", loss)
         return loss, len(starts)
 
     def _refresh_occupancy(self) -> None:
@@ -170,31 +197,40 @@ class Fitting:
         threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
         return self.occupancy.above(threshold)
 
-    def _check_finite(self, loss: Tensor) -> None:
-        given = {**self.optimiser.gradients(), **self.parts.gradients()}
-        gradients = {f"gradient of {name}": tensor for name, tensor in given.items()}
-        for name, tensor in {"loss": loss, **gradients}.items():
-            # A sum is non-finite if any term is.
-            if not math.isfinite(tensor.sum().item()):
-                raise UserError(
-                    f"{name} is not finite at step {self.step}",
-                    "the last checkpoint is kept; try another --seed, and please report the scene",
-                    NON_FINITE,
-                )
+    def _check_finite(self, loss: Tensor, watch: Watch) -> None:
+        total = loss.detach()
+        for name, gradient in {**self.optimiser.gradients(), **self.parts.gradients()}.items():
+            watch.values(f"gradient of {name}", gradient)
+            total = total + gradient.sum()  # which is non-finite if any term is
+        if self.optimiser.sink is not None:
+            watch.values("gradient of rows", self.optimiser.sink)
+        if not math.isfinite(total.item()):
+            raise NonFiniteError
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Everything that `restore` needs to go on bit for bit, besides the field's own weights."""
+        """Everything that `restore` needs to go on bit for bit."""
         tensors = {
+            **{f"field.{name}": tensor for name, tensor in self.field.state_dict().items()},
             "generator": self.generator.get_state(),
             **self.occupancy.state(),
+            "occupied": self.occupied,
             **self.optimiser.state(),
         }
         tensors.update({f"parts.{name}": value for name, value in self.parts.state_dict().items()})
         tensors.update(self.parts_optimiser.state())
-        return tensors, {"step": self.step, "samples_per_ray": self.samples_per_ray}
+        return tensors, {
+            "field": self.field.settings.to_json(),
+            "step": self.step,
+            "samples_per_ray": self.samples_per_ray,
+            "rate_factor": self.rate_factor,
+            "rollbacks": self.rollbacks,
+        }
 
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-        """Take up what `state` gave; the field's weights are loaded by the caller."""
+        """Take up what `state` gave."""
+        self.field.load_state_dict(
+            {name.removeprefix("field."): value for name, value in tensors.items() if name.startswith("field.")}
+        )
         self.generator.set_state(tensors["generator"].cpu())
         self.occupancy.restore(tensors)
         self.optimiser.restore(tensors)
@@ -202,4 +238,7 @@ class Fitting:
         self.parts_optimiser.restore(tensors)
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
-        self.occupied = self._open_cells()
+        self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]
+        self.in_step = False
+        # Not opened anew: the threshold moves between two refreshes, the open cells do not.
+        self.occupied = tensors["occupied"]

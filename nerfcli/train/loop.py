@@ -14,17 +14,21 @@ import torch
 from nerfcli import kernels
 from nerfcli.atomic import cannot_write, write_json
 from nerfcli.errors import UserError
-from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
+from nerfcli.render.model import Model, save_model
 from nerfcli.scene import Scene
 from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.heldout import HeldoutPixels
+from nerfcli.train.interrupts import held_back
 from nerfcli.train.normalisation import training_frame
 from nerfcli.train.photos import PixelPool, load_photos
-from nerfcli.train.run_folder import CONFIG, FIELD, LOG, STATE, append_log, describe_run, write_cameras
+from nerfcli.train.run_folder import CONFIG, FIELD, LOG, STATE, append_log, cut_log, describe_run, write_cameras
+from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.settings import TrainSettings, automatic_downscale
+from nerfcli.train.watch import that_must_be_finite
 
+STATE_FORMAT = "nerfcli training 1"
 CHECKPOINT_SECONDS = 30.0
 HELDOUT_SHARES = (0.25, 0.5, 0.75, 1.0)
 # Photos without alpha fill the frame; what the field lets through is black, and little does.
@@ -110,12 +114,14 @@ def train(
     totals = _Totals()
     if resume:
         totals = _restore(fitting, run)
+        cut_log(run, fitting.step)
         notify(f"resumed at step {fitting.step}, {totals.seconds:.1f} s")
     else:
         try:
             run.mkdir(parents=True, exist_ok=True)
-            for name in (FIELD, STATE, LOG):  # what stands there now would not fit to what comes
-                (run / name).unlink(missing_ok=True)
+            # What stands there now would not fit to what comes.
+            for old in (run / STATE, run / FIELD, run / LOG, *run.glob(FAILURES)):
+                old.unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(run, error) from error
     write_json(run / CONFIG, describe_run(scene, settings, factor))
@@ -135,30 +141,48 @@ def train(
         )
 
     def checkpoint() -> None:
-        save_model(run / FIELD, model())
         tensors, description = fitting.state()
-        save_tensors(run / STATE, tensors, {**description, "totals": vars(totals)})
+        writing = [
+            lambda: save_model(run / FIELD, model()),
+            lambda: save_tensors(run / STATE, tensors, {"format": STATE_FORMAT, **description, "totals": vars(totals)}),
+        ]
+        # A kill may come between the two. The state is all that resuming needs, and never ahead of the field; the first
+        # time it is written first, so that there is no field which one can neither go on from nor replace.
+        for write in writing if (run / FIELD).exists() else reversed(writing):
+            write()
 
-    try:
-        _run(
-            fitting,
-            totals,
-            model=model,
-            run=run,
-            heldout=heldout,
-            on_progress=on_progress,
-            checkpoint=checkpoint,
-        )
-    except KeyboardInterrupt:
+    sentinel = Sentinel(fitting, pool, run=run, notify=notify)
+    with held_back() as interrupts:
+
+        def after_step(progress: Progress) -> None:
+            on_progress(progress)
+            interrupts.answer()
+
+        try:
+            _run(
+                fitting,
+                totals,
+                sentinel=sentinel,
+                model=model,
+                run=run,
+                heldout=heldout,
+                on_progress=after_step,
+                checkpoint=checkpoint,
+            )
+        except KeyboardInterrupt:
+            if not fitting.in_step:
+                checkpoint()
+            raise
         checkpoint()
-        raise
-    checkpoint()
+    if fitting.rollbacks:
+        notify(f"numbers became non-finite {fitting.rollbacks} times; the states before are in {run}/failure-*")
 
 
 def _run(
     fitting: Fitting,
     totals: _Totals,
     *,
+    sentinel: Sentinel,
     model: Callable[[], Model],
     run: Path,
     heldout: HeldoutPixels | None,
@@ -188,6 +212,7 @@ def _run(
             "samples_per_second": round(samples_per_second),
             "rays_per_second": round(rays_per_second),
             "peak_memory_bytes": peak_memory_bytes(),
+            "rollbacks": fitting.rollbacks,
         }
         append_log(run, entry | measured)
         logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
@@ -196,7 +221,7 @@ def _run(
     try:
         while (share := _share(settings, fitting.step, totals.seconds)) < 1.0:
             began = time.perf_counter()
-            result = fitting.advance(share)
+            result = sentinel.advance(share)
             totals.seconds += time.perf_counter() - began
             totals.samples += result.samples
             totals.rays += result.rays
@@ -227,15 +252,20 @@ def _share(settings: TrainSettings, step: int, seconds: float) -> float:
 
 def _restore(fitting: Fitting, run: Path) -> _Totals:
     """Bring `fitting` to the run's last checkpoint."""
-    device = fitting.settings.device
-    model = load_model(run / FIELD, device)
-    if model.field.settings != fitting.field.settings:
+    tensors, description = load_tensors(run / STATE, fitting.settings.device)
+    if description.get("format") != STATE_FORMAT:
+        raise UserError(f"{run / STATE} was written by another version", "train again with --overwrite")
+    if description["field"] != fitting.field.settings.to_json():
         raise UserError(
-            f"{run} was trained with another field ({model.field.settings})",
+            f"{run} was trained with another field ({description['field']})",
             "train into a new folder with -o, or again with --overwrite",
         )
-    fitting.field.load_state_dict(model.field.state_dict())
-    tensors, description = load_tensors(run / STATE, device)
+    if missing := [name for name in fitting.parts.state_dict() if f"parts.{name}" not in tensors]:
+        raise UserError(
+            f"{run} was trained without what --with asks for now ({missing[0]})",
+            "train into a new folder with -o, or again with --overwrite",
+        )
+    refuse_non_finite(that_must_be_finite(tensors), run / STATE)
     fitting.restore(tensors, description)
     return _Totals(**description["totals"])
 

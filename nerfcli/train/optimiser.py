@@ -65,6 +65,8 @@ class FieldOptimiser:
         """Take up what `state` gave; other tensors may stand beside it."""
         if self._first is not None:
             self._first, self._second = tensors["table_first"], tensors["table_second"]
+        if self.sink is not None:
+            self.sink.zero_()  # a step may have ended before it was used
         if self._adam is not None:
             _restore_moments(self._adam, tensors, "adam")
 

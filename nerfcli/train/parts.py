@@ -10,7 +10,7 @@ from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
 from nerfcli.train.components import Components
 from nerfcli.train.losses import over_background
-from nerfcli.train.photos import Drawn, PixelPool
+from nerfcli.train.photos import Drawn, Pool
 
 # Learning rates as multiples of the field's.
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 0.3
@@ -30,7 +30,7 @@ class Parts(nn.Module):
         UserError: a background is to be learned behind photos with alpha.
     """
 
-    def __init__(self, components: Components, pool: PixelPool, *, log_gains: Tensor):
+    def __init__(self, components: Components, pool: Pool, *, log_gains: Tensor):
         super().__init__()
         device = pool.colours.device
         kind = components.background

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -80,6 +80,26 @@ class Drawn(NamedTuple):
     numbers: Tensor
 
 
+class Pool(Protocol):
+    """Where a training takes its pixels from."""
+
+    colours: Tensor
+    first_pixel: Tensor
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the colours have four channels."""
+        ...
+
+    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+        """`count` random pixels, with replacement."""
+        ...
+
+    def photo_of(self, numbers: Tensor) -> Tensor:
+        """Which photo each pixel (N,) is of."""
+        ...
+
+
 class PixelPool:
     """All usable pixels of some photos, and the ray of each, in the training frame.
 
@@ -93,6 +113,7 @@ class PixelPool:
         self.colours = torch.from_numpy(np.concatenate([p.reshape(-1, p.shape[-1]) for p in pixels])).to(device)
         counts = [len(p.reshape(-1, p.shape[-1])) for p in pixels]
         self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
+        self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
         poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
         self.poses = torch.tensor(np.array(poses), dtype=torch.float32, device=device)
 
@@ -146,6 +167,13 @@ class PixelPool:
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Which photo each pixel (N,) is of."""
         return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
+
+    def place(self, number: int) -> tuple[str, int, int]:
+        """The photo's name, column and row of the pixel with a number."""
+        photo = int(self.photo_of(torch.tensor(number, device=self.first_pixel.device)))
+        name, width = self.names_and_widths[photo]
+        row, column = divmod(number - int(self.first_pixel[photo]), width)
+        return name, column, row
 
 
 def _with_alpha(pixels: np.ndarray) -> np.ndarray:

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from nerfcli import __version__
-from nerfcli.atomic import cannot_write, write_json
+from nerfcli.atomic import atomic_path, cannot_write, write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
+from nerfcli.field.checkpoint import load_tensors
 from nerfcli.scene import Scene, fingerprint
 from nerfcli.train.settings import TrainSettings
 
@@ -24,6 +25,7 @@ CAMERAS = "cameras.json"
 FIELD = "field.safetensors"
 STATE = "state.safetensors"
 LOG = "log.jsonl"
+LOCK = ".train.lock"
 
 
 def describe_run(scene: Scene, settings: TrainSettings, factor: int) -> dict[str, Any]:
@@ -115,6 +117,13 @@ def read_log(run: Path) -> list[dict[str, Any]]:
     return entries
 
 
+def cut_log(run: Path, step: int) -> None:
+    """Forget the entries behind `step`: a killed training logs more than its last checkpoint knows of."""
+    kept = [entry for entry in read_log(run) if entry["step"] <= step]
+    with atomic_path(run / LOG) as partial:
+        partial.write_text("".join(f"{json.dumps(entry)}\n" for entry in kept), encoding="utf-8")
+
+
 def _frame_to_json(frame: Frame, run: Path) -> dict[str, Any]:
     return {
         "name": frame.name,
@@ -153,10 +162,25 @@ def is_same_run(run: Path, scene: Scene, settings: TrainSettings) -> bool:
 
 
 def is_complete(run: Path, settings: TrainSettings) -> bool:
-    """Whether training reached the budget: by the last line of its log, and its field is there."""
-    log = read_log(run)
-    if not log or not (run / FIELD).exists():
+    """Whether training reached the budget, by its last checkpoint: the log of a killed training is ahead of it."""
+    if not (run / FIELD).exists():
         return False
-    by_time = settings.budget_seconds is not None and log[-1]["seconds"] >= settings.budget_seconds
-    by_steps = settings.steps is not None and log[-1]["step"] >= settings.steps
+    if (run / STATE).exists():
+        step, seconds = saved_progress(run)
+    elif log := read_log(run):  # somebody needed the room
+        step, seconds = log[-1]["step"], log[-1]["seconds"]
+    else:
+        return False
+    by_time = settings.budget_seconds is not None and seconds >= settings.budget_seconds
+    by_steps = settings.steps is not None and step >= settings.steps
     return by_time or by_steps
+
+
+def saved_progress(run: Path) -> tuple[int, float]:
+    """Steps and training seconds of the last checkpoint.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    _, description = load_tensors(run / STATE, "cpu")
+    return description["step"], description["totals"]["seconds"]

@@ -64,6 +64,11 @@ class TrainSettings:
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
+        """What `to_json` gave."""
+        return cls(**{**content, "components": Components(**content["components"])})
+
 
 def automatic_downscale(width: int, height: int) -> int:
     """The smallest downscale that brings the longer side to `AUTO_LONGER_SIDE_PX` or below."""

@@ -1,0 +1,206 @@
+"""Guards a training against numbers that are not finite: they are found, named, kept for replay, and stepped around.
+
+Every step looks at its loss and the gradients of its weights, which costs microseconds. The whole state is looked at
+and copied every few hundred steps. When something is not finite, the training goes back to the copy and repeats its
+steps, now looking at every number of every tensor: the steps are the same bit for bit (on a CPU), so the first tensor
+that turns bad is found, with its step and its pixels. The state before that step goes into a file, the training back
+to the copy, with half the learning rate.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerfcli.errors import NON_FINITE, UserError
+from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.render.model import Marching
+from nerfcli.train.fitting import Fitting, StepResult
+from nerfcli.train.photos import Drawn, PixelPool
+from nerfcli.train.settings import TrainSettings
+from nerfcli.train.watch import BadTensor, FirstBad, NonFiniteError, is_finite, that_must_be_finite
+
+FAILURE_FORMAT = "nerfcli failure 1"
+FAILURES = "failure-*.safetensors"
+SNAPSHOT_EVERY = 256
+MOST_ROLLBACKS = 3
+PIXELS_NAMED = 8
+
+
+class Sentinel:
+    """Takes the steps of a training for it.
+
+    Args:
+        fitting: the training, in a state that is finite.
+        pool: where its pixels come from.
+        run: where states before failures are kept.
+        notify: takes lines for the user.
+    """
+
+    def __init__(self, fitting: Fitting, pool: PixelPool, *, run: Path, notify: Callable[[str], None]):
+        self._fitting = fitting
+        self._pool = pool
+        self._run = run
+        self._notify = notify
+        self._shares: list[float] = []  # of the steps since the copy
+        self._tensors, self._description = _copied(*fitting.state())
+
+    def advance(self, share: float) -> StepResult:
+        """One step, see `Fitting.advance`; after a failure, the first step on the way again.
+
+        Raises:
+            UserError: numbers become non-finite although the steps are small, exit code 5.
+        """
+        self._shares.append(share)
+        try:
+            if len(self._shares) > SNAPSHOT_EVERY:
+                self._take_snapshot(share)
+            return self._fitting.advance(share)
+        except NonFiniteError:
+            return self._answer()
+
+    def _take_snapshot(self, share: float) -> None:
+        tensors, description = self._fitting.state()
+        if not all(map(is_finite, that_must_be_finite(tensors).values())):
+            raise NonFiniteError
+        if self._tensors.keys() == tensors.keys():  # into the same memory, which is there already
+            for name, tensor in tensors.items():
+                self._tensors[name].copy_(tensor)
+            self._description = description
+        else:  # Adam has no moments before its first step
+            self._tensors, self._description = _copied(tensors, description)
+        self._shares = [share]
+
+    def _go_back(self) -> None:
+        self._fitting.restore(*_copied(self._tensors, self._description))
+
+    def _answer(self) -> StepResult:
+        """Find the failure by repeating the steps since the copy; go back, with smaller steps from there on."""
+        fitting = self._fitting
+        self._go_back()
+        done, bad, result = 0, None, None
+        while bad is None and done < len(self._shares):
+            result, bad = _watched_step(fitting, self._shares[done])
+            done += 1
+        if bad is None:
+            assert result is not None
+            self._notify(
+                f"numbers were not finite at step {fitting.step}, but are when the step is repeated; training goes on "
+                "(a fault of memory or of an overclocked processor, if it comes back)"
+            )
+            return result
+        self._go_back()
+        for share in self._shares[: done - 1]:
+            fitting.advance(share)
+        path, told = self._keep(self._shares[done - 1], bad)
+        self._go_back()
+        if fitting.rollbacks == MOST_ROLLBACKS:
+            raise UserError(
+                f"{told}, {MOST_ROLLBACKS} times smaller steps notwithstanding",
+                f"the last checkpoint is kept; {path} has the state before it (nerfcli info repeats the step); "
+                "try another --seed",
+                NON_FINITE,
+            )
+        fitting.smaller_steps()
+        self._notify(
+            f"{told}; back to step {fitting.step} with {fitting.rate_factor:g} of the learning rate "
+            f"({fitting.rollbacks} of {MOST_ROLLBACKS} times); {path} has the state before it"
+        )
+        self._description = fitting.state()[1]  # a later failure goes back to these smaller steps
+        first, self._shares = self._shares[0], []
+        return self.advance(first)
+
+    def _keep(self, share: float, bad: BadTensor) -> tuple[Path, str]:
+        """Write the state before a step with its batch, and say in words what the step will meet."""
+        fitting = self._fitting
+        tensors, description = fitting.state()
+        before = {name: tensor.clone() for name, tensor in tensors.items()}
+        drawn = fitting.draw(share)
+        batch = {
+            **drawn._asdict(),
+            "first_pixel": fitting.pool.first_pixel,
+            "after_draw": fitting.generator.get_state(),
+        }
+        pixels = [self._pool.place(int(drawn.numbers[ray])) for ray in bad.rays[:PIXELS_NAMED]]
+        told = f"{bad.name} is not finite at step {fitting.step + 1}: {bad.count} of {bad.total} numbers"
+        if pixels:
+            name, x, y = pixels[0]
+            more = f" and {len(bad.rays) - 1} pixels more" if len(bad.rays) > 1 else ""
+            told += f", seen from {name} at pixel ({x}, {y}){more}"
+        path = self._run / f"failure-{fitting.step + 1}.safetensors"
+        content = {
+            "format": FAILURE_FORMAT,
+            "told": told,
+            "tensor": bad.name,
+            "share": share,
+            "pixels": [list(pixel) for pixel in pixels],
+            "settings": fitting.settings.to_json(),
+            "marching": vars(fitting.marching),
+            "state": description,
+        }
+        save_tensors(path, {**before, **{f"batch.{name}": value for name, value in batch.items()}}, content)
+        return path, told
+
+
+class _SavedBatch:
+    """A pool of pixels that has one batch to give."""
+
+    def __init__(self, tensors: dict[str, Tensor]):
+        self.colours, self.first_pixel = tensors["batch.colours"], tensors["batch.first_pixel"]
+        self._drawn = Drawn(
+            tensors["batch.origins"], tensors["batch.directions"], self.colours, tensors["batch.numbers"]
+        )
+        self._after_draw = tensors["batch.after_draw"]
+
+    @property
+    def has_alpha(self) -> bool:
+        return self.colours.shape[-1] == 4
+
+    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+        generator.set_state(self._after_draw)
+        return self._drawn
+
+    def photo_of(self, numbers: Tensor) -> Tensor:
+        return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
+
+
+def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
+    """Take the step of a failure again, from its file alone.
+
+    Returns:
+        The file's description, and what is not finite this time; None if nothing is.
+
+    Raises:
+        UserError: the file cannot be read, or is something else.
+    """
+    tensors, description = load_tensors(path, "cpu")
+    if description.get("format") != FAILURE_FORMAT:
+        raise UserError(f"{path} holds {description.get('format')!r}", "give a failure-STEP.safetensors of a run")
+    settings = replace(TrainSettings.from_json(description["settings"]), device="cpu")
+    torch.set_num_threads(settings.threads)
+    fitting = Fitting(
+        _SavedBatch(tensors),
+        Marching(**description["marching"]),
+        unbounded=description["state"]["field"]["unbounded"],
+        settings=settings,
+    )
+    fitting.restore({name: t for name, t in tensors.items() if not name.startswith("batch.")}, description["state"])
+    return description, _watched_step(fitting, description["share"])[1]
+
+
+def _watched_step(fitting: Fitting, share: float) -> tuple[StepResult | None, BadTensor | None]:
+    """A step that looks at every number, and the first tensor that is not finite."""
+    watch = FirstBad()
+    try:
+        result = fitting.advance(share, watch)
+    except NonFiniteError:
+        # Where no number is bad, numbers are so large that their sum is.
+        return None, watch.found or BadTensor("sum of the gradients", 1, 1, ())
+    return result, watch.found
+
+
+def _copied(tensors: dict[str, Tensor], description: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    return {name: tensor.clone() for name, tensor in tensors.items()}, dict(description)

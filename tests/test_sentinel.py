@@ -1,0 +1,174 @@
+"""Numbers that are not finite in a training: named, kept for replay, stepped around or refused; and what that costs."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerfcli import kernels
+from nerfcli.errors import NON_FINITE, UserError
+from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.render.model import load_model, save_model
+from nerfcli.render.pictures import render_picture
+from nerfcli.scene import Scene
+from nerfcli.train import sentinel
+from nerfcli.train.fitting import Fitting
+from nerfcli.train.loop import train
+from nerfcli.train.run_folder import read_log
+from nerfcli.train.sentinel import replay
+from nerfcli.train.settings import TrainSettings
+from nerfcli.train.watch import FirstBad, is_finite
+
+FEW = TrainSettings(budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
+
+
+@pytest.fixture(scope="module")
+def views(spheres: Scene) -> Scene:
+    return replace(spheres, frames=spheres.frames[:3], test_names=frozenset())
+
+
+def fit(scene: Scene, run: Path, settings: TrainSettings = FEW, *, resume: bool = False) -> list[str]:
+    """Train, and return what the user was told."""
+    told: list[str] = []
+    train(scene, run, settings, resume=resume, notify=told.append, on_progress=lambda progress: None)
+    return told
+
+
+def weights(run: Path) -> dict[str, bytes]:
+    tensors, _ = load_tensors(run / "field.safetensors", "cpu")
+    return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+
+
+def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_failure(views, tmp_path):
+    # Adam's first step has the length of the learning rate, whatever the gradient: weights of 1e12 to the fifth power.
+    with pytest.raises(UserError, match=r"colour of samples is not finite at step 2: \d+ of \d+ numbers") as caught:
+        fit(views, tmp_path / "run", replace(FEW, learning_rate=1e12, warmup_steps=1))
+    assert caught.value.exit_code == NON_FINITE
+    assert "seen from train/r_00" in caught.value.message
+    assert "failure-2.safetensors has the state before it" in caught.value.hint
+    description, bad = replay(tmp_path / "run" / "failure-2.safetensors")
+    assert bad is not None
+    assert bad.name == "colour of samples"
+    assert bad.name in description["told"]
+    assert f"{bad.count} of {bad.total}" in description["told"]
+    assert not (tmp_path / "run" / "field.safetensors").exists()
+
+
+def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, monkeypatch):
+    rate = Fitting.learning_rate
+
+    def poisoned(self: Fitting, share: float) -> float:
+        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, share)
+
+    monkeypatch.setattr(Fitting, "learning_rate", poisoned)
+    monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
+    told = fit(views, tmp_path / "run")
+    (line,) = [line for line in told if "back to step" in line]
+    # The rate is wrong in the eighth step; the table comes first among what it spoils. The loss shows it a step later.
+    assert line.startswith("table is not finite at step 8")
+    assert "back to step 4 with 0.5 of the learning rate (1 of 3 times)" in line
+    assert told[-1].startswith("numbers became non-finite 1 times")
+    last = read_log(tmp_path / "run")[-1]
+    assert (last["step"], last["rollbacks"]) == (12, 1)
+    load_model(tmp_path / "run" / "field.safetensors", "cpu")  # which refuses what is not finite
+    tensors, description = load_tensors(tmp_path / "run" / "failure-8.safetensors", "cpu")
+    assert description["state"]["step"] == 7
+    assert is_finite(tensors["field.table"])
+
+
+def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
+    # After the failure everything but the learning rate is as in a training that knew it from the start of the copy.
+    rate = Fitting.learning_rate
+    monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
+    monkeypatch.setattr(Fitting, "learning_rate", lambda self, share: rate(self, share) * (self.step < 4 or 0.5))
+    fit(views, tmp_path / "known")
+
+    def poisoned(self: Fitting, share: float) -> float:
+        return math.inf if self.step == 6 and self.rollbacks == 0 else rate(self, share)
+
+    monkeypatch.setattr(Fitting, "learning_rate", poisoned)
+    fit(views, tmp_path / "found")
+    assert weights(tmp_path / "found") == weights(tmp_path / "known")
+
+
+def test_a_fault_that_does_not_come_back_changes_nothing(views, tmp_path, monkeypatch):
+    fit(views, tmp_path / "straight")
+    composite, calls = kernels.composite, 0
+
+    def flaky(*args: torch.Tensor, **named: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        nonlocal calls
+        calls += 1
+        rgb, transmittance, shares = composite(*args, **named)
+        return (rgb * math.nan if calls == 9 else rgb), transmittance, shares
+
+    monkeypatch.setattr(kernels, "composite", flaky)
+    told = fit(views, tmp_path / "flaky")
+    assert any("are when the step is repeated" in line for line in told)
+    assert weights(tmp_path / "flaky") == weights(tmp_path / "straight")
+    assert not list((tmp_path / "flaky").glob("failure-*"))
+
+
+def test_a_poisoned_checkpoint_is_refused_by_name_and_kept(views, tmp_path):
+    run = tmp_path / "run"
+    fit(views, run, replace(FEW, steps=1))
+    readers: list[tuple[str, str, Callable[[], object]]] = [
+        ("state.safetensors", "field.weights.1", lambda: fit(views, run, replace(FEW, steps=2), resume=True)),
+        ("field.safetensors", "weights.1", lambda: load_model(run / "field.safetensors", "cpu")),
+    ]
+    for file, name, read in readers:
+        tensors, description = load_tensors(run / file, "cpu")
+        tensors[name].view(-1)[5] = math.inf
+        save_tensors(run / file, tensors, description)
+        before = (run / file).read_bytes()
+        with pytest.raises(UserError, match=rf"^{name} in .*{file} is not finite in 1 of 512 places") as caught:
+            read()
+        assert caught.value.exit_code == NON_FINITE
+        assert (run / file).read_bytes() == before
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
+def test_the_first_bad_tensor_is_found_with_its_rays(poison):
+    watch = FirstBad()
+    good, bad = torch.zeros(6, 3), torch.zeros(6, 3)
+    bad[2, 1] = bad[3, 0] = bad[5, 2] = poison
+    rays = torch.tensor([0, 0, 4, 4, 7, 9])
+    watch.rows("first", good, rays)
+    watch.rows("second", bad, rays)
+    watch.values("third", bad)
+    assert watch.found is not None
+    assert (watch.found.name, watch.found.count, watch.found.total) == ("second", 3, 18)
+    assert watch.found.rays == (4, 9)
+
+
+def test_gradients_are_looked_at_in_the_order_in_which_they_come():
+    # d sqrt(x) at 0 is infinite; the root's own gradient is fine.
+    watch = FirstBad()
+    x = torch.tensor([1.0, 0.0], requires_grad=True)
+    root = x.sqrt()
+    watch.rows("x", x, torch.tensor([3, 8]))
+    watch.rows("root", root, torch.tensor([3, 8]))
+    root.sum().backward()
+    assert watch.found is not None
+    assert (watch.found.name, watch.found.rays) == ("gradient of x", (8,))
+
+
+def test_replay_of_something_else_is_refused(spheres_run):
+    with pytest.raises(UserError, match="holds 'nerfcli field 1'"):
+        replay(spheres_run / "field.safetensors")
+
+
+def test_a_field_that_overflows_is_no_picture(spheres, spheres_run, tmp_path):
+    # Finite weights whose products are not: found in the picture, by name and pixel.
+    model = load_model(spheres_run / "field.safetensors", "cpu")
+    with torch.no_grad():
+        for name, parameter in model.field.named_parameters():
+            if name.startswith("weights"):
+                parameter.mul_(1e15)
+    save_model(tmp_path / "field.safetensors", model)
+    model = load_model(tmp_path / "field.safetensors", "cpu")
+    with pytest.raises(UserError, match=r"rgb of .* is not finite at pixel \(\d+, \d+\), of \d+ in all") as caught:
+        render_picture(model, spheres.test_frames[0], background=model.background)
+    assert caught.value.exit_code == NON_FINITE
