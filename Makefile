@@ -23,7 +23,8 @@ demo: .venv/installed
 test: .venv/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/basedpyright
+	# The CPU kernels are compiled once, while types are checked; two test processes would both do it.
+	$(BIN)/python -c 'from nerfcli import kernels; kernels.prepare(print)' & $(BIN)/basedpyright && wait $$!
 	$(BIN)/pytest -n 2 --dist loadfile
 
 test-slow: .venv/installed-dev

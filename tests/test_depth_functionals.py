@@ -247,3 +247,8 @@ def test_max_weight_takes_the_nearest_of_equals():
     means = torch.tensor([1.0, 2.0, 3.0, 4.0])
     nearest = depth.max_weight(weights, means, torch.tensor([0, 4]))
     assert nearest.tolist() == [2.0]
+    # Weights that are equal to the last bit, in the definition and in the compiled kernel.
+    density, starts = torch.tensor([1e-30, 1e-30, 1e-30]), torch.tensor([1.0, 3.0, 5.0])
+    for module in (depth, kernels):
+        light = module.light_ends(density, starts, starts + 1, offsets=torch.tensor([0, 3]), shares=())
+        assert light.heaviest.tolist() == [1.5]

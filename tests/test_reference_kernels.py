@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles import march_through_slabs, trilinear_hash
 
+from nerfcli import kernels
 from nerfcli.field.contraction import training_points, uncontract
 from nerfcli.kernels import reference
 
@@ -150,8 +151,8 @@ def test_gradients_stay_bounded_at_the_extremes(density):
     assert torch.isfinite(by_length).all()
 
 
-RESOLUTIONS = (4, 9, 40)
-ROWS = 512  # the first level fits densely (125), the others are hashed
+RESOLUTIONS = (4, 7, 40)
+ROWS = 512  # the first two levels fit densely (125 vertices, and 512), the last is hashed
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -181,6 +182,14 @@ def test_hash_encode_at_vertices_is_the_table_row():
     encoded = reference.hash_encode(points.double(), table, (4,))
     rows = [(3 * 5 + 2) * 5 + 1, (4 * 5 + 4) * 5 + 4, 0]
     torch.testing.assert_close(encoded, table[0, rows])
+
+
+def test_hash_encode_reads_no_row_that_is_no_vertex():
+    table = torch.full((1, ROWS, 4), torch.nan)
+    table[0, :125] = 1.0
+    points = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 0.5], [7.0, -3.0, 1.0]])
+    assert torch.equal(kernels.hash_encode(points, table, (4,)), torch.ones(3, 4))
+    assert torch.equal(reference.hash_encode(points, table, (4,)), torch.ones(3, 4))
 
 
 def test_hash_encode_gradcheck_in_the_table():

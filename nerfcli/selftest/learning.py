@@ -28,8 +28,9 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
         yield _density_row(precision)
         if precision.dtype == torch.float32:
             yield _adam_row(precision)
-        if precision.dtype != torch.bfloat16 and not precision.compiled:
+        if not precision.compiled:
             yield from _draw_rows(precision)
+        if precision.dtype != torch.bfloat16 and not precision.compiled:
             yield _poison_row(precision)
 
 

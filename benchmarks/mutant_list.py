@@ -1,0 +1,398 @@
+"""The mutants of `mutants.py`: what is broken where, and which tests are asked."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One text, which stands once in the file, replaced by another; `equivalent` says why no test can tell."""
+
+    old: str
+    new: str
+    equivalent: str = ""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Mutants of one file.
+
+    Args:
+        file: below nerfcli/.
+        tests: the files that run, until the first failure.
+        selected: pytest's -k; "" for all.
+        compiled_into: files whose compiled functions hold those of this file.
+        mutants: what is broken.
+    """
+
+    file: str
+    tests: tuple[str, ...]
+    selected: str
+    compiled_into: tuple[str, ...]
+    mutants: tuple[Mutant, ...]
+
+
+GROUPS: tuple[Group, ...] = (
+    Group(
+        "kernels/reference.py",
+        ("tests/test_reference_kernels.py", "tests/test_worked_examples.py"),
+        "",
+        (),
+        (
+            Mutant("return (2.0 - shrink / norm) *", "return (2.0 + shrink / norm) *"),
+            Mutant(".maximum(shrink.square()).sqrt()", ".sqrt()"),
+            Mutant("contract(points) / 4.0 + 0.5", "contract(points) / 2.0 + 0.5"),
+            Mutant("points / 2.0 + 0.5", "points / 2.0 - 0.5"),
+            Mutant("side = resolution + 1\n", "side = resolution\n"),
+            Mutant("if side**3 <= rows:", "if side**3 < rows:"),
+            Mutant("2654435761, 805459861)", "2654435761, 805459863)"),
+            Mutant("mixed & (rows - 1)", "mixed & rows"),
+            Mutant("points.clamp(0.0, 1.0) * resolution", "points * resolution"),
+            Mutant(".clamp_max(resolution - 1)", ".clamp_max(resolution)"),
+            Mutant("torch.where(corners == 1, inside,", "torch.where(corners == 0, inside,"),
+            Mutant("* ((starts + ends) / 2)[..., None]", "* starts[..., None]"),
+            Mutant("edges[:-1] + jitter[:, None] *", "edges[:-1] - jitter[:, None] *"),
+            Mutant("((coordinates >= 0) & (coordinates <= 1))", "((coordinates >= 0) & (coordinates <= 2))"),
+            Mutant("(rays, place + 1)", "(rays, place)"),
+            Mutant("weights = torch.exp(-before) * opacity(depth)", "weights = torch.exp(-before) * depth"),
+            Mutant("weights = torch.exp(-before) *", "weights = torch.exp(before) *"),
+            Mutant("return weights, torch.exp(-total)", "return weights, 1.0 - torch.exp(-total)"),
+            Mutant("transmittance[:, None] * background", "background"),
+            Mutant("2 * gaps * before", "gaps * before"),
+            Mutant("(weights + behind)", "behind"),
+            Mutant("(ends - starts) / 3", "(ends - starts) / 2"),
+        ),
+    ),
+    Group(
+        "kernels/reference.py",
+        ("tests/test_numba_kernels.py",),
+        "visible and not misses",
+        (),
+        (
+            Mutant("occupied[z, y, x]", "occupied[x, y, z]"),
+            Mutant("* ((starts + ends) / 2)[:, None]", "* ends[:, None]"),
+            Mutant("< deepest\n", "< 2 * deepest\n"),
+        ),
+    ),
+    Group(
+        "kernels/reference.py",
+        ("tests/test_numba_kernels.py",),
+        "radiance",
+        (),
+        (
+            Mutant("torch.relu(encoded @ weights[0].t())", "(encoded @ weights[0].t())"),
+            Mutant("torch.sigmoid(hidden", "torch.tanh(hidden"),
+        ),
+    ),
+    Group(
+        "kernels/reference.py",
+        ("tests/test_numba_kernels.py", "tests/test_selftest.py"),
+        "pixel_rays or adam or bound",
+        (),
+        (
+            Mutant("right=True) - 1", "right=False) - 1"),
+            Mutant("/ 255.0", "/ 256.0"),
+            Mutant("(1 - betas[1]) * g * g", "(1 - betas[1]) * g"),
+            Mutant("(1 - betas[0] ** step)", "(1 - betas[0])"),
+            Mutant("/ (spread + eps)", "/ spread"),
+            Mutant("gradient.zero_()", "gradient.abs()"),
+            Mutant(".any(-1)", ".all(-1)"),
+        ),
+    ),
+    Group(
+        "kernels/activations.py",
+        ("tests/test_reference_kernels.py", "tests/test_field.py", "tests/test_selftest.py"),
+        "",
+        (),
+        (
+            Mutant("LOG_DENSITY_LIMIT = 15.0", "LOG_DENSITY_LIMIT = 16.0"),
+            Mutant("gradients[0] * density", "gradients[0]"),
+            Mutant("-torch.expm1(-optical_depth)", "1 - torch.exp(-optical_depth)"),
+            Mutant("gradients[0] * torch.exp(-optical_depth)", "gradients[0] * (1 + torch.expm1(-optical_depth))"),
+        ),
+    ),
+    Group(
+        "kernels/depth.py",
+        ("tests/test_depth_functionals.py", "tests/test_selftest.py"),
+        "",
+        (),
+        (
+            Mutant("(1 / 720 - x2 * tail)", "(1 / 702 - x2 * tail)"),
+            Mutant("1.0 / y + torch.exp(-y) /", "1.0 / y - torch.exp(-y) /"),
+            Mutant("1 / 12, -1 / 240,", "1 / 12, 1 / 240,"),
+            Mutant("torch.expm1(-y).square()", "torch.expm1(-y).abs()"),
+            Mutant("return starts + lengths * mean_fraction", "return ends - lengths * mean_fraction"),
+            Mutant(
+                "moment(weights, means, offsets) / torch.where(defined, total, 1.0)", "moment(weights, means, offsets)"
+            ),
+            Mutant("starts - torch.where(defined, anchors, 0.0)[rays] + lengths", "starts + lengths"),
+            Mutant("interval_variances(density, lengths) + (places", "(places"),
+            Mutant("torch.where(wide, variance, 1.0).sqrt()", "torch.where(wide, variance, 1.0)"),
+            Mutant("(weights == largest) & (weights > 0)", "weights == largest"),
+            Mutant("-math.log1p(-share)", "-math.log(share)"),
+            Mutant("inside = (target - before) /", "inside = target /"),
+            Mutant("inside.clamp_min(0.0)", "inside"),
+            Mutant("(passed(high) <= 1.0 - share) & (high > 0)", "high > 0"),
+            Mutant("rays_per_pixel).mean(-1)", "rays_per_pixel).sum(-1)"),
+            Mutant(
+                "torch.where(enough, low, middle), torch.where(enough, middle, high)",
+                "torch.where(enough, middle, low), torch.where(enough, high, middle)",
+            ),
+            Mutant("BISECTIONS = 40", "BISECTIONS = 12"),
+            Mutant("total = opacity(sum_along_rays(density * lengths, offsets))", "total = 1.0 - transmittance"),
+            Mutant('distances, "amin")', 'distances, "amax")'),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/compositing.py",
+        ("tests/test_numba_kernels.py",),
+        "composite or distortion",
+        (),
+        (
+            Mutant("            out[i] = depth\n", "            out[i] = depth + density[i] * lengths[i]\n"),
+            Mutant(
+                "            weight = np.exp(-depth) * -np.expm1(-own)", "            weight = np.exp(-depth) * own"
+            ),
+            Mutant("left * background[ray, 1]", "left * background[ray, 0]"),
+            Mutant("            depth += own\n        left =", "            depth -= own\n        left ="),
+            Mutant("density_gradient[i] * value - behind", "density_gradient[i] * value + behind"),
+            Mutant("range(last - 1, first - 1, -1)", "range(last - 1, first, -1)"),
+            Mutant(" + transmittance_gradient[ray]", ""),
+            Mutant(" + weights_gradient[i]", ""),
+            Mutant("rgb_gradient[i, 2] = weight * gb", "rgb_gradient[i, 2] = weight * gg"),
+            Mutant("behind += weight * value", "behind += value"),
+            Mutant(
+                "            weights[i] = np.exp(-depth) * -np.expm1(-own)", "            weights[i] = -np.expm1(-own)"
+            ),
+            Mutant("2.0 * weight * (middle * mass - moment)", "weight * (middle * mass - moment)"),
+            Mutant("weight * weight * length / 3.0", "weight * weight * length / 2.0"),
+            Mutant("moment_behind - middle * behind", "moment_behind + middle * behind"),
+            Mutant("            behind -= weight\n", "            behind -= 0.0\n"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/depth.py",
+        ("tests/test_depth_functionals.py",),
+        "",
+        (),
+        (
+            Mutant("return 1.0 / x - (1.0 - alpha) / alpha\n", "return 1.0 / x + (1.0 - alpha) / alpha\n"),
+            Mutant("(1.0 - alpha) / (alpha * alpha)", "(1.0 - alpha) / alpha"),
+            Mutant("mean += step * (weight / mass)", "mean += step * weight"),
+            Mutant("step * (place - mean)", "step * step"),
+            Mutant("if weight > largest:", "if weight >= largest:"),
+            Mutant("depth + own >= targets[crossed]", "depth >= targets[crossed]"),
+            Mutant("(targets[crossed] - depth) / sigma", "targets[crossed] / sigma"),
+            Mutant("            depth += own\n        out[ray, 0]", "            depth = own\n        out[ray, 0]"),
+            Mutant("out[ray, 0] = -np.expm1(-depth)", "out[ray, 0] = 1.0 - np.float32(np.exp(-depth))"),
+            Mutant("quantiles=quantiles[:, back]", "quantiles=quantiles"),
+            Mutant("min(t, np.float64(ends[i])) - start", "np.float64(ends[i]) - start"),
+            Mutant("return total / count", "return total"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/hash_grid.py",
+        ("tests/test_numba_kernels.py",),
+        "hash_encode",
+        (),
+        (
+            Mutant("min(np.int32(scaled), last)", "np.int32(scaled)"),
+            Mutant("np.uint32((corner >> 1) & 1)", "np.uint32((corner >> 2) & 1)"),
+            Mutant("<= np.int64(rows)", "< np.int64(rows)"),
+            Mutant("np.uint32(805459861)", "np.uint32(805459863)"),
+            Mutant(
+                "inside[1, i] if corner & 2 else one - inside[1, i]",
+                "one - inside[1, i] if corner & 2 else inside[1, i]",
+            ),
+            Mutant("range(thread, resolutions.shape[0], threads)", "range(0, resolutions.shape[0], threads)"),
+            Mutant("column = level * FEATURES", "column = 0"),
+            Mutant("if a != 0 or b != 0 or c != 0 or d != 0:", "if a != 0 or b != 0 or c != 0:"),
+            Mutant("total if ctx.sink is None else None", "total"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/networks.py",
+        ("tests/test_numba_kernels.py",),
+        "radiance",
+        (),
+        (
+            Mutant("if h[i] <= np.float32(0):", "if h[i] < np.float32(0):"),
+            Mutant("exponential(min(max(density[i], -LIMIT), LIMIT))", "exponential(density[i])"),
+            Mutant("density_gradient[first + i] * own[i]", "density_gradient[first + i]"),
+            Mutant("sigmoid_slope(channels[i])", "sigmoid(channels[i])"),
+            Mutant("_layer_32(g, back, C2, g2)", "_layer_32(g, back, C1, g2)"),
+            Mutant("out[i * WIDTH + OUT + j] = harmonics[ray, j]", "out[i * WIDTH + OUT + j] = harmonics[0, j]"),
+            Mutant("_weights_32(c0, g2, total, C1)", "_weights_32(h2, g2, total, C1)"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/rays.py",
+        ("tests/test_numba_kernels.py",),
+        "visible or ray_indices",
+        ("kernels/numba_cpu/visible.py", "kernels/numba_cpu/marching.py"),
+        (
+            Mutant("(two - one / norm)", "(two + one / norm)"),
+            Mutant("return edges[k] + shift * (edges[k + 1] - edges[k])", "return edges[k]"),
+            Mutant("(layer * side + row) * side + column if inside else -1", "(layer * side + row) * side + column"),
+            Mutant("] = ray\n", "] = ray + 1\n"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/visible.py",
+        ("tests/test_numba_kernels.py",),
+        "visible",
+        (),
+        (
+            Mutant("(8.0 if unbounded else 4.0)", "(80.0 if unbounded else 40.0)"),
+            Mutant("if lane_depth[lane] < deepest:", "if lane_depth[lane] < 2 * deepest:"),
+            Mutant("near[max(z - 1, 0) : z + 2, ", "near[z : z + 1, "),
+            Mutant("past = i + 1", "past = i"),
+            Mutant("            place[ray] += 1\n", "            place[ray] += 0\n"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/row_adam.py",
+        ("tests/test_numba_kernels.py",),
+        "adam",
+        (),
+        (
+            Mutant("(one - beta2) * g * g", "(one - beta2) * g"),
+            Mutant("np.sqrt(v) * correction", "np.sqrt(v)"),
+            Mutant("touched |= gradient[row, j] != 0", "touched = gradient[row, j] != 0"),
+            Mutant("gradient[row, j] = np.float32(0)", "gradient[row, j] = g"),
+            Mutant("rate * m /", "-rate * m /"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/pixels.py",
+        ("tests/test_numba_kernels.py",),
+        "pixel_rays",
+        (),
+        (
+            Mutant('side="right") - 1', 'side="left") - 1'),
+            Mutant("np.float32(255)", "np.float32(256)"),
+            Mutant("row[2] * bearing[2]", "row[2] * bearing[1]"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/exponential.py",
+        ("tests/test_numba_kernels.py",),
+        "exponential",
+        (),
+        (
+            Mutant("5.0000001201e-1", "4.99e-1"),
+            Mutant("x = min(max(x, np.float32(-87)), np.float32(88))", "x = min(x, np.float32(88))"),
+            Mutant(
+                "return tail / ((np.float32(1) + tail) * (np.float32(1) + tail))",
+                "return tail / (np.float32(1) + tail)",
+            ),
+            Mutant("exponential(-abs(x))\n    return (np", "exponential(-x)\n    return (np"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/vector.py",
+        ("tests/test_numba_kernels.py",),
+        "radiance",
+        ("kernels/numba_cpu/networks.py",),
+        (
+            Mutant(
+                'builder.fcmp_ordered("<=", total, zero), zero, total)',
+                'builder.fcmp_ordered("<=", total, zero), total, total)',
+            ),
+            Mutant(
+                "product_32 = _block_product(2, begin=_zero, finish=_as_it_is)",
+                "product_32 = _block_product(1, begin=_zero, finish=_as_it_is)",
+            ),
+        ),
+    ),
+    Group(
+        "render/sampling.py",
+        ("tests/test_sampling.py", "tests/test_selftest.py"),
+        "",
+        (),
+        (
+            Mutant("distance * max(1.0, distance)", "distance"),
+            Mutant("((strata + uniform) / count)", "(strata / count)"),
+            Mutant("(right - 1).clamp_min(0), last)", "right, last)"),
+            Mutant(
+                "torch.minimum((right - 1).clamp_min(0), last)",
+                "(right - 1).clamp_min(0).clamp_max(weights.shape[-1] - 1)",
+            ),
+            Mutant("- low, 1.0)).clamp(0.0, 1.0)", "- low, 1.0))"),
+            Mutant("uniform.contiguous(), right=True)", "uniform.contiguous(), right=False)"),
+            Mutant("weights / torch.where(largest > 0, largest, 1.0)", "weights"),
+        ),
+    ),
+    Group(
+        "render/transmission.py",
+        ("tests/test_worked_examples.py", "tests/test_selftest.py"),
+        "",
+        (),
+        (
+            Mutant("attenuation * lengths, offsets", "attenuation, offsets"),
+            Mutant("torch.exp(-integral)", "torch.exp(integral)"),
+        ),
+    ),
+    Group(
+        "field/encodings.py",
+        ("tests/test_field.py",),
+        "",
+        (),
+        (
+            Mutant("(3 * zz - 1)", "(3 * zz + 1)"),
+            Mutant("math.sqrt(105 / (4 * math.pi))", "math.sqrt(104 / (4 * math.pi))"),
+            Mutant(
+                "math.sqrt(7 / (16 * math.pi)) * z * (5 * zz - 3)", "math.sqrt(7 / (16 * math.pi)) * z * (5 * zz - 2)"
+            ),
+            Mutant("frequencies = math.pi *", "frequencies ="),
+            Mutant("[phases.sin(), phases.cos()]", "[phases.cos(), phases.sin()]"),
+        ),
+    ),
+    Group(
+        "field/contraction.py",
+        ("tests/test_reference_kernels.py", "tests/test_field.py", "tests/test_selftest.py"),
+        "",
+        (),
+        (
+            Mutant("1.0 / (2.0 - norm)", "1.0 / (2.0 + norm)"),
+            Mutant(".clamp_min(1.0 / LARGEST_RADIUS)", ""),
+            Mutant("(coordinates - 0.5) * 4.0", "(coordinates - 0.5) * 2.0"),
+        ),
+    ),
+    Group(
+        "cameras/distortion.py",
+        (
+            "tests/test_lens_domain.py",
+            "tests/test_lens_jacobians.py",
+            "tests/test_lens_projections.py",
+            "tests/test_camera.py",
+        ),
+        "",
+        (),
+        (
+            Mutant("moved += 2 * (p @ plane) * plane", "moved += (p @ plane) * plane"),
+            Mutant("moved += square * np.array(self.prism)", "moved -= square * np.array(self.prism)"),
+            Mutant("bend = 2 * self._factor_slope", "bend = self._factor_slope"),
+            Mutant("diagonal + bend * y * y", "diagonal + bend * x * x"),
+            Mutant("-plane * factor * square**i", "plane * factor * square**i"),
+            Mutant("6 * _size(self.tangential)", "0 * _size(self.tangential)"),
+            Mutant("real.min(initial=np.inf)", "real.max(initial=0.0)"),
+            Mutant("~(goals >= heights[-1])", "goals >= 0"),
+            Mutant("close & (_radius(plane) < self.reach)", "close"),
+            Mutant("(slope - self._factor(square) * bottom_slope)", "(slope + self._factor(square) * bottom_slope)"),
+        ),
+    ),
+    Group(
+        "cameras/rigid.py",
+        ("tests/test_rigid.py",),
+        "",
+        (),
+        (
+            Mutant("2 * np.arctan2(sine,", "np.arctan2(sine,"),
+            Mutant("(6, -120, 5040,", "(6, 120, 5040,"),
+            Mutant("u + b * turned + c *", "u - b * turned + c *"),
+            Mutant("translation - turned / 2 + d", "translation + turned / 2 + d"),
+            Mutant("np.sinc(half / np.pi) * vector / 2", "np.sinc(half / np.pi) * vector"),
+            Mutant("np.cross(forward, right), forward]", "np.cross(right, forward), forward]"),
+        ),
+    ),
+)

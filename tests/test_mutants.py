@@ -1,0 +1,20 @@
+"""The list of mutants keeps up with the code; whether they are killed, `benchmarks/mutants.py` tells."""
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from mutant_list import GROUPS
+
+import nerfcli
+
+ROOT = Path(nerfcli.__file__).parent
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.file)
+def test_every_mutant_breaks_one_place(group):
+    text = (ROOT / group.file).read_text(encoding="utf-8")
+    assert [mutant.old for mutant in group.mutants if text.count(mutant.old) != 1] == []
+    assert [old for old, count in Counter(mutant.old for mutant in group.mutants).items() if count > 1] == []
+    assert all((ROOT.parent / test).is_file() for test in group.tests)
