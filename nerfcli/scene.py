@@ -8,7 +8,7 @@ import hashlib
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from nerfcli.cameras.formats.scene_json import SCENE_FILE, SCENE_VERSION, UNITS,
 from nerfcli.cameras.formats.transforms import read_transforms
 from nerfcli.cameras.frame import Capture, Frame, Size
 from nerfcli.errors import UserError
+from nerfcli.holdout import names_held_out
 from nerfcli.media.images import image_size, list_images, read_exif
 from nerfcli.media.masks import find_mask
 
@@ -51,6 +52,8 @@ class Scene:
         depth_bounds: (frames, 2) nearest and farthest z per frame, in scene units, where the format has them.
         unit_source: how a metre is known; None where the unit is arbitrary, or nobody said.
         rescaled: for how many photos the intrinsics were given for another size, see `Capture.rescaled`.
+        history: how cameras and points were found: the provenance of `save`, or {"from": the format}.
+        holdout: the rule that chose the held-out frames; None where the capture itself says, or is split as usual.
     """
 
     root: Path
@@ -63,6 +66,8 @@ class Scene:
     depth_bounds: np.ndarray | None = None
     unit_source: str | None = None
     rescaled: Mapping[tuple[Size, Size], int] = field(default_factory=dict)
+    history: Mapping[str, Any] = field(default_factory=dict)
+    holdout: str | None = None
 
     @property
     def train_frames(self) -> tuple[Frame, ...]:
@@ -86,34 +91,21 @@ def model_folder(path: Path) -> Path | None:
     return next((path / name for name in _MODEL_FOLDERS if is_model(path / name)), None)
 
 
-def load(path: Path) -> Scene:
+def load(path: Path, *, holdout: str | None = None) -> Scene:
     """The scene in a folder, whatever its format; a scene.json or transforms.json itself may be named too.
 
+    Args:
+        path: the folder, or the file.
+        holdout: the rule by which photos are held out, see `holdout`, instead of what the capture says.
+
     Raises:
-        UserError: there is no scene, or its files are malformed or do not fit the photos.
+        UserError: there is no scene, its files are malformed or do not fit the photos, or the rule does not.
     """
-    path = Path(path)
-    if not path.exists():
-        raise UserError(f"there is no {path}", "give the folder of a scene")
-    if path.is_file():
-        if path.suffix.lower() != ".json":
-            raise UserError(f"{path} is a file, not a scene", "give the folder of a scene, or its transforms.json")
-        if path.name != SCENE_FILE:
-            return _scene(path.parent, read_transforms(path, _measure))
-        path = path.parent
-    if (path / SCENE_FILE).is_file():
-        return _load_own(path)
-    model_dir = model_folder(path)
-    if model_dir is not None:
-        model = read_model(model_dir)
-        return _scene(path, colmap_on_disk(model, _image_folder(path, model_dir, model), _measure, model_dir))
-    if (path / "transforms.json").is_file():
-        return _scene(path, read_transforms(path / "transforms.json", _measure))
-    if (path / "transforms_train.json").is_file():
-        return _scene(path, read_blender(path, _measure))
-    if (path / "poses_bounds.npy").is_file():
-        return _scene(path, read_llff(path, _measure, list_images))
-    raise _no_scene(path)
+    scene = _load(Path(path))
+    if holdout is None:
+        return scene
+    names = names_held_out(holdout, (frame.name for frame in scene.frames), others=scene.missing)
+    return replace(scene, test_names=names, holdout=holdout)
 
 
 def save(
@@ -203,6 +195,30 @@ def fingerprint(scene: Scene) -> str:
     return digest.hexdigest()
 
 
+def _load(path: Path) -> Scene:
+    if not path.exists():
+        raise UserError(f"there is no {path}", "give the folder of a scene")
+    if path.is_file():
+        if path.suffix.lower() != ".json":
+            raise UserError(f"{path} is a file, not a scene", "give the folder of a scene, or its transforms.json")
+        if path.name != SCENE_FILE:
+            return _scene(path.parent, read_transforms(path, _measure))
+        path = path.parent
+    if (path / SCENE_FILE).is_file():
+        return _load_own(path)
+    model_dir = model_folder(path)
+    if model_dir is not None:
+        model = read_model(model_dir)
+        return _scene(path, colmap_on_disk(model, _image_folder(path, model_dir, model), _measure, model_dir))
+    if (path / "transforms.json").is_file():
+        return _scene(path, read_transforms(path / "transforms.json", _measure))
+    if (path / "transforms_train.json").is_file():
+        return _scene(path, read_blender(path, _measure))
+    if (path / "poses_bounds.npy").is_file():
+        return _scene(path, read_llff(path, _measure, list_images))
+    raise _no_scene(path)
+
+
 def _scene(root: Path, capture: Capture) -> Scene:
     """The scene of a capture in a foreign format, with its own split where it fixes one."""
     splits = {frame.split for frame in capture.frames}
@@ -227,6 +243,7 @@ def _scene(root: Path, capture: Capture) -> Scene:
         depth_bounds=bounds,
         unit_source=capture.unit_source,
         rescaled=capture.rescaled,
+        history={"from": capture.kind},
     )
 
 
@@ -255,6 +272,7 @@ def _load_own(root: Path) -> Scene:
         depth_bounds=described.bounds_of(frames),
         unit_source=described.unit_source,
         rescaled=capture.rescaled,
+        history=described.provenance,
     )
 
 

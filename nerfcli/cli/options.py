@@ -27,6 +27,21 @@ Exclude = Annotated[
     list[str] | None,
     typer.Option("--without", metavar="NAME", help="A component to switch off; see below. Repeatable."),
 ]
+Require = Annotated[
+    str | None,
+    typer.Option(help="Numbers to reach, else exit code 7: psnr>=25,registered>=0.9.", show_default=False),
+]
+Holdout = Annotated[
+    str | None,
+    typer.Option(
+        help="Photos to hold out: every:8, block:0.15 (the middle of the capture), or a file of names.",
+        show_default=False,
+    ),
+]
+Strict = Annotated[
+    bool,
+    typer.Option("--strict", help="Poses without the held-out photos, which are placed afterwards, all else fixed."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No notes and no progress; warnings and errors stay.")]
@@ -70,6 +85,20 @@ def bytes_from_text(text: str) -> int:
     ):
         raise typer.BadParameter(f"{text!r} is not an amount of memory; write 4GB or 500MB")
     return size
+
+
+def holdout_rule(holdout: str | None) -> str | None:
+    """The rule of --holdout, with the path of a file made absolute; None where it is not given.
+
+    Raises:
+        typer.BadParameter: it is no rule, and no file.
+    """
+    from nerfcli.holdout import check_holdout
+
+    try:
+        return None if holdout is None else check_holdout(holdout)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--holdout") from error
 
 
 def thread_count(threads: int) -> int:

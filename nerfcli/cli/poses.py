@@ -9,13 +9,16 @@ from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.clips import Frames, photos_of, without_suffix
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
+    Holdout,
     Json,
     Output,
     Overwrite,
     Quiet,
     Seed,
+    Strict,
     Threads,
     bytes_from_text,
+    holdout_rule,
     seconds_from_text,
     thread_count,
 )
@@ -69,6 +72,8 @@ def poses(
         str | None,
         typer.Option(help="fixed: the intrinsics are exact; prior: the adjustment starts there.  [default: fixed]"),
     ] = None,
+    holdout: Holdout = None,
+    strict: Strict = False,
     min_registered: Annotated[float, typer.Option(help="Share of photos that must register.", min=0, max=1)] = 0.5,
     memory: Annotated[
         str | None, typer.Option(help="Memory it may use: 4GB, 500MB.  [default: 4/5 of the machine's]")
@@ -101,10 +106,12 @@ def poses(
       nerfcli poses photos/kitchen -o kitchen --quality fast
       nerfcli poses photos/kitchen --dry-run --json
       nerfcli poses kitchen.mp4 --frames 200
+      nerfcli poses photos/kitchen --strict --holdout block:0.15
       nerfcli poses statue/ --masks statue-masks/
       nerfcli poses photos/kitchen --intrinsics calibration/cameras.txt
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
+    from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.poses.cameras import USES
     from nerfcli.poses.memory import default_memory_limit
     from nerfcli.poses.pairs import PAIRINGS
@@ -137,6 +144,8 @@ def poses(
         pairing=pairing,
         pairs_file=None if pairs is None else str(pairs.absolute()),
         masks=str(masks.resolve()) if masks else None,
+        holdout=holdout_rule(holdout) or DEFAULT_HOLDOUT,
+        strict=strict,
     )
     limits = Limits(
         memory_bytes=default_memory_limit() if memory is None else bytes_from_text(memory),

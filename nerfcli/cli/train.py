@@ -12,6 +12,7 @@ from nerfcli.cli.options import (
     Device,
     Downscale,
     Exclude,
+    Holdout,
     Include,
     Json,
     Output,
@@ -21,6 +22,7 @@ from nerfcli.cli.options import (
     Threads,
     device_name,
     downscale_factor,
+    holdout_rule,
     seconds_from_text,
     thread_count,
 )
@@ -51,6 +53,7 @@ def train(
     levels: Annotated[int, typer.Option(help="Tables of the field; other numbers than 8 are slow.", min=1)] = 8,
     width: Annotated[int, typer.Option(help="Neurons of its layers; other numbers than 32 are slow.", min=1)] = 32,
     batch: Annotated[int, typer.Option(help="Samples of a step at the end of the training.", min=2**8)] = 2**16,
+    holdout: Holdout = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint to the new total.")] = False,
     device: Device = "auto",
     seed: Seed = 0,
@@ -62,8 +65,8 @@ def train(
     """Fit a radiance field to a scene.
 
     SCENE is what `nerfcli poses` wrote, a COLMAP project, or a folder with transforms.json (nerfstudio, instant-ngp),
-    transforms_train.json (Blender) or poses_bounds.npy (LLFF). Every 8th photo is held out. Writes SCENE-run/.
-    Ctrl-C saves a checkpoint; --resume goes on from it.
+    transforms_train.json (Blender) or poses_bounds.npy (LLFF). Photos are held out as the scene says, else every 8th,
+    or by --holdout. Writes SCENE-run/. Ctrl-C saves a checkpoint; --resume goes on from it.
 
     Components, for --with and --without: background (auto, black, constant, random, sphere: what is behind the
     field), view (0 to 3: the degree to which colours depend on the direction), exposure (none, exif, learned:
@@ -74,6 +77,7 @@ def train(
     Examples:
       nerfcli train photos-scene --budget 90s
       nerfcli train photos-scene --budget 5m --resume
+      nerfcli train photos-scene --holdout block:0.15 -o gap-run
       nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
       nerfcli train photos-scene --without view --with distortion=0.01
     """
@@ -97,19 +101,29 @@ def train(
         log2_rows=log2_rows,
         width=width,
     )
+    rule = holdout_rule(holdout)
 
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
-        train_scene(folder, run, settings=settings, resume=resume, overwrite=overwrite, console=console)
+        train_scene(folder, run, settings=settings, resume=resume, overwrite=overwrite, console=console, holdout=rule)
         console.result(run)
 
     for_each_input(scene, work)
 
 
 def train_scene(
-    folder: Path, run: Path, *, settings: "TrainSettings", resume: bool, overwrite: bool, console: Console
+    folder: Path,
+    run: Path,
+    *,
+    settings: "TrainSettings",
+    resume: bool,
+    overwrite: bool,
+    console: Console,
+    holdout: str | None = None,
 ) -> None:
     """Train one scene, keep a run that is already what was asked for, or refuse to touch another one.
+
+    Photos are held out as the scene says, or by the rule `holdout`.
 
     Raises:
         UserError: see `nerfcli.train.loop.train`; or a different run stands at `run`.
@@ -119,7 +133,7 @@ def train_scene(
     from nerfcli.exclusive import exclusive
     from nerfcli.train.run_folder import LOCK
 
-    scene = scenes.load(folder)
+    scene = scenes.load(folder, holdout=holdout)
     if scene.missing:
         listed = ", ".join(scene.missing[:NAMES_SHOWN])
         more = f" and {len(scene.missing) - NAMES_SHOWN} more" if len(scene.missing) > NAMES_SHOWN else ""
@@ -148,11 +162,17 @@ def _keeps(run: Path, scene: "Scene", settings: "TrainSettings", *, resume: bool
         UserError: it is something else, which is not ours to replace; or nothing to resume.
     """
     from nerfcli import scene as scenes
-    from nerfcli.train.run_folder import CONFIG, FIELD, LOCK, STATE, is_complete, is_same_run, read_config
+    from nerfcli.train.run_folder import CONFIG, FIELD, LOCK, STATE, is_complete, is_same_run, read_config, split_hash
 
     trained = (run / FIELD).exists()
     if resume and not trained and not (run / STATE).exists():
         raise UserError(f"nothing to resume in {run}", "leave --resume out to start, or give the run with -o")
+    if resume and read_config(run).get("split_sha256") != split_hash(scene.test_names):
+        before = read_config(run).get("holdout")
+        raise UserError(
+            f"{run} was trained with other photos held out ({before or 'as the scene says'})",
+            f"give --holdout {before}" if before else "leave --holdout out, or choose another place with -o",
+        )
     if resume and read_config(run).get("scene_fingerprint") != scenes.fingerprint(scene):
         raise UserError(f"{run} was trained on another scene than {scene.root}", "choose another place with -o")
     if trained and not resume and not overwrite:
@@ -196,11 +216,51 @@ def _fit(
             raise
 
 
-def was_interrupted(folder: Path, run: Path, settings: "TrainSettings") -> bool:
+def was_interrupted(folder: Path, run: Path, settings: "TrainSettings", *, holdout: str | None = None) -> bool:
     """Whether a training of this scene with these settings stopped before its end and left a checkpoint."""
     from nerfcli import scene as scenes
     from nerfcli.train.run_folder import FIELD, is_complete, is_same_run
 
     if not (run / FIELD).exists():
         return False
-    return is_same_run(run, scenes.load(folder), settings) and not is_complete(run, settings)
+    scene = scenes.load(folder, holdout=holdout)
+    return is_same_run(run, scene, settings) and not is_complete(run, settings)
+
+
+def train_other_seeds(run: Path, count: int, *, device: str, threads: int, console: Console) -> list[Path]:
+    """Train the scene of a run again with other seeds and otherwise the same settings, in RUN/seeds/SEED.
+
+    Runs that are there and complete are kept, interrupted ones are gone on with.
+
+    Args:
+        run: a complete run.
+        count: how many others; their seeds follow the run's own.
+        device, threads: as for `TrainSettings`.
+
+    Raises:
+        UserError: the scene is no longer where it was, or is another one by now.
+    """
+    from dataclasses import replace
+
+    from nerfcli import scene as scenes
+    from nerfcli.train.run_folder import read_config, settings_of
+
+    config = read_config(run)
+    folder, holdout = Path(config["scene"]), config.get("holdout")
+    first = replace(settings_of(config), device=device, threads=threads)
+    if not folder.exists():
+        raise UserError(
+            f"the scene of {run} should be in {folder}, which is not there",
+            "call it from the folder that the run was trained from, or train again",
+        )
+    scene = scenes.load(folder, holdout=holdout)
+    if scenes.fingerprint(scene) != config.get("scene_fingerprint"):
+        raise UserError(f"{folder} is not the scene any more that {run} was trained on", "train again with --overwrite")
+    others = []
+    for seed in range(first.seed + 1, first.seed + 1 + count):
+        settings, other = replace(first, seed=seed), run / "seeds" / str(seed)
+        resume = was_interrupted(folder, other, settings, holdout=holdout)
+        console.note(f"{other}: seed {seed}")
+        train_scene(folder, other, settings=settings, resume=resume, overwrite=False, console=console, holdout=holdout)
+        others.append(other)
+    return others

@@ -46,7 +46,8 @@ class Job:
     content. pairs: which to compare. neighbours: how many more each is compared with, those that look most alike; once
     they are found, pairs has them too. rung: "" or the name of an attempt with other features, which has its own
     database and stages: `replace(job, rung="full-size", max_image_size=...)`. masks: one per photo, or none at all for
-    a capture without masks; their pictures are in mask_folder. The rest is as in `PoseSettings`.
+    a capture without masks; their pictures are in mask_folder. held_out: photos that are placed when all else is fixed.
+    The rest is as in `PoseSettings`.
     """
 
     folder: str
@@ -63,6 +64,7 @@ class Job:
     threads: int
     masks: tuple[LaidOutMask, ...] = ()
     rung: str = ""
+    held_out: tuple[int, ...] = ()
 
     @property
     def photos(self) -> Path:
@@ -110,7 +112,7 @@ def read_job(path: Path) -> Job:
     content = json.loads(path.read_text(encoding="utf-8"))
     content["groups"] = tuple(_group(group) for group in content["groups"])
     content["pairs"] = tuple((i, j) for i, j in content["pairs"])
-    for name in ("files", "names", "keys"):
+    for name in ("files", "names", "keys", "held_out"):
         content[name] = tuple(content[name])
     content["masks"] = tuple(LaidOutMask(**mask) for mask in content["masks"])
     return Job(**content)

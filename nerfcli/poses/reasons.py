@@ -41,6 +41,8 @@ _ADVICE = {
     "matches no other photo well": "take photos with more overlap, two thirds from one to the next",
     "in another model": "take photos that join the parts of the scene",
     "contradicts the rest": "take photos with more overlap around this one, or leave it away",
+    "matches too few points": "hold out photos that overlap with the others, see --holdout",
+    "its camera took no photo": "hold out photos of cameras that took others, too, see --holdout",
     "rejected by the mapper": "take photos with more overlap and while moving sideways, or allow more features",
 }
 

@@ -41,6 +41,7 @@ class PosesReport:
     seconds: per stage, of the call that wrote the report; what an earlier one left is not in them. models: the sizes of
     all models found, the kept one first. attempts: what each rung of the ladder gave. matching: the rule for pairs, and
     their number. points: how many the kept model has. intrinsics: what was given of them, see `cameras.Grouped`.
+    strict: how held-out photos were placed afterwards, see `strict.place_held_out`.
     """
 
     registered: int
@@ -60,6 +61,7 @@ class PosesReport:
     lenses: tuple[dict[str, Any], ...]
     parts: tuple[int, ...]
     intrinsics: dict[str, Any] | None = None
+    strict: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and dictionaries."""
@@ -105,6 +107,7 @@ def make_report(
         lenses=tuple(result.get("lenses", ())),
         parts=tuple(result["parts"]),
         intrinsics=intrinsics,
+        strict=result.get("strict"),
     )
 
 

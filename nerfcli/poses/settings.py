@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from nerfcli.holdout import DEFAULT_HOLDOUT
 from nerfcli.poses.pairs import PAIRINGS
 
 # What may be asked for as `camera_model`.
@@ -33,6 +34,8 @@ class PoseSettings:
     threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
     min_registered: the share of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a text
     file with two names per line, these pairs are compared and no others. masks: a folder of masks, see `media.masks`.
+    holdout: the rule by which photos are held out, see `nerfcli.holdout`. strict: whether these are placed afterwards,
+    with all that the others gave fixed, see `strict`.
     """
 
     max_image_size: int = QUALITIES["default"][0]
@@ -44,6 +47,8 @@ class PoseSettings:
     pairing: str = "auto"
     pairs_file: str | None = None
     masks: str | None = None
+    holdout: str = DEFAULT_HOLDOUT
+    strict: bool = False
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import Any
 from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.errors import UserError
+from nerfcli.holdout import names_held_out
 from nerfcli.media.images import list_images
 from nerfcli.poses.cameras import GivenIntrinsics, Grouped, group_by_given, group_photos
 from nerfcli.poses.job import Job, write_job
@@ -28,6 +29,7 @@ from nerfcli.poses.plan import Plan, make_plan
 from nerfcli.poses.report import PosesReport, make_report, refusal
 from nerfcli.poses.settings import Limits, PoseSettings, check_settings
 from nerfcli.poses.stages import file_key
+from nerfcli.poses.strict import held_out_last
 from nerfcli.poses.supervise import run_worker
 from nerfcli.poses.workspace import is_in_the_making, publish, workspace
 
@@ -91,6 +93,8 @@ def estimate_poses(
         matching = {"rule": pairing.rule, "pairs": result["pairs"]}
         if settings.pairs_file is not None:
             matching["pairs_file_key"] = file_key(Path(settings.pairs_file))
+        if Path(settings.holdout).is_file():
+            matching["holdout_key"] = file_key(Path(settings.holdout))
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
         if error := refusal(report, photos_dir):
             raise _refused(error, report, scene_dir)
@@ -99,8 +103,15 @@ def estimate_poses(
             write_json(scene_dir / "poses_report.json", report.to_json())
             provenance = {"command": "poses", "settings": asdict(settings), "versions": report.versions}
             provenance |= {} if given is None else {"intrinsics": given.to_json()}
-            masks = Path(settings.masks) if settings.masks else None
-            scene.save(scene_dir, image_folder=photos_dir, provenance=provenance, unit="arbitrary", masks=masks)
+            provenance |= {"registered": report.registered, "total": report.total}
+            scene.save(
+                scene_dir,
+                image_folder=photos_dir,
+                provenance=provenance,
+                unit="arbitrary",
+                masks=Path(settings.masks) if settings.masks else None,
+                split=_split(report, settings.holdout),
+            )
 
         publish(scene_dir, describe)
     if len(report.parts) > 1:
@@ -124,6 +135,7 @@ def plan_poses(
     """
     check_settings(settings)
     photos = find_photos(photos_dir, lambda done, total: progress("read", done, total))
+    names_held_out(settings.holdout, photos.names, others=photos.unreadable)  # before the work rather than after it
     grouped = group_photos(photos, model=settings.camera_model) if given is None else group_by_given(photos, given)
     if settings.pairs_file is None:
         pairing = choose_pairs(photos.photos, rule=settings.pairing)
@@ -148,6 +160,7 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
     made = scene_dir.resolve() / _read_json(scene_dir / scene.SCENE_FILE)["image_folder"]
     names = [path.name for path in list_images(photos_dir)]
     pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
+    holdout_key = file_key(Path(settings.holdout)) if Path(settings.holdout).is_file() else None
     known = report.get("intrinsics")
     if (known and (known["use"], known["key"])) != (given and (given.use, given.calibration.key)):
         return False
@@ -157,6 +170,7 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
         made.resolve() == photos_dir.resolve()
         and sorted(image["name"] for image in report["images"]) == sorted(names)
         and report["matching"].get("pairs_file_key") == pairs_key
+        and report["matching"].get("holdout_key") == holdout_key
         and all(made_with[key] == value for key, value in wanted.items())
     )
 
@@ -174,7 +188,8 @@ def _prepare(
     laid_out = lay_out(photos, work)
     files = tuple(photo.file for photo in laid_out)
     masks = Path(settings.masks) if settings.masks else None
-    return Job(
+    held_out = names_held_out(settings.holdout, photos.names, others=photos.unreadable) if settings.strict else ()
+    job = Job(
         folder=str(work.absolute()),
         files=files,
         originals=str(photos.folder.absolute()),
@@ -188,7 +203,19 @@ def _prepare(
         seed=settings.seed,
         threads=settings.threads,
         masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),
+        held_out=tuple(sorted(photos.names.index(name) for name in held_out)),
     )
+    return held_out_last(job)
+
+
+def _split(report: PosesReport, holdout: str) -> dict[str, str | None]:
+    """Which of the placed photos are for training and which for testing."""
+    placed = [image.name for image in report.images if image.registered]
+    if report.strict is not None:
+        test = frozenset(report.strict["placed"])
+        return {name: "test" if name in test else "train" for name in placed}
+    test = names_held_out(holdout, placed, others=[image.name for image in report.images])
+    return {name: "test" if name in test else "train" for name in placed}
 
 
 def _check_destination(scene_dir: Path, photos_dir: Path) -> None:

@@ -32,6 +32,7 @@ from nerfcli.poses.ladder import climb
 from nerfcli.poses.mapping import describe_cameras, photo_numbers, write_model
 from nerfcli.poses.retrieval import with_neighbours
 from nerfcli.poses.stages import read_stage, stage_key, write_stage
+from nerfcli.poses.strict import place_held_out, training_part
 
 # The last stage's file: what the report needs. The model stands beside it, in sparse/0.
 RESULT = "result.json"
@@ -49,19 +50,42 @@ def main(job_path: str) -> None:
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
     """Extraction, matching, mapping; each goes on from what is there."""
-    seconds: dict[str, float] = {}
     discard_if_damaged(job.database)
+    if job.held_out:
+        _solve_strictly(job, report, tell)
+        return
+    seconds: dict[str, float] = {}
+    job = _matched(job, report, seconds=seconds)
+    result, key = Path(job.folder) / RESULT, mapping_key(job)
+    if read_stage(result, key) is None:
+        result.unlink(missing_ok=True)
+        write_stage(result, key, _map(job, report, tell, seconds=seconds))
+    name_images(job)
+
+
+def _solve_strictly(job: Job, report: Report, tell: Tell) -> None:
+    """All that with the training photos alone; the held-out ones are placed in what comes of it."""
+    result, key = Path(job.folder) / RESULT, mapping_key(job)
+    if read_stage(result, key) is None:
+        result.unlink(missing_ok=True)
+        seconds: dict[str, float] = {}
+        training = _matched(training_part(job), report, seconds=seconds)
+        found = _map(training, report, tell, seconds=seconds)
+        with _timed(seconds, "place"):
+            found = place_held_out(job, training, found, report)
+        write_stage(result, key, found)
+    name_images(job)
+
+
+def _matched(job: Job, report: Report, *, seconds: dict[str, float]) -> Job:
+    """Features and matches; the job with its pairs complete."""
     with _timed(seconds, "extract"):
         extract(job, report)
     with _timed(seconds, "match"):
         job = with_neighbours(job, report)
         start_matching(job, job.pairs)
         match(job, job.pairs, report)
-    result, key = Path(job.folder) / RESULT, mapping_key(job)
-    if read_stage(result, key) is None:
-        result.unlink(missing_ok=True)
-        write_stage(result, key, _map(job, report, tell, seconds=seconds))
-    name_images(job)
+    return job
 
 
 def mapping_key(job: Job) -> str:

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.scene import Scene, fingerprint
+from nerfcli.train.components import Components
 from nerfcli.train.settings import TrainSettings
 
 CONFIG = "config.json"
@@ -36,7 +37,9 @@ def describe_run(scene: Scene, settings: TrainSettings, factor: int) -> dict[str
         "unit": scene.unit,
         "unit_source": scene.unit_source,
         "scene_fingerprint": fingerprint(scene),
-        "split_sha256": hashlib.sha256("\n".join(sorted(scene.test_names)).encode()).hexdigest(),
+        "split_sha256": split_hash(scene.test_names),
+        "holdout": scene.holdout,
+        "history": dict(scene.history),
         "missing_photos": list(scene.missing),
         "settings": {**settings.to_json(), "downscale": factor},
         "versions": {
@@ -45,6 +48,30 @@ def describe_run(scene: Scene, settings: TrainSettings, factor: int) -> dict[str
             **{name: version(name) for name in ("torch", "numpy")},
         },
     }
+
+
+def settings_of(config: dict[str, Any]) -> TrainSettings:
+    """The settings that a run was trained with, from its config.json; an automatic downscale is what it became."""
+    settings = config["settings"]
+    return TrainSettings(**{**settings, "components": Components(**settings.get("components", {}))})
+
+
+def split_hash(test_names: Iterable[str]) -> str:
+    """SHA-256 over the names of the held-out photos, in order: the same split has the same hash."""
+    return hashlib.sha256("\n".join(sorted(test_names)).encode()).hexdigest()
+
+
+def check_split(run: Path, config: dict[str, Any], test: Sequence[Frame]) -> None:
+    """Refuse cameras whose held-out photos are not those that were held out of the training.
+
+    Raises:
+        UserError: they are others.
+    """
+    if config.get("split_sha256") != split_hash(frame.name for frame in test):
+        raise UserError(
+            f"the held-out photos in {run / CAMERAS} are not those that {CONFIG} was written for (split_sha256)",
+            "numbers on photos that may have been trained on mean nothing: train again with --overwrite",
+        )
 
 
 def write_cameras(run: Path, train: Sequence[Frame], test: Sequence[Frame]) -> None:

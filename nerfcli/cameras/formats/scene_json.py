@@ -33,6 +33,7 @@ class Description:
         listed: names of frames by what they are for: "test", "val", or "unused" of those that the split leaves out.
         masks: the folder of the masks, or the mask of each photo that has one.
         depth_bounds: nearest and farthest z by the name of the frame, in scene units; empty where they are not known.
+        provenance: what made the scene: command, settings, versions; empty where nobody wrote it down.
     """
 
     path: Path
@@ -43,6 +44,7 @@ class Description:
     listed: Mapping[str, frozenset[str]]
     masks: Path | Mapping[str, Path] | None
     depth_bounds: Mapping[str, tuple[float, float]]
+    provenance: Mapping[str, Any]
 
     def described(self, frames: Sequence[Frame], find_mask: FindMask) -> tuple[Frame, ...]:
         """The frames of the model with their masks and their part of the split; None for unused ones.
@@ -95,6 +97,7 @@ def read_description(root: Path) -> Description:
     if unit not in UNITS:
         raise UserError(f"{path}: unit is {unit!r}", f"expected {' or '.join(UNITS)}")
     source, masks = content.get("unit_source"), content.get("masks")
+    provenance = content.get("provenance")
     if isinstance(masks, dict):
         masks = {name: place(_text(masks, name, path)) for name in masks}
     elif masks is not None:
@@ -108,6 +111,7 @@ def read_description(root: Path) -> Description:
         listed=_listed_names(content, path),
         masks=masks,
         depth_bounds=_listed_bounds(content, path),
+        provenance=provenance if isinstance(provenance, dict) else {},
     )
 
 
