@@ -30,6 +30,7 @@ from nerfcli.cli import poses as poses_command
 from nerfcli.cli.options import seconds_from_text, thread_count
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TOO_FEW_PHOTOS
 from nerfcli.media.float_tiff import read_tiff
+from nerfcli.media.images import read_image
 from nerfcli.render.model import save_model
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
@@ -361,7 +362,9 @@ def test_train_evaluate_render_info_in_a_row(capture):
     assert evaluated.exit_code == 0
     metrics = json.loads(evaluated.stdout)
     assert metrics["path"] == str(run / "metrics.json")
-    assert set(metrics["mean"]) == {"psnr", "ssim"}
+    assert set(metrics["mean"]) >= {"psnr", "ssim", "lpips", "psnr_float", "ssim_float", "psnr_colour_aligned"}
+    assert metrics["images"][0]["view"]["kind"] in ("interpolation", "extrapolation")
+    assert {entry["stage"] for entry in metrics["ledger"]} >= {"poses", "intrinsics", "points", "normalisation"}
     assert [image["name"] for image in metrics["images"]] == ["test/r_000.png"]
     assert metrics["training"]["steps"] == 1
     assert json.loads((run / "metrics.json").read_text()) == {k: v for k, v in metrics.items() if k != "path"}
@@ -525,6 +528,74 @@ def test_metrics_are_kept_for_the_same_checkpoint_and_refused_for_another(finish
     assert result.exit_code == BAD_INPUT
     assert "earlier state" in error_of(result)[0]
     assert nerfcli("evaluate", finished, "--overwrite").exit_code == 0
+
+
+def test_requirements_decide_on_the_exit_code(finished):
+    assert nerfcli("evaluate", finished, "--require", "psnr>=1,training_seconds<1e6").exit_code == 0
+    result = nerfcli("evaluate", finished, "--require", "psnr>=99,ssim>=-1,registered>=0.5")
+    assert (result.exit_code, result.stdout) == (GATE_NOT_MET, f"{finished / 'metrics.json'}\n")
+    error, hint = error_of(result)
+    assert "does not meet --require psnr>=99 (psnr is " in error
+    assert "registered>=0.5 (registered is not known)" in error
+    assert "ssim" not in error
+    assert "--budget" in hint
+    for wrong in ("psnr", "beauty>=1"):
+        assert nerfcli("evaluate", finished, "--require", wrong).exit_code == 2
+        assert nerfcli("run", finished, "--require", wrong).exit_code == 2
+
+
+def test_predictions_are_what_was_measured(finished):
+    assert nerfcli("evaluate", finished).exit_code == 0
+    result = nerfcli("evaluate", finished, "--save-predictions", "png")
+    assert result.exit_code == BAD_INPUT
+    assert "made without saved predictions" in error_of(result)[0]
+    result = nerfcli("evaluate", finished, "--save-predictions", "float", "--overwrite")
+    metrics = json.loads((finished / "metrics.json").read_text())
+    folder = finished / "predictions"
+    (picture,), (photo,) = (list((folder / name).rglob("*.png")) for name in ("color", "gt-color"))
+    error = np.square(read_image(picture) / 255.0 - read_image(photo) / 255.0).mean()
+    assert -10 * np.log10(error) == pytest.approx(metrics["mean"]["psnr"], abs=1e-9)
+    (unrounded,) = (np.load(path) for path in (folder / "color-float").rglob("*.npy"))
+    error = np.square(unrounded.astype(np.float64) - read_image(photo) / 255.0).mean()
+    assert -10 * np.log10(error) == pytest.approx(metrics["mean"]["psnr_float"], abs=1e-9)
+    assert nerfcli("evaluate", finished, "--save-predictions", "png").exit_code == 0
+
+
+def test_other_seeds_are_trained_and_their_spread_is_told(finished):
+    result = nerfcli("evaluate", finished, "--seeds", "2", "--json")
+    assert result.exit_code == 0, result.stderr
+    first, second, last = map(json.loads, result.stdout.splitlines())
+    assert [first["path"], second["path"]] == [
+        str(finished / "metrics.json"),
+        str(finished / "seeds" / "1" / "metrics.json"),
+    ]
+    both = [first["mean"]["psnr"], second["mean"]["psnr"]]
+    assert both[0] != both[1]
+    assert last["spread"]["psnr"]["mean"] == pytest.approx(sum(both) / 2)
+    before = listing(finished)
+    again = nerfcli("evaluate", finished, finished / "seeds" / "1", "--json")
+    assert json.loads(again.stdout.splitlines()[-1])["spread"]["psnr"] == last["spread"]["psnr"]
+    assert listing(finished) == before
+    assert nerfcli("evaluate", finished, finished, "--seeds", "2").exit_code == 2
+
+
+def test_photos_are_held_out_by_the_rule_that_is_given(capture):
+    run = capture.with_name("gap-run")
+    given = ("train", capture, *QUICK, "--holdout", "block:0.25", "-o", run)
+    assert nerfcli(*given).exit_code == 0
+    config = json.loads((run / "config.json").read_text())
+    cameras = json.loads((run / "cameras.json").read_text())
+    assert config["holdout"] == "block:0.25"
+    assert "is kept" in nerfcli(*given).stderr
+    result = nerfcli("train", capture, *QUICK, "--resume", "-o", run)
+    assert result.exit_code == BAD_INPUT
+    assert error_of(result)[1].endswith("give --holdout block:0.25")
+    assert nerfcli("train", capture, *QUICK, "--holdout", "most", "-o", run).exit_code == 2
+    # Cameras whose split is not the one of the training are refused.
+    write_json(run / "cameras.json", {"train": cameras["test"], "test": cameras["train"]})
+    result = nerfcli("evaluate", run)
+    assert result.exit_code == BAD_INPUT
+    assert "split_sha256" in error_of(result)[0]
 
 
 def test_a_folder_with_other_files_is_never_replaced_by_renders(finished, tmp_path):

@@ -9,12 +9,13 @@ import pytest
 import torch
 from fog import fog, foggy_cells
 from skimage.metrics import structural_similarity
+from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
+from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
 
 EVERYTHING = np.ones((24, 32), dtype=bool)
@@ -55,15 +56,43 @@ def test_ssim_of_identical_pictures_is_1():
     assert ssim(noise(0), noise(0), used=EVERYTHING) == 1
 
 
-def test_ssim_is_scikit_images_with_the_papers_window():
+def test_ssim_is_scikit_images_mean_with_the_papers_window():
     picture, photo = noise(0), (noise(0) // 2 + noise(1) // 2).astype(np.uint8)
     mean: Any = structural_similarity(
         picture, photo, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
     )
-    # scikit-image's own mean leaves out a border of 5 pixels, where the window hangs over; the map is the same.
-    inside = np.zeros_like(EVERYTHING)
-    inside[5:-5, 5:-5] = True
-    assert ssim(picture, photo, used=inside) == pytest.approx(float(mean), abs=1e-12)
+    assert ssim(picture, photo, used=EVERYTHING) == pytest.approx(float(mean), abs=1e-12)
+
+
+def test_psnr_and_ssim_are_those_of_torchmetrics():
+    rng = np.random.default_rng(0)
+    photo = rng.uniform(0.2, 0.8, (40, 30, 3))
+    picture = (photo + rng.normal(0, 0.05, photo.shape)).clip(0, 1)
+    one, other = (torch.from_numpy(p).permute(2, 0, 1)[None] for p in (picture, photo))
+    used = np.ones((40, 30), dtype=bool)
+    # Its own mean takes in windows that hang over the border.
+    full: Any = structural_similarity_index_measure(one, other, data_range=1.0, return_full_image=True)[1]
+    assert ssim(picture, photo, used=used) == pytest.approx(float(full[0, :, 5:-5, 5:-5].mean()), abs=1e-12)
+    assert psnr(picture, photo, used=used) == pytest.approx(float(peak_signal_noise_ratio(one, other, data_range=1.0)))
+
+
+def test_ssim_leaves_out_every_window_that_holds_a_masked_pixel():
+    # What is behind the mask changes nothing, and a picture cut along the mask has the same windows.
+    picture, photo = noise(0, (30, 40, 3)), noise(1, (30, 40, 3))
+    used = np.ones((30, 40), dtype=bool)
+    used[:, 25:] = False
+    other = photo.copy()
+    other[:, 25:] = 0
+    expected = ssim(picture[:, :25], photo[:, :25], used=used[:, :25])
+    assert ssim(picture, photo, used=used) == pytest.approx(expected, abs=1e-12)
+    assert ssim(picture, other, used=used) == pytest.approx(expected, abs=1e-12)
+    assert whole_windows(used).sum() == (30 - 10) * (25 - 10)
+
+
+def test_ssim_without_a_whole_window_is_not_known():
+    used = np.ones((24, 32), dtype=bool)
+    used[::8, ::8] = False
+    assert ssim(noise(0), noise(1), used=used) is None
 
 
 def test_ssim_of_two_flat_pictures_in_closed_form():
@@ -77,7 +106,9 @@ def test_ssim_of_two_flat_pictures_in_closed_form():
 def test_ssim_of_pictures_smaller_than_its_window(shape):
     used = np.ones(shape[:2], dtype=bool)
     assert ssim(noise(0, shape), noise(0, shape), used=used) == 1
-    assert -1 <= ssim(noise(0, shape), noise(1, shape), used=used) < 1
+    other = ssim(noise(0, shape), noise(1, shape), used=used)
+    assert other is not None
+    assert -1 <= other < 1
 
 
 def test_8_bit_rounds_to_the_nearest_level_and_clips():
@@ -123,9 +154,10 @@ def test_evaluation_of_fog_in_closed_form():
     seen = 0.5 * (1 - math.exp(-2)) + math.exp(-2)
     narrow = Frame("a", Camera.pinhole(3, 3, 3000.0), frame("a").world_from_cam)
     photo = HeldOut(narrow, np.zeros((3, 3, 4), dtype=np.uint8), None)  # white
-    error = 1 - round(255 * seen) / 255
+    error, unrounded = 1 - round(255 * seen) / 255, 1 - seen
     metrics = evaluate_model(model, [photo], on_image=lambda done, total: None)
     assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(error))
+    assert metrics["images"][0]["psnr_float"] == pytest.approx(-20 * math.log10(unrounded), abs=1e-3)
 
 
 def test_masked_pixels_do_not_count():
@@ -135,7 +167,9 @@ def test_masked_pixels_do_not_count():
     pixels[4, 5] = 51
     metrics = evaluate_model(model, [HeldOut(frame("a"), pixels, used)], on_image=lambda done, total: None)
     assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(0.2))
-    assert metrics["images"][0]["pixels"] == 1
+    assert (metrics["images"][0]["pixels"], metrics["images"][0]["masked_pixels"]) == (1, 12 * 16 - 1)
+    assert metrics["images"][0]["ssim_windows"] == 0
+    assert metrics["mean"]["ssim"] is None
 
 
 def test_a_mask_that_hides_a_whole_photo_is_told():
@@ -149,7 +183,7 @@ def test_protocol_says_what_was_measured():
     photos = [HeldOut(frame(name), np.zeros((12, 16, 4), dtype=np.uint8), None) for name in ("x.png", "y.png")]
     protocol = evaluate_model(model, photos, on_image=lambda done, total: None)["protocol"]
     names = hashlib.sha256(b"x.png\ny.png").hexdigest()[:12]
-    assert protocol.startswith(f"nerfcli-1: 2 held-out photos (names sha256 {names}) at 16x12, area-averaged")
+    assert protocol.startswith(f"nerfcli-2: 2 held-out photos (names sha256 {names}) at 16x12, area-averaged")
     assert "RGBA on white" in protocol
     small = HeldOut(frame("x.png", 8, 6), np.zeros((6, 8, 3), dtype=np.uint8), None)
     protocol = evaluate_model(model, [small], on_image=lambda done, total: None)["protocol"]

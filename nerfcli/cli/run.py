@@ -11,14 +11,18 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Device,
     Downscale,
+    Holdout,
     Json,
     Output,
     Overwrite,
     Quiet,
+    Require,
     Seed,
+    Strict,
     Threads,
     device_name,
     downscale_factor,
+    holdout_rule,
     seconds_from_text,
     thread_count,
 )
@@ -37,6 +41,9 @@ def run(
     max_size: Annotated[
         int | None, typer.Option(help="Longer side of the video at most, pixels.  [default: as trained]", min=8)
     ] = None,
+    holdout: Holdout = None,
+    strict: Strict = False,
+    require: Require = None,
     device: Device = "auto",
     seed: Seed = 0,
     threads: Threads = 0,
@@ -54,22 +61,32 @@ def run(
       nerfcli run photos/kitchen
       nerfcli run photos/kitchen -o kitchen --budget 5m
       nerfcli run kitchen.mp4
+      nerfcli run photos/kitchen --require "psnr>=25,registered>=0.9"
     """
-    from nerfcli.cli.evaluate import evaluate_run
+    from nerfcli.cli.evaluate import evaluate_run, hold_against, requirements_of
     from nerfcli.cli.poses import estimate_scene
     from nerfcli.cli.render import folder_name, render_run
     from nerfcli.cli.train import train_scene, was_interrupted
     from nerfcli.cli.views import Views
     from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
+    from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.poses.memory import default_memory_limit
     from nerfcli.poses.settings import Limits, PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.train.settings import TrainSettings
 
     console = Console(quiet=quiet, json_lines=json)
+    requirements, rule = requirements_of(require), holdout_rule(holdout)
     cores, torch_device = thread_count(threads), device_name(device)
     max_image_size, max_features = sizes_of(quality)
-    pose_settings = PoseSettings(max_image_size=max_image_size, max_features=max_features, seed=seed, threads=cores)
+    pose_settings = PoseSettings(
+        max_image_size=max_image_size,
+        max_features=max_features,
+        seed=seed,
+        threads=cores,
+        holdout=rule or DEFAULT_HOLDOUT,
+        strict=strict,
+    )
     train_settings = TrainSettings(
         budget_seconds=seconds_from_text(budget),
         downscale=downscale_factor(downscale),
@@ -110,5 +127,6 @@ def run(
             )
             for path in written:
                 console.result(path)
+        hold_against(field, numbers, requirements)
 
     for_each_input(photos, work)

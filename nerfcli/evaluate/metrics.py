@@ -1,9 +1,20 @@
-"""How close a rendered picture is to a photo."""
+"""How close a rendered picture is to a photo: in dB, in structure, and to the eye of a network.
+
+Colours are sRGB in [0, 1], as float or rounded to 8 bits. Pixels that do not count (masked, or without a ray) are
+left out entirely: of PSNR pixel by pixel, of SSIM with every window that holds one.
+"""
 
 import math
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 from skimage.metrics import structural_similarity
+
+# Of Wang et al.: the Gaussian's standard deviation, and the width at which scikit-image cuts it off (3.5 sigma).
+SIGMA = 1.5
+WINDOW = 11
+# Identical pictures: the error of less than a thousandth of a grey level, where the logarithm has no end.
+MOST_PSNR = 100.0
 
 
 def to_8_bit(picture: np.ndarray) -> np.ndarray:
@@ -11,43 +22,70 @@ def to_8_bit(picture: np.ndarray) -> np.ndarray:
     return np.round(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def psnr(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB: -10 log10 of the mean squared error of values in [0, 1].
+def as_float(picture: np.ndarray) -> np.ndarray:
+    """Colours in [0, 1] as float64: 8-bit levels divided by 255, floats clipped."""
+    if picture.dtype == np.uint8:
+        return picture / 255.0
+    return np.clip(picture, 0.0, 1.0).astype(np.float64)
+
+
+def mean_squared_error(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
+    """Mean over the pixels that count and their channels of the squared difference of colours in [0, 1].
 
     Args:
-        picture, photo: (H, W, 3) uint8.
+        picture, photo: (H, W, 3) uint8, or float in [0, 1].
         used: (H, W) bool, the pixels that count; at least one.
-
-    Returns:
-        dB; identical pictures give 100.
     """
-    difference = (picture[used].astype(np.float64) - photo[used]) / 255.0
-    return -10.0 * math.log10(max(float(np.square(difference).mean()), 1e-10))
+    return float(np.square(as_float(picture[used]) - as_float(photo[used])).mean())
 
 
-def ssim(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
-    """Structural similarity, mean over the pixels that count, in [-1, 1].
+def psnr_of(error: float) -> float:
+    """Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]: -10 log10, at most 100."""
+    return -10.0 * math.log10(max(error, 10.0 ** (-MOST_PSNR / 10)))
 
-    Gaussian window of sigma 1.5 (11 x 11), K1 0.01, K2 0.03, population covariance, per channel, as in the paper;
-    pictures narrower than the window get the largest odd window that fits.
+
+def psnr(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB; see `mean_squared_error` and `psnr_of`."""
+    return psnr_of(mean_squared_error(picture, photo, used=used))
+
+
+def whole_windows(used: np.ndarray) -> np.ndarray:
+    """(H, W) bool: the centres of the windows of `ssim` that lie in the picture and hold only pixels that count."""
+    return minimum_filter(used, size=_window(used.shape), mode="constant", cval=False)
+
+
+def ssim(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float | None:
+    """Structural similarity, mean over `whole_windows`, in [-1, 1]; None where there is none.
+
+    Gaussian window of sigma 1.5 (11 x 11), K1 0.01, K2 0.03, data range 1, population covariance, per channel. Without
+    a mask this is the mean that scikit-image and dm_pix give (so nerfbaselines); torchmetrics (so nerfstudio) has the
+    same map inside, but its mean takes in a border of windows that hang over. Pictures narrower than the
+    window get the largest odd window that fits, with equal weights.
 
     Args:
-        picture, photo: (H, W, 3) uint8.
+        picture, photo: (H, W, 3) uint8, or float in [0, 1].
         used: (H, W) bool.
 
     Source: Wang et al. 2004, Image quality assessment, IEEE TIP 13(4); computed by scikit-image.
     """
-    smallest = min(picture.shape[:2])
-    window = {"win_size": smallest - 1 + smallest % 2} if smallest < 11 else {}
+    whole = whole_windows(used)
+    if not whole.any():
+        return None
+    width = _window(used.shape)
     similarity = structural_similarity(
-        picture.astype(np.float64) / 255.0,
-        photo.astype(np.float64) / 255.0,
+        as_float(picture),
+        as_float(photo),
         data_range=1.0,
         channel_axis=-1,
-        gaussian_weights=not window,
-        sigma=1.5,
+        gaussian_weights=width == WINDOW,
+        sigma=SIGMA,
+        win_size=width,
         use_sample_covariance=False,
         full=True,
-        **window,
     )[1]
-    return float(np.asarray(similarity)[used].mean())
+    return float(np.asarray(similarity)[whole].mean())
+
+
+def _window(shape: tuple[int, ...]) -> int:
+    smallest = min(shape[:2])
+    return WINDOW if smallest >= WINDOW else smallest - 1 + smallest % 2

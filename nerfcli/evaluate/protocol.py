@@ -3,7 +3,7 @@
 import hashlib
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +12,19 @@ import torch
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
+from nerfcli.evaluate.alignment import align_pose, halves
+from nerfcli.evaluate.colour import colour_aligned
+from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
+from nerfcli.evaluate.novelty import novelty
+from nerfcli.evaluate.perceptual import NAME as LPIPS_NAME
+from nerfcli.evaluate.perceptual import SMALLEST, Perceptual
+from nerfcli.field.background import Background
 from nerfcli.field.exposure import exposed
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import render_picture
+from nerfcli.render.pictures import Picture, render_picture
 
 METRICS = "metrics.json"
+PROTOCOL = "nerfcli-2"
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -38,18 +45,54 @@ class HeldOut:
     log_gain: float = 0.0
 
 
+@dataclass(frozen=True)
+class Compared:
+    """What was compared: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and which pixels count (H, W)."""
+
+    frame: Frame
+    rendered: np.ndarray
+    photo: np.ndarray
+    used: np.ndarray
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What is measured besides.
+
+    Args:
+        training: the training views, to tell how new the held-out ones are.
+        perceptual: LPIPS, where it can be had.
+        align_poses: whether each held-out pose is refined, too; it costs a render and about 60 times 2048 pixels.
+        keep: takes what was compared, photo by photo.
+    """
+
+    training: Sequence[Frame] = ()
+    perceptual: Perceptual | None = None
+    align_poses: bool = False
+    keep: Callable[[Compared], None] = lambda compared: None
+
+
 def evaluate_model(
-    model: Model, held_out: Sequence[HeldOut], *, on_image: Callable[[int, int], None]
+    model: Model,
+    held_out: Sequence[HeldOut],
+    *,
+    on_image: Callable[[int, int], None],
+    extras: Extras = Extras(),
 ) -> dict[str, Any]:
-    """PSNR and SSIM of every held-out photo and their means, with the render time beside them.
+    """How close the model comes to every held-out photo, the means, and the render time beside them.
+
+    Per photo: psnr, ssim and lpips of the 8-bit picture; psnr_float and ssim_float of the picture before rounding;
+    *_colour_aligned after `colour.colour_aligned`; with `align_poses`, *_pose_aligned and *_right_half: the right half
+    of the photo, from the pose that the left half asks for and from its own. None is what is not known.
 
     Args:
         model: the trained model.
         held_out: the photos, at least one.
         on_image: called with (rays done, rays in all).
+        extras: what is measured besides.
 
     Returns:
-        The keys "protocol", "mean", "images" and "render" of metrics.json.
+        The keys "protocol", "mean", "images", "kinds" and "render" of metrics.json.
 
     Raises:
         UserError: nothing was held out, or a mask hides a whole photo.
@@ -59,7 +102,8 @@ def evaluate_model(
             "this run has no held-out photo to evaluate on",
             "the default split holds out every 8th photo; check `nerfcli info RUN` and the scene's split",
         )
-    total = sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in held_out)
+    renders = 2 if extras.align_poses else 1
+    total = renders * sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in held_out)
     done = 0
 
     def on_tile(rays: int) -> None:
@@ -67,31 +111,30 @@ def evaluate_model(
         done += rays
         on_image(done, total)
 
+    views = novelty([photo.frame for photo in held_out], extras.training) if extras.training else None
     images, seconds = [], []
-    for photo in held_out:
-        began = time.perf_counter()
+    for index, photo in enumerate(held_out):
         background = WHITE if photo.pixels.shape[-1] == 4 else model.background
+        began = time.perf_counter()
         picture = render_picture(model, photo.frame, background=background, on_tile=on_tile)
         seconds.append(time.perf_counter() - began)
-        used = picture.valid if photo.used is None else picture.valid & photo.used
-        if not used.any():
-            raise UserError(
-                f"no pixel of {photo.frame.name} is left to compare", "check that its mask is white where pixels count"
-            )
-        rendered, truth = to_8_bit(_as_exposed(picture.rgb, photo.log_gain)), over_white(photo.pixels)
-        images.append(
-            {
-                "name": photo.frame.name,
-                "psnr": psnr(rendered, truth, used=used),
-                "ssim": ssim(rendered, truth, used=used),
-                "pixels": int(used.sum()),
-                "seconds": seconds[-1],
-            }
-        )
+        compared = _compared(photo, picture)
+        extras.keep(compared)
+        entry = {
+            "name": photo.frame.name,
+            **_measured(compared, extras.perceptual),
+            **_counted(photo, picture, compared),
+        }
+        if extras.align_poses:
+            entry |= _pose_aligned(model, compared, photo.log_gain, background=background, on_tile=on_tile)
+        if views is not None:
+            entry["view"] = views[index].to_json()
+        images.append(entry | {"seconds": seconds[-1]})
     return {
-        "protocol": _protocol_name(held_out),
-        "mean": {key: statistics.fmean(image[key] for image in images) for key in ("psnr", "ssim")},
+        "protocol": _protocol_name(held_out, extras),
+        "mean": mean_of(images),
         "images": images,
+        "kinds": _kinds(images),
         "render": {
             "seconds_per_image": statistics.median(seconds),
             "fastest_seconds": min(seconds),
@@ -100,11 +143,13 @@ def evaluate_model(
     }
 
 
-def _as_exposed(rgb: np.ndarray, log_gain: float) -> np.ndarray:
-    """A picture as a photo of another exposure shows it, clipped."""
-    if log_gain == 0.0:
-        return rgb
-    return exposed(torch.from_numpy(rgb), torch.tensor(log_gain)).clamp(0.0, 1.0).numpy()
+def mean_of(images: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+    """Mean over images of each measure; None where one of them does not have it."""
+    means: dict[str, float | None] = {}
+    for key in (key for key in images[0] if key.split("_")[0] in ("psnr", "ssim", "lpips")):
+        values = [image[key] for image in images if image[key] is not None]
+        means[key] = statistics.fmean(values) if len(values) == len(images) else None
+    return means
 
 
 def over_white(pixels: np.ndarray) -> np.ndarray:
@@ -115,12 +160,94 @@ def over_white(pixels: np.ndarray) -> np.ndarray:
     return to_8_bit(pixels[..., :3] / 255.0 * alpha + 1.0 - alpha)
 
 
-def _protocol_name(held_out: Sequence[HeldOut]) -> str:
+def _compared(photo: HeldOut, picture: Picture) -> Compared:
+    used = picture.valid if photo.used is None else picture.valid & photo.used
+    if not used.any():
+        raise UserError(
+            f"no pixel of {photo.frame.name} is left to compare", "check that its mask is white where pixels count"
+        )
+    return Compared(photo.frame, _as_exposed(picture.rgb, photo.log_gain), over_white(photo.pixels), used)
+
+
+def _as_exposed(rgb: np.ndarray, log_gain: float) -> np.ndarray:
+    """A picture as a photo of another exposure shows it, clipped."""
+    if log_gain == 0.0:
+        return rgb
+    return exposed(torch.from_numpy(rgb), torch.tensor(log_gain)).clamp(0.0, 1.0).numpy()
+
+
+def _measured(compared: Compared, perceptual: Perceptual | None) -> dict[str, float | None]:
+    truth, used = compared.photo, compared.used
+    rounded = to_8_bit(compared.rendered)
+    corrected = to_8_bit(colour_aligned(as_float(compared.rendered), as_float(truth), used=used))
+    return {
+        **_close(rounded, truth, used=used, suffix=""),
+        "lpips": _lpips(rounded, truth, used=used, perceptual=perceptual),
+        **_close(compared.rendered, truth, used=used, suffix="_float"),
+        **_close(corrected, truth, used=used, suffix="_colour_aligned"),
+        "lpips_colour_aligned": _lpips(corrected, truth, used=used, perceptual=perceptual),
+    }
+
+
+def _close(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, suffix: str) -> dict[str, float | None]:
+    return {
+        f"psnr{suffix}": psnr(picture, truth, used=used),
+        f"ssim{suffix}": ssim(picture, truth, used=used),
+    }
+
+
+def _lpips(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, perceptual: Perceptual | None) -> float | None:
+    if perceptual is None or min(used.shape) < SMALLEST:
+        return None
+    # A network sees whole pictures: where pixels do not count, both are given the photo's.
+    return perceptual(as_float(np.where(used[..., None], picture, truth)), as_float(truth))
+
+
+def _counted(photo: HeldOut, picture: Picture, compared: Compared) -> dict[str, int]:
+    return {
+        "pixels": int(compared.used.sum()),
+        "masked_pixels": 0 if photo.used is None else int((~photo.used).sum()),
+        "pixels_without_ray": int((~picture.valid).sum()),
+        "ssim_windows": int(whole_windows(compared.used).sum()),
+    }
+
+
+def _pose_aligned(
+    model: Model, compared: Compared, log_gain: float, *, background: Background, on_tile: Callable[[int], None]
+) -> dict[str, Any]:
+    left, right = halves(compared.used)
+    truth = compared.photo
+    found = align_pose(model, compared.frame, as_float(truth), used=left, background=background, log_gain=log_gain)
+    if found is None or not right.any():
+        nothing = ("psnr_right_half", "ssim_right_half", "psnr_pose_aligned", "ssim_pose_aligned", "pose_alignment")
+        return dict.fromkeys(nothing)
+    again = render_picture(model, found.frame, background=background, on_tile=on_tile)
+    return {
+        **_close(to_8_bit(compared.rendered), truth, used=right, suffix="_right_half"),
+        **_close(to_8_bit(_as_exposed(again.rgb, log_gain)), truth, used=right, suffix="_pose_aligned"),
+        "pose_alignment": found.to_json(),
+    }
+
+
+def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The means of the views between training views and of those beyond them."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for image in images:
+        if "view" in image:
+            groups.setdefault(image["view"]["kind"], []).append(image)
+    return {kind: {"images": len(group), **mean_of(group)} for kind, group in sorted(groups.items())}
+
+
+def _protocol_name(held_out: Sequence[HeldOut], extras: Extras) -> str:
     sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in held_out})
     names = hashlib.sha256("\n".join(photo.frame.name for photo in held_out).encode()).hexdigest()[:12]
     known = ", exposures by EXIF" if any(photo.log_gain for photo in held_out) else ""
     alpha = ", RGBA on white" if any(photo.pixels.shape[-1] == 4 for photo in held_out) else ""
+    lpips = f"{LPIPS_NAME} (torchmetrics)" if extras.perceptual is not None else "no LPIPS"
+    pose = ", pose_aligned: refined on the left half, measured on the right" if extras.align_poses else ""
     return (
-        f"nerfcli-1: {len(held_out)} held-out photos (names sha256 {names}) at {' '.join(sizes)}, area-averaged, "
-        f"sRGB 8 bit{alpha}{known}, mean of per-image PSNR, SSIM with Gaussian window 1.5 (scikit-image)"
+        f"{PROTOCOL}: {len(held_out)} held-out photos (names sha256 {names}) at {' '.join(sizes)}, area-averaged, "
+        f"sRGB 8 bit{alpha}{known}, mean of per-image values; PSNR; SSIM with Gaussian window 1.5, 11 x 11, of "
+        f"windows inside the picture that hold no masked pixel (scikit-image); {lpips}; float: before rounding; "
+        f"colour_aligned: quadratic colour correction fitted to the held-out photo (multinerf){pose}"
     )

@@ -97,6 +97,10 @@ def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFact
     return read
 
 
+def _structure(view: Seen) -> str:
+    return "not known" if view.ssim is None else f"{view.ssim:.3f}"
+
+
 def _last(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
     return lambda run: form.format(run.log[-1][key] / scale) if run.log and key in run.log[-1] else ""
 
@@ -179,7 +183,7 @@ def _views_html(
         first = seen[0][1]
         height, width = first.photo.shape[:2]
         told = "; ".join(
-            f"{run.label + ': ' if len(runs) > 1 else ''}{view.psnr:.2f} dB, SSIM {view.ssim:.3f}, "
+            f"{run.label + ': ' if len(runs) > 1 else ''}{view.psnr:.2f} dB, SSIM {_structure(view)}, "
             f"depth in {100 * view.with_depth:.0f} % of the pixels"
             for run, view, _ in seen
         )
@@ -276,7 +280,7 @@ def _photos_html(runs: Sequence[RunFacts]) -> str:
             image = images.get(name, {})
             row += [
                 f"{image['psnr']:.2f}" if "psnr" in image else "",
-                f"{image['ssim']:.4f}" if "ssim" in image else "",
+                f"{image['ssim']:.4f}" if image.get("ssim") is not None else "",
             ]
         rows.append(row)
     return table(columns, rows, numbers=range(1, len(columns)))

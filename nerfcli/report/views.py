@@ -30,7 +30,7 @@ class Seen:
         name: of the photo.
         photo, picture, error: (H, W, 3) uint8 sRGB; RGBA photos on white.
         depth: (H, W) in the unit of the scene, NaN where there is none.
-        psnr, ssim: between picture and photo over the pixels that count, as in `evaluate`.
+        psnr, ssim: between picture and photo over the pixels that count, as in `evaluate`; SSIM may not be known.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Seen:
     error: np.ndarray
     depth: np.ndarray
     psnr: float
-    ssim: float
+    ssim: float | None
 
     @property
     def with_depth(self) -> float:

@@ -1,0 +1,131 @@
+"""Pose alignment: what the error of a held-out photo's own pose costs, told apart from the field's.
+
+The pose is refined on the left half of the photo, with the field held, and the picture is measured on the right half,
+which the refinement did not see.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import transform_from_twist, vector_from_rotation
+from nerfcli.field.background import Background, colours_behind
+from nerfcli.field.exposure import exposed
+from nerfcli.render.model import Model
+from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.render.tracing import render_rays
+
+PIXELS = 2048
+SEED = 1
+# Fewer pixels do not hold six unknowns against noise.
+LEAST_PIXELS = 64
+# How far, in pixels, the camera is moved to see what changes: wide at first, to look across the field's own noise.
+STEPS_PX = (2.0, 2.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5)
+ENOUGH_PX = 0.01
+_FIRST_DAMPING = 1e-3
+_TRIES = 4
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A refined frame, and how far it moved: rotation in degrees, translation of its centre in scene units, and the
+    mean squared errors of the pixels that were looked at, before and after."""
+
+    frame: Frame
+    rotation_deg: float
+    translation: float
+    error_before: float
+    error_after: float
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the frame, whose pose is spelled out."""
+        return {
+            "rotation_deg": self.rotation_deg,
+            "translation": self.translation,
+            "world_from_cam": self.frame.world_from_cam.tolist(),
+        }
+
+
+def halves(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels that count of the left half of a picture and of the rest, both (H, W) bool."""
+    left = np.zeros_like(used)
+    left[:, : used.shape[1] // 2] = True
+    return used & left, used & ~left
+
+
+@torch.no_grad()
+def align_pose(
+    model: Model,
+    frame: Frame,
+    colours: np.ndarray,
+    *,
+    used: np.ndarray,
+    background: Background,
+    log_gain: float = 0.0,
+) -> Alignment | None:
+    """The pose at which the model comes closest to a photo, from the photo's own pose on; the model is not changed.
+
+    Levenberg-Marquardt on the squared error of 2048 random pixels, with derivatives by differences of renders. The six
+    unknowns are counted in pixels: turns by one over the focal length, and moves that shift what is as far away as the
+    scene's radius by one pixel. A step is taken only where it brings the error down.
+
+    Args:
+        model: the trained model.
+        frame: the photo's camera and pose.
+        colours: (H, W, 3) the photo, float in [0, 1].
+        used: (H, W) bool, the pixels to look at.
+        background: behind everything.
+        log_gain: the photo's exposure, as of `protocol.HeldOut`.
+
+    Returns:
+        None where too few pixels count.
+    """
+    chosen = np.flatnonzero(used)
+    if len(chosen) < LEAST_PIXELS:
+        return None
+    generator = np.random.default_rng(SEED)
+    chosen = np.sort(generator.choice(chosen, min(PIXELS, len(chosen)), replace=False))
+    wanted = colours.reshape(-1, 3)[chosen]
+    focal = frame.camera.focal_px
+    unit = np.array([1.0 / model.training_from_scene.scale / focal] * 3 + [1.0 / focal] * 3)
+
+    def residuals(pose: np.ndarray) -> np.ndarray:
+        moved = replace(frame, world_from_cam=pose)
+        rays = pixel_rays(moved, model.training_from_scene, pixels=chosen, places=CENTRES, device=model.device)
+        behind = colours_behind(background, rays.directions)
+        rgb = render_rays(model, rays.origin.expand_as(rays.directions), rays.directions, background=behind).rgb
+        if log_gain != 0.0:
+            rgb = exposed(rgb, rgb.new_tensor(log_gain))
+        return (rgb.clamp(0.0, 1.0).cpu().numpy().astype(np.float64) - wanted).ravel()
+
+    pose, current = frame.world_from_cam, residuals(frame.world_from_cam)
+    before, damping = float(np.square(current).mean()), _FIRST_DAMPING
+    for step_px in STEPS_PX:
+        moves = np.eye(6) * step_px * unit
+        columns = [(residuals(pose @ transform_from_twist(move)) - current) / step_px for move in moves]
+        jacobian = np.stack(columns, axis=1)
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ current
+        moved_px = 0.0
+        for _ in range(_TRIES):
+            damped = normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6)
+            step = -np.linalg.solve(damped, gradient)
+            trial = pose @ transform_from_twist(step * unit)
+            found = residuals(trial)
+            if np.square(found).sum() < np.square(current).sum():
+                pose, current, moved_px = trial, found, float(np.linalg.norm(step))
+                damping /= 10
+                break
+            damping *= 10
+        if moved_px < ENOUGH_PX and step_px == STEPS_PX[-1]:
+            break
+    turn = frame.world_from_cam[:3, :3].T @ pose[:3, :3]
+    return Alignment(
+        frame=replace(frame, world_from_cam=pose),
+        rotation_deg=float(np.degrees(np.linalg.norm(vector_from_rotation(turn)))),
+        translation=float(np.linalg.norm(pose[:3, 3] - frame.world_from_cam[:3, 3])),
+        error_before=before,
+        error_after=float(np.square(current).mean()),
+    )

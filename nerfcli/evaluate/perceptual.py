@@ -1,0 +1,65 @@
+"""LPIPS: how different two pictures look to a network that was trained on people's judgements. It may not be there.
+
+The network's weights are no part of any package: torchvision downloads AlexNet's (230 MB) when it is first asked. Where
+torchmetrics, torchvision or the weights cannot be had, there is no LPIPS, and that is said once.
+"""
+
+import importlib
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+# (picture, photo), both (H, W, 3) float in [0, 1], to their distance.
+Perceptual = Callable[[np.ndarray, np.ndarray], float]
+
+NAME = "LPIPS AlexNet v0.1"
+INSTALL = "pip install 'nerfcli[lpips]'"
+# AlexNet halves a picture so often that nothing is left of smaller ones.
+SMALLEST = 32
+_ANSWER_SECONDS = 20.0
+
+
+def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
+    """The distance, ready to use; None where it cannot be had, with one line that says why.
+
+    Source: Zhang et al. 2018, The unreasonable effectiveness of deep features as a perceptual metric,
+    arXiv:1801.03924; computed by torchmetrics.
+    """
+    try:
+        importlib.import_module("torchvision")
+        metric = importlib.import_module("torchmetrics.image.lpip").LearnedPerceptualImagePatchSimilarity
+    # A torchvision that was built for another torch fails with a RuntimeError or OSError.
+    except (ImportError, RuntimeError, OSError) as error:
+        notify(f"LPIPS is left out ({_first_line(error)}); {INSTALL} brings what it needs")
+        return None
+    try:
+        with _impatient():
+            network = metric(net_type="alex", normalize=True)
+    except (RuntimeError, OSError) as error:  # no network (URLError is an OSError), or a file that was cut off
+        notify(f"LPIPS is left out: its weights cannot be had ({_first_line(error)})")
+        return None
+
+    def measure(picture: np.ndarray, photo: np.ndarray) -> float:
+        pair = [torch.from_numpy(np.ascontiguousarray(p, dtype=np.float32)) for p in (picture, photo)]
+        with torch.no_grad():
+            return float(network(*(values.permute(2, 0, 1)[None] for values in pair)))
+
+    return measure
+
+
+@contextmanager
+def _impatient() -> Iterator[None]:
+    """Servers that do not answer are given up soon: torch waits for them for ever."""
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(_ANSWER_SECONDS)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,40 @@
+"""What was compared, as files that other programs can measure, in the layout that nerfbaselines has.
+
+predictions/color/NAME.png         the rendered picture, 8 bit sRGB
+predictions/gt-color/NAME.png      the photo as it was compared: upright, averaged to the size of the training
+predictions/mask/NAME.png          255 where pixels count; only where some do not
+predictions/color-float/NAME.npy   the rendered picture before rounding, float32; only if it is asked for
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.evaluate.metrics import to_8_bit
+from nerfcli.evaluate.protocol import Compared
+from nerfcli.media.images import write_png
+
+PREDICTIONS = "predictions"
+INFO = "info.json"
+# What may be asked for: 8-bit pictures, or unrounded ones besides.
+KINDS = ("png", "float")
+
+
+def save_compared(folder: Path, stem: str, compared: Compared) -> None:
+    """Write the 8-bit picture, the photo and, where pixels are left out, the mask.
+
+    Args:
+        folder: the folder of predictions.
+        stem: the name of the files, without suffix; subfolders are made.
+    """
+    write_png(folder / "color" / f"{stem}.png", to_8_bit(compared.rendered))
+    write_png(folder / "gt-color" / f"{stem}.png", compared.photo)
+    if not compared.used.all():
+        write_png(folder / "mask" / f"{stem}.png", compared.used.astype(np.uint8) * 255)
+
+
+def save_unrounded(folder: Path, stem: str, compared: Compared) -> None:
+    """Write the rendered picture before rounding."""
+    path = folder / "color-float" / f"{stem}.npy"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, compared.rendered.astype(np.float32))

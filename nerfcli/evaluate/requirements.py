@@ -1,0 +1,71 @@
+"""What a run has to reach: psnr>=25,registered>=0.9."""
+
+import operator
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+_COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
+_ALIGNED = ("", "_colour_aligned", "_pose_aligned")
+# What may be asked for: the means of metrics.json, the share of photos with a pose, and what the run cost.
+NAMES = (
+    *(f"{measure}{aligned}" for measure in ("psnr", "ssim") for aligned in (*_ALIGNED, "_float", "_right_half")),
+    *("lpips", "lpips_colour_aligned", "registered", "training_seconds", "seconds_per_image"),
+)
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """A bound on a number: "psnr", ">=", 25.0."""
+
+    name: str
+    comparison: str
+    bound: float
+
+    def __str__(self) -> str:
+        return f"{self.name}{self.comparison}{self.bound:g}"
+
+    def is_met(self, value: float | None) -> bool:
+        """Whether a number fulfils it; one that is not known does not."""
+        return value is not None and bool(_COMPARISONS[self.comparison](value, self.bound))
+
+
+def parse_requirements(text: str) -> tuple[Requirement, ...]:
+    """Requirements with commas between them.
+
+    Raises:
+        ValueError: an unknown name, or no comparison with a number; the message says what was expected.
+    """
+    found = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\w+)\s*(>=|<=|>|<)\s*(\S+)\s*", part)
+        if match is None or not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", match[3]):
+            raise ValueError(f"{part.strip()!r} is no requirement; write psnr>=25,registered>=0.9")
+        if match[1] not in NAMES:
+            raise ValueError(f"{match[1]!r} is not measured; choose {', '.join(NAMES)}")
+        found.append(Requirement(match[1], match[2], float(match[3])))
+    return tuple(found)
+
+
+def known_numbers(metrics: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, float | None]:
+    """The numbers of a run that requirements are about, from metrics.json and config.json."""
+    history = config.get("history") or {}
+    placed, photos = history.get("registered"), history.get("total")
+    return {
+        **metrics["mean"],
+        "registered": placed / photos if placed is not None and photos else None,
+        "training_seconds": metrics["training"]["seconds"],
+        "seconds_per_image": metrics["render"]["seconds_per_image"],
+    }
+
+
+def unmet(requirements: Sequence[Requirement], numbers: Mapping[str, float | None]) -> list[str]:
+    """What is not met, and what was found instead, in words."""
+    failures = []
+    for requirement in requirements:
+        value = numbers.get(requirement.name)
+        if not requirement.is_met(value):
+            found = "not known" if value is None else f"{value:.4g}"
+            failures.append(f"{requirement} ({requirement.name} is {found})")
+    return failures

@@ -1,0 +1,121 @@
+"""poses --strict on the room corner, whose poses are known: held-out photos change nothing, and are placed rightly."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from corner import CENTRES, NAMES, cam_from_world, write_capture
+from test_poses import FAST, similarity
+
+from nerfcli import scene
+from nerfcli.evaluate.ledger import leak_ledger
+from nerfcli.poses.job import CameraGroup, Job
+from nerfcli.poses.report import PosesReport
+from nerfcli.poses.settings import PoseSettings
+from nerfcli.poses.strict import fingerprint, held_out_last, training_part
+from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
+
+HELD_OUT = 2  # in the middle, and stored upright
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, PoseSettings, PosesReport]:
+    folder = tmp_path_factory.mktemp("strict")
+    write_capture(folder / "photos")
+    (folder / "test.txt").write_text(f"{NAMES[HELD_OUT]}\nwall.png\n")
+    settings = replace(FAST, strict=True, holdout=str(folder / "test.txt"))
+    report = estimate_poses(
+        folder / "photos",
+        folder / "scene",
+        settings=settings,
+        notify=lambda note: None,
+        progress=lambda stage, done, total: None,
+    )
+    return folder / "photos", folder / "scene", settings, report
+
+
+def test_a_held_out_photo_is_placed_and_moves_nothing_by_a_bit(solved):
+    """Synthetic truth for the pose; a hash of every bit of the rest, taken before and again here, from the disk."""
+    _, scene_dir, _, report = solved
+    model = pycolmap.Reconstruction(str(scene_dir / "sparse" / "0"))
+    name = NAMES[HELD_OUT]
+    assert report.strict["fingerprint_before"] == fingerprint(model, without=frozenset({name}))
+    held_out = model.find_image_with_name(name)
+    tracks = [element.image_id for point in model.points3D.values() for element in point.track.elements]
+    assert held_out.image_id not in tracks
+    others = [index for index in range(len(NAMES)) if index != HELD_OUT]
+    centres = np.array([model.find_image_with_name(NAMES[index]).projection_center() for index in others])
+    scale, rotation, translation = similarity(centres, CENTRES[others])
+    found = scale * rotation @ held_out.projection_center() + translation
+    assert np.linalg.norm(found - CENTRES[HELD_OUT]) < 0.01
+    turn = held_out.cam_from_world().rotation.matrix() @ rotation.T @ cam_from_world(CENTRES[HELD_OUT])[:, :3].T
+    assert np.degrees(np.arccos(min((np.trace(turn) - 1) / 2, 1.0))) < 0.3
+    assert report.strict["placed"][name]["inliers"] > 50
+    assert report.strict["placed"][name]["error_px"] < 1.5
+
+
+def test_the_scene_knows_what_was_held_out_and_how(solved):
+    photos, scene_dir, settings, report = solved
+    images = {image.name: image for image in report.images}
+    assert images["wall.png"].reason == "matches too few points of the training photos (0 agree of 0)"
+    assert (report.registered, report.total) == (7, 9)
+    loaded = scene.load(scene_dir)
+    assert loaded.test_names == {NAMES[HELD_OUT]}
+    assert (loaded.history["registered"], loaded.history["total"]) == (7, 9)
+    ledger = {entry.stage: entry.saw_held_out for entry in leak_ledger({"history": loaded.history})}
+    assert (ledger["poses"], ledger["intrinsics"], ledger["points"]) == (False, False, False)
+    assert is_same_scene(scene_dir, photos, settings)
+    assert not is_same_scene(scene_dir, photos, replace(settings, strict=False))
+    Path(settings.holdout).write_text(NAMES[0])
+    assert not is_same_scene(scene_dir, photos, settings)
+
+
+def test_the_fingerprint_sees_the_last_bit(solved):
+    _, scene_dir, _, _ = solved
+    model = pycolmap.Reconstruction(str(scene_dir / "sparse" / "0"))
+    before = fingerprint(model)
+    point = model.points3D[min(model.point3D_ids())]
+    kept = point.xyz.copy()
+    point.xyz = kept + np.array([np.spacing(kept[0]), 0, 0])
+    assert fingerprint(model) != before
+    point.xyz = kept
+    assert fingerprint(model) == before
+    camera = model.cameras[min(model.cameras)]
+    camera.params = [*camera.params[:-1], np.nextafter(camera.params[-1], 1)]
+    assert fingerprint(model) != before
+
+
+def test_the_training_part_keeps_files_cameras_and_pairs_together():
+    job = Job(
+        folder="work",
+        files=("00000.jpg", "00003.jpg", "00004.jpg", "00007.jpg", "00008.jpg"),
+        originals="photos",
+        names=("a", "b", "c", "d", "e"),
+        keys=("ka", "kb", "kc", "kd", "ke"),
+        groups=(
+            CameraGroup((1,), "OPENCV", 4, 3),
+            CameraGroup((0, 2), "PINHOLE", 4, 3),
+            CameraGroup((3, 4), "RADIAL", 8, 6),
+        ),
+        pairs=((0, 1), (0, 2), (1, 3), (2, 4), (3, 4)),
+        neighbours=0,
+        max_image_size=100,
+        max_features=100,
+        seed=0,
+        threads=1,
+        held_out=(1, 2),
+    )
+    ordered = held_out_last(job)
+    assert [group.model for group in ordered.groups] == ["PINHOLE", "RADIAL", "OPENCV"]
+    part = training_part(ordered)
+    assert (part.files, part.names, part.keys) == (
+        ("00000.jpg", "00007.jpg", "00008.jpg"),
+        ("a", "d", "e"),
+        ("ka", "kd", "ke"),
+    )
+    assert [(group.model, group.photos) for group in part.groups] == [("PINHOLE", (0,)), ("RADIAL", (1, 2))]
+    assert part.pairs == ((1, 2),)
+    assert part.image_ids == (1, 8, 9)
+    assert part.held_out == ()
