@@ -39,6 +39,8 @@ CASES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("exposure", 2, ("", "exposure")),
     ("glossy", 1, ("-view", "view=1", "view=2", "")),
     ("unbounded", 1, ("", "background=constant", "background")),
+    ("turntable", 1, ("", "masks")),
+    ("few", 1, ("", "points", "points=1")),
 )
 
 
@@ -85,7 +87,7 @@ def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, sam
     with tempfile.TemporaryDirectory() as run:
         train(capture, Path(run), settings, resume=False, notify=lambda text: None, on_progress=clock)
         model = load_model(Path(run) / FIELD, "cpu")
-    photos = load_photos(capture.test_frames, factor=downscale, threads=1)
+    photos = load_photos(capture.test_frames, factor=downscale, threads=1, masks=components.masks)
     gains = relative_log_exposures(capture.test_frames, model.log_exposure)
     held_out = [
         HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))

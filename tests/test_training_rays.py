@@ -145,7 +145,7 @@ SIMILARITY = Similarity(0.3, rotation_from_quaternion(np.array([0.8, 0.2, -0.4, 
 
 def drawn(pool: PixelPool, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Origins, directions, and (count, 3) numbers (photo, row, column) of random pixels."""
-    origins, directions, colours, _ = pool.draw(count, torch.Generator().manual_seed(0))
+    origins, directions, colours = pool.draw(count, torch.Generator().manual_seed(0))[:3]
     assert colours.dtype == torch.float32
     return origins.numpy(), directions.numpy(), np.round(colours[:, :3].numpy() * 255).astype(int)
 
@@ -191,7 +191,7 @@ def test_photos_with_and_without_alpha_go_together():
     assert not PixelPool(photos[:1], SIMILARITY, CPU).has_alpha
     pool = PixelPool(photos, SIMILARITY, CPU)
     assert pool.has_alpha
-    _, _, colours, _ = pool.draw(500, torch.Generator().manual_seed(0))
+    colours = pool.draw(500, torch.Generator().manual_seed(0)).colours
     assert (colours[:, 3] == 1).all()
 
 

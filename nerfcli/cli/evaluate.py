@@ -171,7 +171,9 @@ def evaluate_run(
         "rays_per_second": log[-1]["rays"] / log[-1]["seconds"],
         "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
     }
-    photos = load_photos(cameras["test"], factor=config["settings"]["downscale"], threads=threads)
+    settings = config["settings"]
+    masks = settings.get("components", {}).get("masks", "ignore")
+    photos = load_photos(cameras["test"], factor=settings["downscale"], threads=threads, masks=masks)
     gains = relative_log_exposures(cameras["test"], model.log_exposure)
     held_out = [
         HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))

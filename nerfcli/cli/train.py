@@ -70,8 +70,9 @@ def train(
 
     Components, for --with and --without: background (auto, black, constant, random, sphere: what is behind the
     field), view (0 to 3: the degree to which colours depend on the direction), exposure (none, exif, learned:
-    brightness and white balance of each photo), near (smaller gradients near cameras), distortion (a weight: the light
-    of a ray in one place).
+    brightness and white balance of each photo), masks (ignore, empty: what their black means), points (a weight:
+    surfaces at points of structure from motion), entropy (a weight: rays are opaque or clear), near (smaller gradients
+    near cameras), distortion (a weight: the light of a ray in one place).
 
     \b
     Examples:

@@ -15,6 +15,8 @@ Value = bool | int | float | str
 # What may be behind all that the field holds.
 BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
 EXPOSURES = ("none", "exif", "learned")
+# What is behind the black of a mask: something unknown, or nothing.
+MASKS = ("ignore", "empty")
 # Spherical harmonics up to this degree: 16 of them.
 MOST_DEGREES = 3
 
@@ -29,6 +31,9 @@ class Components:
         view: how colours depend on the direction they are seen from: the highest degree of the spherical harmonics
             that the colour network is told, 0 to 3. 0: not at all.
         exposure: gains of the photos, see `field.exposure`: "none", those that "exif" tells, or "learned" from there.
+        masks: what their black means: "ignore", not to be looked at; or "empty", nothing is there, as with alpha.
+        points: weight of `point_depth.point_depth_loss`.
+        entropy: weight of `losses.opacity_entropy`.
         near: whether gradients near a camera are scaled down; see `fitting.scale_gradients`.
         distortion: weight of `losses.distortion_loss`; 0.05 is best or as good as any on real and synthetic
             captures.
@@ -37,6 +42,9 @@ class Components:
     background: str = "auto"
     view: int = MOST_DEGREES
     exposure: str = "none"
+    masks: str = "ignore"
+    points: float = 0.0
+    entropy: float = 0.0
     near: bool = True
     distortion: float = 0.05
 
@@ -84,6 +92,9 @@ CHOICES = {
     "background": Choice("what is behind the field", "black", "sphere", BACKGROUNDS),
     "view": Choice("colour by direction, degree", 0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
     "exposure": Choice("brightness and white balance of photos", "none", "learned", EXPOSURES),
+    "masks": Choice("the black of masks is empty space", "ignore", "empty", MASKS),
+    "points": Choice("surfaces at points of structure from motion, weight", 0.0, 0.1, None),
+    "entropy": Choice("rays are opaque or clear, weight", 0.0, 0.01, None),
     "near": Choice("smaller gradients near cameras", False, True, (False, True)),
     "distortion": Choice("light of a ray in one place, weight", 0.0, 0.05, None),
 }

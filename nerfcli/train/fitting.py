@@ -12,10 +12,11 @@ from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
-from nerfcli.train.losses import colour_loss, distortion_loss
+from nerfcli.train.losses import colour_loss, distortion_loss, opacity_entropy
 from nerfcli.train.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.train.parts import Parts
 from nerfcli.train.photos import Drawn, Pool
+from nerfcli.train.point_depth import PointDepths, PointRays, fading, point_depth_loss
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.watch import UNWATCHED, NonFiniteError, Watch
 
@@ -65,6 +66,7 @@ class Fitting:
         unbounded: bool,
         settings: TrainSettings,
         log_gains: Tensor | None = None,
+        points: PointRays | None = None,
     ):
         device = pool.colours.device
         torch.manual_seed(settings.seed)
@@ -82,6 +84,7 @@ class Fitting:
         )
         self.field = fresh_field(size).to(device)
         gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
+        self.points = points
         self.parts = Parts(self.components, pool, log_gains=gains)
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.occupied = self._open_cells()
@@ -108,7 +111,7 @@ class Fitting:
         drawn = self.draw(share)
         rays = len(drawn.origins)
         stride = next(stride for until, stride in STRIDES if share <= until)
-        loss, samples = self._loss(drawn, edges=self.edges[::stride].contiguous(), watch=watch)
+        loss, samples = self._loss(drawn, edges=self.edges[::stride].contiguous(), share=share, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
         if samples > 0:
@@ -130,7 +133,10 @@ class Fitting:
             self._refresh_occupancy()
         wanted = settings.first_samples_per_step + share * (settings.samples_per_step - settings.first_samples_per_step)
         rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
-        return self.pool.draw(rays, self.generator)
+        drawn = self.pool.draw(rays, self.generator)
+        if self.points is None or fading(share) == 0.0:
+            return drawn
+        return self.points.added_to(drawn, self.generator)
 
     def smaller_steps(self) -> None:
         """Halve the learning rate from here on, as numbers became non-finite."""
@@ -144,7 +150,7 @@ class Fitting:
         warmup = min(1.0, (self.step + 1) / settings.warmup_steps)
         return self.rate_factor * settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
 
-    def _loss(self, drawn: Drawn, *, edges: Tensor, watch: Watch) -> tuple[Tensor, int]:
+    def _loss(self, drawn: Drawn, *, edges: Tensor, share: float, watch: Watch) -> tuple[Tensor, int]:
         """Loss over some rays, and the number of samples it took."""
         origins, directions = drawn.origins, drawn.directions
         components, device = self.components, origins.device
@@ -164,6 +170,13 @@ class Fitting:
         loss = colour_loss(*self.parts.compared(rendered, transmittance, drawn, behind=background))
         if components.distortion:
             loss = loss + components.distortion * distortion_loss(weights, starts, ends, offsets)
+        if components.entropy:
+            loss = loss + components.entropy * opacity_entropy(transmittance)
+        if len(drawn.distances):
+            known = PointDepths(drawn.numbers[-len(drawn.distances) :], drawn.distances, drawn.trust)
+            middles = (starts + ends) / 2
+            apart = point_depth_loss(weights, transmittance, middles, offsets=offsets, known=known)
+            loss = loss + components.points * fading(share) * apart
         shown = {
             "coordinates of samples": samples.coordinates,
             "code of samples": samples.code,

@@ -33,7 +33,7 @@ class HeldoutPixels:
     ):
         pool = PixelPool(photos, training_from_scene, device)
         generator = torch.Generator(device=device).manual_seed(SEED)
-        self.origins, self.directions, self.colours, numbers = pool.draw(PIXELS, generator)
+        self.origins, self.directions, self.colours, numbers = pool.draw(PIXELS, generator)[:4]
         self.log_gains = torch.as_tensor(log_gains, dtype=torch.float32, device=device)[pool.photo_of(numbers)]
 
     @torch.no_grad()

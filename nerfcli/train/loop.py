@@ -23,6 +23,7 @@ from nerfcli.train.heldout import HeldoutPixels
 from nerfcli.train.interrupts import held_back
 from nerfcli.train.normalisation import training_frame
 from nerfcli.train.photos import PixelPool, load_photos
+from nerfcli.train.point_depth import PointRays, point_depths
 from nerfcli.train.run_folder import CONFIG, FIELD, LOG, STATE, append_log, cut_log, describe_run, write_cameras
 from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.settings import TrainSettings, automatic_downscale
@@ -86,8 +87,9 @@ def train(
         raise UserError(f"{scene.root} has no training photo", "every 8th photo is held out; at least 2 are needed")
     first = scene.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)
-    photos = load_photos(scene.train_frames, factor=factor, threads=settings.threads)
-    test_photos = load_photos(scene.test_frames, factor=factor, threads=settings.threads)
+    masks = settings.components.masks
+    photos = load_photos(scene.train_frames, factor=factor, threads=settings.threads, masks=masks)
+    test_photos = load_photos(scene.test_frames, factor=factor, threads=settings.threads, masks=masks)
     unbounded = not all(photo.pixels.shape[-1] == 4 for photo in photos)
     similarity, marching = training_frame(scene, unbounded=unbounded)
     device = torch.device(settings.device)
@@ -105,12 +107,15 @@ def train(
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
 
+    points = PointRays(point_depths(scene, pool, similarity), pool) if settings.components.points else None
+    if points is not None:
+        notify(f"{len(points.known.numbers)} pixels have a point of structure from motion")
     if reference is not None:
         known = log_exposures(scene.train_frames)
         notify(f"EXIF tells the exposure of {np.isfinite(known).sum()} of {len(known)} photos")
     gains = relative_log_exposures(scene.train_frames, reference)
     log_gains = torch.from_numpy(gains)[:, None].expand(-1, 3)
-    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings, log_gains=log_gains)
+    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings, log_gains=log_gains, points=points)
     totals = _Totals()
     if resume:
         totals = _restore(fitting, run)

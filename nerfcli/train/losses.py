@@ -41,6 +41,21 @@ def _contracted(distance: Tensor) -> Tensor:
     return torch.where(distance <= 1.0, distance, 2.0 - 1.0 / distance.clamp_min(1.0)) / 2.0
 
 
+def opacity_entropy(transmittance: Tensor) -> Tensor:
+    """Mean over rays of how undecided they are between opaque and clear, in nats.
+
+    -T log T - (1 - T) log(1 - T), with T kept inside [1e-4, 1 - 1e-4], where its gradient is at most 9.3
+
+    Args:
+        transmittance: (R,) in [0, 1].
+
+    Returns:
+        Scalar in (0, log 2]. Differentiable.
+    """
+    share = transmittance.clamp(1e-4, 1.0 - 1e-4)
+    return -(share * share.log() + (1.0 - share) * torch.log1p(-share)).mean()
+
+
 def over_background(colours: Tensor, background: Tensor) -> Tensor:
     """Measured colours in front of `background` (R, 3): alpha * rgb + (1 - alpha) * background for RGBA.
 

@@ -33,17 +33,23 @@ class Photo:
     used: np.ndarray | None
 
 
-def load_photos(frames: Sequence[Frame], *, factor: int, threads: int) -> list[Photo]:
+def load_photos(frames: Sequence[Frame], *, factor: int, threads: int, masks: str = "ignore") -> list[Photo]:
     """Read, orient and downscale the photos of `frames`, in parallel, in order.
+
+    Args:
+        frames: with their images and masks.
+        factor: of the downscaling.
+        threads: to read with.
+        masks: what their black means: "ignore", or "empty": it then is the alpha of the photos that have a mask.
 
     Raises:
         UserError: a photo cannot be read, or has another size than its camera.
     """
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        return list(pool.map(lambda frame: _load_photo(frame, factor), frames))
+        return list(pool.map(lambda frame: _load_photo(frame, factor, masks), frames))
 
 
-def _load_photo(frame: Frame, factor: int) -> Photo:
+def _load_photo(frame: Frame, factor: int, masks: str) -> Photo:
     if frame.image is None:
         raise UserError(f"{frame.name} has no photo", "this camera can be rendered, but not trained on or evaluated")
     pixels = read_image(frame.image)
@@ -54,7 +60,9 @@ def _load_photo(frame: Frame, factor: int) -> Photo:
             "put the photo back that the poses were made from, or run nerfcli poses again",
         )
     used = None
-    if frame.mask is not None:
+    if frame.mask is not None and masks == "empty":
+        pixels = _emptied(pixels, read_mask(frame.mask, frame.image))
+    elif frame.mask is not None:
         # A pixel of the small picture counts only where all that it averages counts.
         used = downscale(read_mask(frame.mask, frame.image), factor) == 255
     return Photo(replace(frame, camera=downscaled_camera(frame.camera, factor)), downscale(pixels, factor), used)
@@ -72,12 +80,15 @@ class Drawn(NamedTuple):
         origins, directions: (N, 3) training frame, unit directions.
         colours: (N, 3 or 4) float32 in [0, 1].
         numbers: (N,) int64, counted through all photos.
+        distances, trust: (K,) of the last K of them, those whose surface is known; see `point_depth.PointDepths`.
     """
 
     origins: Tensor
     directions: Tensor
     colours: Tensor
     numbers: Tensor
+    distances: Tensor
+    trust: Tensor
 
 
 class Pool(Protocol):
@@ -101,7 +112,7 @@ class Pool(Protocol):
 
 
 class PixelPool:
-    """All usable pixels of some photos, and the ray of each, in the training frame.
+    """All usable pixels of some photos, and the ray of each, in the training frame; `frames` are those of the photos.
 
     Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
     pixels that the lens model has no direction for, which are left out.
@@ -114,6 +125,7 @@ class PixelPool:
         counts = [len(p.reshape(-1, p.shape[-1])) for p in pixels]
         self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
         self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
+        self.frames = tuple(photo.frame for photo in photos)
         poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
         self.poses = torch.tensor(np.array(poses), dtype=torch.float32, device=device)
 
@@ -162,7 +174,8 @@ class PixelPool:
             poses=self.poses,
             photos=self.colours,
         )
-        return Drawn(*rays, numbers)
+        none = torch.zeros(0, device=numbers.device)
+        return Drawn(*rays, numbers, distances=none, trust=none)
 
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Which photo each pixel (N,) is of."""
@@ -174,6 +187,12 @@ class PixelPool:
         name, width = self.names_and_widths[photo]
         row, column = divmod(number - int(self.first_pixel[photo]), width)
         return name, column, row
+
+
+def _emptied(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """RGBA: clear where the mask is black, or where the photo is clear itself."""
+    alpha = mask if pixels.shape[-1] == 3 else np.minimum(mask, pixels[..., 3])
+    return np.concatenate([pixels[..., :3], alpha[..., None]], axis=-1)
 
 
 def _with_alpha(pixels: np.ndarray) -> np.ndarray:

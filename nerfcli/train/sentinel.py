@@ -150,9 +150,7 @@ class _SavedBatch:
 
     def __init__(self, tensors: dict[str, Tensor]):
         self.colours, self.first_pixel = tensors["batch.colours"], tensors["batch.first_pixel"]
-        self._drawn = Drawn(
-            tensors["batch.origins"], tensors["batch.directions"], self.colours, tensors["batch.numbers"]
-        )
+        self._drawn = Drawn(**{name: tensors[f"batch.{name}"] for name in Drawn._fields})
         self._after_draw = tensors["batch.after_draw"]
 
     @property

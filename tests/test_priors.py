@@ -1,0 +1,163 @@
+"""What a scene knows besides colours: points of structure from motion, empty space behind masks, decided rays."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nerfcli import kernels
+from nerfcli import scene as scenes
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.colmap_write import write_colmap_binary
+from nerfcli.cameras.frame import Capture, Frame, Observations
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.errors import UserError
+from nerfcli.scene import Scene
+from nerfcli.train.components import Components
+from nerfcli.train.loop import train
+from nerfcli.train.losses import opacity_entropy
+from nerfcli.train.photos import PixelPool, load_photos
+from nerfcli.train.point_depth import LAST_SHARE, PointDepths, fading, point_depth_loss, point_depths
+from nerfcli.train.settings import TrainSettings
+
+CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
+# Seen by both cameras, the first with an error of 3 pixels in the second.
+POINTS = np.array([[0.0, 0.0, 1.0], [0.3, 0.1, 2.0], [-0.2, -0.1, 4.0]])
+
+
+def camera_at(x: float) -> np.ndarray:
+    """It stands at x, 2 in front of the origin, and looks along z."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = (x, 0.0, -2.0)
+    return matrix
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Scene:
+    """Two photos, a model with points, and masks that are black on their left halves."""
+    levels = np.random.default_rng(0).integers(0, 256, (2, 8, 12, 3), dtype=np.uint8)
+    frames, rows = [], []
+    for index in range(2):
+        name = f"{index}.png"
+        for folder, picture in (
+            ("images", levels[index]),
+            ("masks", np.repeat(np.array([[0, 255]], np.uint8), 6, 1).repeat(8, 0)),
+        ):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            Image.fromarray(picture).save(tmp_path / folder / name)
+        frames.append(Frame(name, CAMERA, camera_at(0.2 * index), tmp_path / "images" / name))
+        pixels, _ = CAMERA.project(POINTS - frames[index].centre)
+        rows += [(index, point, pixel) for point, pixel in enumerate(pixels)]
+    observed = Observations(*(np.array(column) for column in zip(*rows, strict=True)))
+    observed.pixels[3] += (3.0, 0.0)
+    (tmp_path / scenes.MODEL_FOLDER).mkdir(parents=True)
+    model = Capture(tuple(frames), POINTS, (), None, "colmap", observations=observed)
+    write_colmap_binary(model, tmp_path / scenes.MODEL_FOLDER)
+    split = {"0.png": "train", "1.png": "train"}
+    scenes.save(tmp_path, image_folder=tmp_path / "images", provenance={}, masks=tmp_path / "masks", split=split)
+    return scenes.load(tmp_path)
+
+
+def pool_of(scene: Scene, masks: str = "ignore", *, similarity: Similarity) -> PixelPool:
+    photos = load_photos(scene.train_frames, factor=1, threads=1, masks=masks)
+    return PixelPool(photos, similarity, torch.device("cpu"))
+
+
+def test_points_are_found_at_their_pixels_with_their_distances_and_trust(capture):
+    similarity = Similarity(0.5, np.eye(3), np.array([1.0, 2.0, 3.0]))
+    pool = pool_of(capture, similarity=similarity)
+    known = point_depths(capture, pool, similarity)
+    rays = pool.rays_of(known.numbers)
+    reached = rays.origins + rays.directions * known.distances[:, None]
+    expected = torch.from_numpy(similarity.apply(np.concatenate([POINTS, POINTS]))).float()
+    # A ray goes through the middle of its pixel: half a pixel's diagonal off at most, at these distances.
+    assert ((reached - expected).norm(dim=-1) <= known.distances * math.sqrt(0.5) / 12 + 1e-6).all()
+    assert pool.photo_of(known.numbers).tolist() == [0, 0, 0, 1, 1, 1]
+    assert known.trust.tolist() == pytest.approx([1, 1, 1, 0.1, 1, 1], abs=1e-5)  # 1 / (1 + 3^2)
+
+
+def test_a_scene_that_does_not_tell_who_saw_what_is_refused(spheres):
+    one = Similarity(1.0, np.eye(3), np.zeros(3))
+    few = replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())
+    with pytest.raises(UserError, match="does not tell which photos saw which points"):
+        point_depths(few, pool_of(few, similarity=one), one)
+
+
+def test_the_loss_of_points_is_the_mean_deviation_of_where_light_ends():
+    # Three rays; the last two have points at 2 and 1, trusted 1 and 0.5.
+    offsets = torch.tensor([0, 1, 3, 4])
+    middles = torch.tensor([5.0, 2.0, 2.25, 9.0])
+    weights, left = torch.tensor([0.9, 0.5, 0.3, 0.7]), torch.tensor([0.1, 0.2, 0.3])
+    known = PointDepths(torch.zeros(2, dtype=torch.int64), torch.tensor([2.0, 1.0]), torch.tensor([1.0, 0.5]))
+    # First: 0.5 at the point, 0.3 half of the way to "elsewhere", 0.2 passes; second: all is elsewhere.
+    expected = (1.0 * (0.3 * 0.5 + 0.2) + 0.5 * (0.7 + 0.3)) / 2
+    assert point_depth_loss(weights, left, middles, offsets=offsets, known=known).item() == pytest.approx(expected)
+    at_points = point_depth_loss(
+        torch.tensor([0.0, 1.0, 0.0, 1.0]), torch.zeros(3), torch.tensor([5.0, 2.0, 3.0, 1.0]),
+        offsets=offsets, known=known,
+    )  # fmt: skip
+    assert at_points.item() == 0.0
+
+
+def test_the_gradient_of_the_loss_of_points_is_right():
+    offsets = torch.tensor([0, 2, 2, 5])
+    density = torch.rand(5, dtype=torch.float64, requires_grad=True)
+    lengths = torch.full((5,), 0.5, dtype=torch.float64)
+    middles = torch.tensor([1.0, 2.0, 1.0, 1.1, 1.7], dtype=torch.float64)
+    known = PointDepths(
+        torch.zeros(3, dtype=torch.int64), torch.tensor([1.9, 1.0, 1.2]).double(), torch.ones(3).double()
+    )
+
+    def loss(density: torch.Tensor) -> torch.Tensor:
+        weights, transmittance = kernels.interval_weights(density, lengths, offsets)
+        return point_depth_loss(weights, transmittance, middles, offsets=offsets, known=known)
+
+    assert torch.autograd.gradcheck(loss, (density,))
+
+
+def test_points_fade_out():
+    assert [fading(share) for share in (0.0, LAST_SHARE / 2, LAST_SHARE, 1.0)] == [1.0, 0.5, 0.0, 0.0]
+
+
+def test_undecided_rays_have_the_largest_entropy_and_decided_ones_no_infinite_slope():
+    assert opacity_entropy(torch.tensor([0.5])).item() == pytest.approx(math.log(2))
+    share = torch.tensor([0.3, 0.9, 0.02], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(opacity_entropy, (share,))
+    extremes = torch.tensor([0.0, 1.0], requires_grad=True)
+    value = opacity_entropy(extremes)
+    value.backward()
+    assert value.item() < 2e-3
+    assert extremes.grad is not None
+    assert extremes.grad.isfinite().all()
+
+
+def test_black_of_a_mask_is_ignored_or_is_empty_space(capture):
+    one = Similarity(1.0, np.eye(3), np.zeros(3))
+    ignored, empty = (pool_of(capture, masks, similarity=one) for masks in ("ignore", "empty"))
+    assert (ignored.has_alpha, ignored.usable_count) == (False, 96)
+    assert (empty.has_alpha, empty.usable_count) == (True, 192)
+    alpha = empty.colours[:, 3].view(2, 8, 12)
+    assert not alpha[:, :, :6].any()
+    assert (alpha[:, :, 6:] == 255).all()
+    assert torch.equal(empty.colours[:, :3], ignored.colours)
+
+
+def test_training_takes_all_of_them_at_once(capture, tmp_path):
+    # Bits are those of the same seed; the loss is finite with every prior on.
+    components = Components(masks="empty", points=0.1, entropy=0.01)
+    settings = TrainSettings(
+        budget_seconds=None, steps=4, first_samples_per_step=2**9, samples_per_step=2**9, components=components
+    )
+    losses: list[list[float]] = []
+    for name in ("one", "two"):
+        losses.append([])
+        train(
+            capture, tmp_path / name, settings, resume=False, notify=lambda text: None,
+            on_progress=lambda progress: losses[-1].append(progress.loss),
+        )  # fmt: skip
+    assert losses[0] == losses[1]
+    assert all(map(math.isfinite, losses[0]))
