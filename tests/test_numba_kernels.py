@@ -88,7 +88,26 @@ def test_hash_encode_takes_a_sink_and_known_values(generator):
     assert_close(sink, expected, "sink")
 
 
+def test_hash_encode_reads_no_row_that_is_no_vertex():
+    table = torch.full((1, 512, 4), torch.nan)
+    table[0, :125] = 1.0
+    points = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 0.5], [7.0, -3.0, 1.0]])
+    assert torch.equal(numba_cpu.hash_encode(points, table, (4,), None, None), torch.ones(3, 4))
+
+
 WEIGHTS = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
+
+
+def test_radiance_ends_where_the_logarithm_of_a_density_does():
+    # Weights that carry the first feature through, one path for each sign.
+    weights = tuple(torch.zeros(shape) for shape in WEIGHTS)
+    weights[0][0, 0], weights[0][1, 0], weights[1][0, 0], weights[1][0, 1] = 1.0, -1.0, 1.0, -1.0
+    encoded = torch.zeros(4, 32)
+    encoded[:, 0] = torch.tensor([-60.0, -16.0, 16.0, 60.0])
+    wanted = torch.tensor([-15.0, -15.0, 15.0, 15.0]).exp()
+    rays = torch.zeros(4, dtype=torch.int64)
+    torch.testing.assert_close(numba_cpu.radiance(encoded, torch.zeros(1, 16), rays, weights)[0], wanted)
+    torch.testing.assert_close(numba_cpu.density(encoded, weights), wanted)
 
 
 @pytest.mark.parametrize("samples", SIZES)
