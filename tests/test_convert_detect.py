@@ -227,6 +227,21 @@ def test_matches_lie_where_both_photos_show_the_same_place(photographed):
     assert np.median(errors) < 0.035
 
 
+def test_matches_are_found_where_opencvs_best_estimator_gives_up(photographed, monkeypatch):
+    """It asserts on some matches that all lie on a plane; the matches are then those of plain RANSAC."""
+    find = cv2.findFundamentalMat
+
+    def asserting(x, y, method, *options):
+        if method == cv2.USAC_MAGSAC:
+            raise cv2.error("Assertion failed (!model.empty())")
+        return find(x, y, method, *options)
+
+    monkeypatch.setattr(cv2, "findFundamentalMat", asserting)
+    pairs, cameras = match_neighbours(photographed.frames[:3], progress=silent)
+    evidence = MatchEvidence(pairs, cameras, 3)
+    assert np.median(evidence.errors_px(evidence.directions(Intrinsics()), poses_of(photographed)[:3])) < 0.05
+
+
 @pytest.mark.parametrize("meant", [Convention("opengl"), Convention("opencv", inverted=True)], ids=str)
 def test_photos_tell_the_convention_and_how_to_read_it(meant, photographed, tmp_path):
     spoiled = misread(photographed, meant, "opengl")

@@ -131,7 +131,10 @@ def _matched(first: Photo, second: Photo) -> tuple[np.ndarray, np.ndarray] | Non
     # In units of the size in which features were sought, so that the threshold means the same for every photo.
     scales = [LONGER_SIDE_PX / max(photo.camera.width, photo.camera.height) for photo in (first, second)]
     scaled = [position * min(1.0, scale) for position, scale in zip(pixels, scales, strict=True)]
-    _, agree = cv2.findFundamentalMat(scaled[0], scaled[1], cv2.USAC_MAGSAC, _EPIPOLAR_PX, 0.999, 5000)
+    try:
+        _, agree = cv2.findFundamentalMat(scaled[0], scaled[1], cv2.USAC_MAGSAC, _EPIPOLAR_PX, 0.999, 5000)
+    except cv2.error:  # OpenCV's USAC asserts (!model.empty()) on some matches that all lie on a plane
+        _, agree = cv2.findFundamentalMat(scaled[0], scaled[1], cv2.FM_RANSAC, _EPIPOLAR_PX, 0.999, 5000)
     if agree is None or agree.sum() < _LEAST_MATCHES:
         return None
     kept = agree.ravel().astype(bool)
