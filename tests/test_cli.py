@@ -406,6 +406,9 @@ def test_the_doctor_writes_a_page_beside_the_photos_and_holds_it_against_a_gate(
     assert (gated.exit_code, gated.stdout.strip()) == (GATE_NOT_MET, told["path"])
     assert "count (bad)" in error_of(gated)[0]
     assert nerfcli("doctor", folder, "--require", "fine").exit_code == USAGE
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 50 10 20 20 25 5\n")
+    unlike = nerfcli("doctor", folder, "--intrinsics", tmp_path / "cameras.txt")
+    assert (unlike.exit_code, "has no camera for photo" in error_of(unlike)[0]) == (BAD_INPUT, True)
     Path(told["path"]).write_text("mine")
     refused = nerfcli("doctor", folder)
     assert (refused.exit_code, Path(told["path"]).read_text()) == (BAD_INPUT, "mine")

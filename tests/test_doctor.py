@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
-from walks import BOARDS, FOCAL_PX, view, walk, write
+from walks import BOARDS, FOCAL_PX, HEIGHT, WIDTH, view, walk, write
 
 from nerfcli.cameras import rigid
+from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.doctor import consensus, coverage, graph, inventory, quality, two_views
@@ -191,6 +192,20 @@ def test_a_flat_world_is_told_from_a_camera_that_only_turns(tmp_path):
     places = [((0.9 * s, 0.4 * s * s, 0.5 * s), -14 * s) for s in np.linspace(-1.5, 1.5, 5)]
     flat = examined(tmp_path / "flat", [view(c, pan_deg=a, boards=BOARDS[:1]) for c, a in places]).diagnosis()
     assert list(alarms(flat)) == ["depth relief"]
+
+
+def test_intrinsics_that_are_known_tell_how_far_things_are(tmp_path):
+    """A step of 0.5 before boards at 2.6 to 6; a focal length said to be twice as long makes all twice as far."""
+    folder = write(tmp_path / "photos", [view((step, 0, 0)) for step in (0.0, 0.5)])
+
+    def baseline_over_depth(focal_px: float) -> float:
+        known = Calibration(Path("c"), (Camera.pinhole(2 * WIDTH, 2 * HEIGHT, 2 * focal_px),), {})
+        (pair,) = examine(find_subject(folder), threads=1, progress=lambda *told: None, calibration=known).pairs
+        assert pair.views is not None
+        return pair.views.baseline_over_depth
+
+    assert 0.5 / 6 < baseline_over_depth(FOCAL_PX) < 0.5 / 2.6
+    np.testing.assert_allclose(baseline_over_depth(2 * FOCAL_PX), baseline_over_depth(FOCAL_PX) / 2, rtol=0.05)
 
 
 # Parts

@@ -9,6 +9,7 @@ import typer
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, thread_count
+from nerfcli.cli.poses import Intrinsics
 from nerfcli.errors import GATE_NOT_MET, UserError
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ _STYLES = {"good": "green", "look": "yellow", "bad": "bold red"}
 def doctor(
     capture: Annotated[str, typer.Argument(help="A folder of photos or a scene, or - for such on standard input.")],
     output: Output = None,
+    intrinsics: Intrinsics = None,
     require: Annotated[
         str | None, typer.Option(help="good or look: end with exit code 7 if a finding is worse.", show_default=False)
     ] = None,
@@ -40,6 +42,7 @@ def doctor(
     Examples:
       nerfcli doctor photos/kitchen
       nerfcli doctor photos/kitchen --json -o kitchen.html | jq .verdict
+      nerfcli doctor photos/kitchen --intrinsics calibration/cameras.txt
       nerfcli doctor photos/kitchen --require look
       ls -d captures/*/ | nerfcli doctor - -o pages/
     """
@@ -49,7 +52,14 @@ def doctor(
 
     def work(path: Path, one_of_many: bool) -> None:
         page = result_path(path, suffix="-doctor.html", output=output, one_of_many=one_of_many)
-        diagnosis = examine_capture(path, page, threads=thread_count(threads), overwrite=overwrite, console=console)
+        diagnosis = examine_capture(
+            path,
+            page,
+            threads=thread_count(threads),
+            overwrite=overwrite,
+            console=console,
+            intrinsics=intrinsics,
+        )
         from nerfcli.doctor.examination import content
 
         console.result(page, content(diagnosis))
@@ -59,20 +69,24 @@ def doctor(
     for_each_input(capture, work)
 
 
-def examine_capture(path: Path, page: Path, *, threads: int, overwrite: bool, console: Console) -> "Diagnosis":
-    """Examine a capture, write its page and print the table of findings.
+def examine_capture(
+    path: Path, page: Path, *, threads: int, overwrite: bool, console: Console, intrinsics: Path | None = None
+) -> "Diagnosis":
+    """Examine a capture, write its page and print the table of findings; with a file of intrinsics, if they are known.
 
     Raises:
-        UserError: see `find_subject` and `refuse_foreign`; or the page cannot be written.
+        UserError: see `find_subject`, `read_calibration` and `refuse_foreign`; or the page cannot be written.
     """
     import cv2
 
     from nerfcli.atomic import cannot_write
+    from nerfcli.convert.intrinsics import read_calibration
     from nerfcli.doctor.examination import estimated_seconds, examine
     from nerfcli.doctor.page import refuse_foreign, write_page
     from nerfcli.doctor.subject import find_subject
 
     subject = find_subject(path)
+    calibration = None if intrinsics is None else read_calibration(intrinsics, images=path)
     if page.is_dir():
         raise UserError(f"{page} is a folder", "give the page's file name with -o")
     if not overwrite:
@@ -85,7 +99,7 @@ def examine_capture(path: Path, page: Path, *, threads: int, overwrite: bool, co
     console.note(f"{path}: {count} photos, about {_time(seconds)}")
     cv2.setNumThreads(1)  # photos and pairs are worked on in parallel; threads within them only wait for each other
     with console.progress(f"doctor {path.name}") as update:
-        diagnosis = examine(subject, threads=threads, progress=update)
+        diagnosis = examine(subject, threads=threads, progress=update, calibration=calibration)
     write_page(diagnosis, page)
     _print_table(diagnosis, console)
     return diagnosis

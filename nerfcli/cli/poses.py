@@ -39,6 +39,14 @@ _STAGES = {
     "check": "checks of the poses",
 }
 
+Intrinsics = Annotated[
+    Path | None,
+    typer.Option(help="A file with the photos' cameras: COLMAP's cameras.txt or .bin, a scene, transforms.json..."),
+]
+IntrinsicsAs = Annotated[
+    str | None,
+    typer.Option(help="fixed: the intrinsics are exact; prior: the adjustment starts there.  [default: fixed]"),
+]
 Quality = Annotated[str, typer.Option(help="Of the poses: fast, default or best: sizes and numbers of features.")]
 
 
@@ -64,14 +72,8 @@ def poses(
         Path | None, typer.Option(help="A file with the pairs to compare, two names per line.", dir_okay=False)
     ] = None,
     camera_model: Annotated[str, typer.Option(help="auto, or a COLMAP model such as SIMPLE_RADIAL, OPENCV.")] = "auto",
-    intrinsics: Annotated[
-        Path | None,
-        typer.Option(help="A file with the photos' cameras: COLMAP's cameras.txt or .bin, a scene, transforms.json..."),
-    ] = None,
-    intrinsics_as: Annotated[
-        str | None,
-        typer.Option(help="fixed: the intrinsics are exact; prior: the adjustment starts there.  [default: fixed]"),
-    ] = None,
+    intrinsics: Intrinsics = None,
+    intrinsics_as: IntrinsicsAs = None,
     holdout: Holdout = None,
     strict: Strict = False,
     min_registered: Annotated[float, typer.Option(help="Share of photos that must register.", min=0, max=1)] = 0.5,
@@ -112,7 +114,6 @@ def poses(
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
     from nerfcli.holdout import DEFAULT_HOLDOUT
-    from nerfcli.poses.cameras import USES
     from nerfcli.poses.memory import default_memory_limit
     from nerfcli.poses.pairs import PAIRINGS
     from nerfcli.poses.settings import CAMERA_MODELS, Limits, PoseSettings
@@ -120,14 +121,12 @@ def poses(
     for value, choices, option in (
         (camera_model, CAMERA_MODELS, "--camera-model"),
         (pairing, PAIRINGS, "--pairing"),
-        (intrinsics_as or "fixed", USES, "--intrinsics-as"),
     ):
         if value not in choices:
             raise typer.BadParameter(f"{value!r}; choose {', '.join(choices)}", param_hint=option)
     if pairs is not None and pairing != "auto":
         raise typer.BadParameter("the pairs come from --pairs; leave out --pairing", param_hint="--pairing")
-    if intrinsics_as is not None and intrinsics is None:
-        raise typer.BadParameter("there are no intrinsics to use so; add --intrinsics", param_hint="--intrinsics-as")
+    use = use_of(intrinsics, intrinsics_as)
     if intrinsics is not None and camera_model != "auto":
         raise typer.BadParameter(
             "the camera models come from --intrinsics; leave out --camera-model", param_hint="--camera-model"
@@ -156,11 +155,11 @@ def poses(
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
         if dry_run:
             folder = frames_there(source, scene)
-            given = given_intrinsics(intrinsics, folder, use=intrinsics_as or "fixed")
+            given = given_intrinsics(intrinsics, folder, use=use)
             plan_scene(source, folder, settings=settings, given=given, console=console)
             return
         folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
-        given = given_intrinsics(intrinsics, folder, use=intrinsics_as or "fixed")
+        given = given_intrinsics(intrinsics, folder, use=use)
         estimate_scene(
             folder, scene, settings=settings, limits=limits, overwrite=overwrite, console=console, given=given
         )
@@ -181,6 +180,21 @@ def sizes_of(quality: str) -> tuple[int, int]:
     if quality not in QUALITIES:
         raise typer.BadParameter(f"{quality!r}; choose {', '.join(QUALITIES)}", param_hint="--quality")
     return QUALITIES[quality]
+
+
+def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
+    """How intrinsics are used, by --intrinsics-as.
+
+    Raises:
+        typer.BadParameter: not a way to use them, or there are none.
+    """
+    from nerfcli.poses.cameras import USES
+
+    if intrinsics_as is not None and intrinsics_as not in USES:
+        raise typer.BadParameter(f"{intrinsics_as!r}; choose {', '.join(USES)}", param_hint="--intrinsics-as")
+    if intrinsics_as is not None and intrinsics is None:
+        raise typer.BadParameter("there are no intrinsics to use so; add --intrinsics", param_hint="--intrinsics-as")
+    return intrinsics_as or USES[0]
 
 
 def given_intrinsics(file: Path | None, photos: Path, *, use: str) -> "GivenIntrinsics | None":

@@ -26,7 +26,7 @@ from nerfcli.cli.options import (
     seconds_from_text,
     thread_count,
 )
-from nerfcli.cli.poses import Quality, sizes_of
+from nerfcli.cli.poses import Intrinsics, IntrinsicsAs, Quality, given_intrinsics, sizes_of, use_of
 
 
 @command
@@ -35,6 +35,8 @@ def run(
     output: Output = None,
     frames: Frames = None,
     quality: Quality = "default",
+    intrinsics: Intrinsics = None,
+    intrinsics_as: IntrinsicsAs = None,
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
     downscale: Downscale = "auto",
     count: Annotated[int, typer.Option(help="Views of the orbit video.", min=2)] = 60,
@@ -60,6 +62,7 @@ def run(
     Examples:
       nerfcli run photos/kitchen
       nerfcli run photos/kitchen -o kitchen --budget 5m
+      nerfcli run photos/kitchen --intrinsics calibration/cameras.txt
       nerfcli run kitchen.mp4
       nerfcli run photos/kitchen --require "psnr>=25,registered>=0.9"
     """
@@ -79,6 +82,7 @@ def run(
     requirements, rule = requirements_of(require), holdout_rule(holdout)
     cores, torch_device = thread_count(threads), device_name(device)
     max_image_size, max_features = sizes_of(quality)
+    use = use_of(intrinsics, intrinsics_as)
     pose_settings = PoseSettings(
         max_image_size=max_image_size,
         max_features=max_features,
@@ -102,8 +106,15 @@ def run(
         if output is not None:
             scene, field = scene / "scene", scene / "run"
         folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
-        limits = Limits(memory_bytes=default_memory_limit())
-        estimate_scene(folder, scene, settings=pose_settings, limits=limits, overwrite=overwrite, console=console)
+        estimate_scene(
+            folder,
+            scene,
+            settings=pose_settings,
+            limits=Limits(memory_bytes=default_memory_limit()),
+            overwrite=overwrite,
+            console=console,
+            given=given_intrinsics(intrinsics, folder, use=use),
+        )
         resume = not overwrite and was_interrupted(scene, field, train_settings)
         train_scene(scene, field, settings=train_settings, resume=resume, overwrite=overwrite, console=console)
         metrics, numbers = evaluate_run(field, device=torch_device, threads=cores, overwrite=overwrite, console=console)

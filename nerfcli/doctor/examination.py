@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.doctor import coverage, geometry, graph, inventory, quality
 from nerfcli.doctor.findings import Finding, as_json, worst
 from nerfcli.doctor.matching import Pair, compare, focal_px
@@ -52,10 +53,19 @@ def estimated_seconds(count: int, threads: int) -> float:
     return (count * _SECONDS_PER_PHOTO + graph.pair_count(count) * _SECONDS_PER_PAIR) / threads
 
 
-def examine(subject: Subject, *, threads: int, progress: Callable[[float, str], None]) -> Diagnosis:
-    """Examine a capture: read every photo once, compare pairs, and judge.
+def examine(
+    subject: Subject,
+    *,
+    threads: int,
+    progress: Callable[[float, str], None],
+    calibration: Calibration | None = None,
+) -> Diagnosis:
+    """Examine a capture: read every photo once, compare pairs, and judge; with intrinsics, where they are known.
 
     Deterministic: the same photos give the same findings.
+
+    Raises:
+        UserError: the intrinsics are not those of a photo.
     """
     count = len(subject.sources)
     reading = count * _SECONDS_PER_PHOTO
@@ -74,7 +84,7 @@ def examine(subject: Subject, *, threads: int, progress: Callable[[float, str], 
     def on_pair(done: int) -> None:
         progress(share + (1 - share) * done / max(len(places), 1), f"pair {done} of {len(places)}")
 
-    focals = _focals(subject, facts)
+    focals = _focals(subject, facts) if calibration is None else _known_focals(subject, facts, calibration)
     pairs = compare_all(facts, places, focals, threads=threads, progress=on_pair)
     pairs = _second_look(facts, pairs, focals)
     return judged(subject, facts, pairs, unreadable=unreadable)
@@ -167,6 +177,19 @@ def _focals(subject: Subject, photos: Sequence[PhotoFacts]) -> list[float]:
         else:
             focals.append(camera.focal_px * max(photo.features.size) / max(camera.width, camera.height))
     return focals
+
+
+def _known_focals(subject: Subject, photos: Sequence[PhotoFacts], calibration: Calibration) -> list[float]:
+    """Focal lengths at the features' size, by the intrinsics of a file."""
+    paths = {source.name: source.path for source in subject.sources}
+    pictures = [
+        Picture(paths[photo.name], photo.exif.width, photo.exif.height, photo.exif.orientation or 1) for photo in photos
+    ]
+    cameras = [found.camera for found in calibrated(calibration, pictures)]
+    return [
+        camera.focal_px * max(photo.features.size) / max(camera.width, camera.height)
+        for photo, camera in zip(photos, cameras, strict=True)
+    ]
 
 
 def content(diagnosis: Diagnosis) -> dict[str, object]:
