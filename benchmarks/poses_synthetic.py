@@ -23,7 +23,7 @@ import synthetic_captures as synthetic
 import typer
 from rich.console import Console
 from rich.table import Table
-from synthetic_captures import FISHEYE, LONG, PHONE, WIDE, Noise, Scene, View
+from synthetic_captures import FISHEYE, LONG, PHONE, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
 from nerfcli.poses.examine import examine
 from nerfcli.poses.ladder import climb
@@ -76,6 +76,7 @@ def captures(seed: int) -> dict[str, Capture]:
         "two cameras": Capture(ring(16, [WIDE, LONG], seed=seed), ball),
         "phone lens": Capture(ring(24, [PHONE], seed=seed), ball),
         "fisheye": Capture(ring(16, [FISHEYE], seed=seed, radius=2.0), rooms),
+        "unknown fisheye": Capture(ring(16, [UNKNOWN_FISHEYE], seed=seed, radius=2.0), rooms),
         "low overlap": Capture(ring(12, [WIDE], seed=seed), ball, pairs=lambda i, j: (j - i) % 12 in (1, 11)),
         "disconnected": Capture(
             [*ring(10, [WIDE], seed=seed), *ring(7, [WIDE], seed=seed + 1, at=far)], apart, refused="parts of 10 + 7"
@@ -104,7 +105,7 @@ def solve(name: str, capture: Capture, *, seed: int) -> Result:
         job = synthetic.synthetic_job(folder, capture.views, seed=seed)
         start = time.process_time()
         climbed = climb(job, lambda *told: None)
-        examined = examine(climbed.models, climbed.job, lambda *told: None)
+        examined = examine(climbed.models, climbed.job, lambda *told: None, localised=climbed.localised)
         seconds = time.process_time() - start
         model = examined.model
         failures = [f"{failure.kind}: {failure.evidence}" for failure in examined.verdict.failures]

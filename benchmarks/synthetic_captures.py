@@ -5,7 +5,7 @@ have no partner, matches that are wrong. Everything from the verification of the
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,9 @@ WIDE = Lens("SIMPLE_RADIAL", 1000, 750, (800.0, 500.0, 375.0, -0.05))
 LONG = Lens("SIMPLE_RADIAL", 900, 1200, (1600.0, 450.0, 600.0, 0.02))
 PHONE = Lens("RADIAL", 1000, 750, (820.0, 510.0, 369.0, 0.12, -0.25))
 FISHEYE = Lens("OPENCV_FISHEYE", 1000, 1000, (320.0, 320.0, 500.0, 500.0, 0.03, -0.01, 0.004, -0.001), "OPENCV_FISHEYE")
+
+# The same lens, of which nothing is known: as photos without EXIF are.
+UNKNOWN_FISHEYE = replace(FISHEYE, start_model="SIMPLE_RADIAL")
 
 
 @dataclass(frozen=True)
@@ -188,12 +191,12 @@ def write_database(
             if "FISHEYE" in lens.start_model:  # as a user would say who knows the lens
                 start.params = [*lens.params[:4], *[0.0] * (len(start.params) - 4)]
                 start.has_prior_focal_length = True
-            _write_camera(database, start)
+            write_camera(database, start)
         order: list[dict[int, int]] = []
         for number, view in enumerate(views):
             points, pixels = seen(view, scene)
-            keypoints, index = _features(points, pixels, view.lens, scene, noise=noise, rng=rng)
-            _write_image(database, number, lenses.index(view.lens) + 1, keypoints)
+            keypoints, looks, index = _features(points, pixels, view.lens, scene, noise=noise, rng=rng)
+            write_image(database, number, lenses.index(view.lens) + 1, keypoints=keypoints, looks=looks)
             order.append(index)
         for i in range(len(views)):
             for j in range(i + 1, len(views)):
@@ -206,6 +209,38 @@ def write_database(
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = seed
     pycolmap.geometric_verification(str(path), verifier, two_view_geometry_options=geometry)
+
+
+def write_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
+    """A camera and its rig under the camera's own id."""
+    camera_id = database.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+
+
+def write_image(
+    database: pycolmap.Database, number: int, camera_id: int, *, keypoints: Array, looks: NDArray[np.int64]
+) -> None:
+    """Photo `number` and its features, which look like the points `looks` (-1: like nothing)."""
+    image = pycolmap.Image(name=photo_name(number), camera_id=camera_id, image_id=number + 1)
+    database.write_image(image, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=number + 1, rig_id=camera_id)
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame, use_frame_id=True)
+    database.write_keypoints(number + 1, keypoints.astype(np.float32))
+    sift = pycolmap.FeatureExtractorType.SIFT
+    database.write_descriptors(number + 1, pycolmap.FeatureDescriptors(sift, _appearance(looks, seed=number)))
+
+
+def _appearance(looks: NDArray[np.int64], *, seed: int) -> NDArray[np.uint8]:
+    """Descriptors (n, 128) as pycolmap's: of length 512; 0.35 apart for one look, 0.85 for two, if the length is 1."""
+    rng = np.random.default_rng([seed, 1])
+    known = np.abs(np.random.default_rng(0).normal(size=(looks.max(initial=-1) + 1, 128)))
+    found = np.abs(rng.normal(size=(len(looks), 128)))
+    found[looks >= 0] = known[looks[looks >= 0]]
+    found *= np.exp(rng.normal(scale=0.25, size=found.shape))
+    return np.minimum(np.rint(512 * found / np.linalg.norm(found, axis=1, keepdims=True)), 255).astype(np.uint8)
 
 
 def synthetic_job(folder: Path, views: Sequence[View], *, seed: int) -> Job:
@@ -284,14 +319,14 @@ def _camera(lens: Lens, camera_id: int) -> pycolmap.Camera:
 
 def _features(
     points: NDArray[np.int64], pixels: Array, lens: Lens, scene: Scene, *, noise: Noise, rng: np.random.Generator
-) -> tuple[Array, dict[int, int]]:
-    """Keypoints in random order, clutter among them, and the keypoint of each look."""
+) -> tuple[Array, NDArray[np.int64], dict[int, int]]:
+    """Keypoints in random order, clutter among them, the look of each (-1: none), and the keypoint of each look."""
     noisy = pixels + rng.normal(scale=noise.features_px, size=pixels.shape)
     clutter = rng.uniform(0, [lens.width, lens.height], size=(len(points) // 4 + 10, 2))
     looks = np.concatenate([scene.looks[points], np.full(len(clutter), -1)])
     shuffled = rng.permutation(len(looks))
     index = {int(looks[old]): new for new, old in enumerate(shuffled) if looks[old] >= 0}
-    return np.vstack([noisy, clutter])[shuffled], index
+    return np.vstack([noisy, clutter])[shuffled], looks[shuffled], index
 
 
 def _matches(
@@ -306,19 +341,3 @@ def _matches(
         [rng.choice(list(one.values()), wrong_count), rng.choice(list(other.values()), wrong_count)]
     )
     return np.vstack([right, wrong]).astype(np.uint32)
-
-
-def _write_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> None:
-    camera_id = database.write_camera(camera, use_camera_id=True)
-    rig = pycolmap.Rig(rig_id=camera_id)
-    rig.add_ref_sensor(camera.sensor_id)
-    database.write_rig(rig, use_rig_id=True)
-
-
-def _write_image(database: pycolmap.Database, number: int, camera_id: int, keypoints: Array) -> None:
-    image = pycolmap.Image(name=photo_name(number), camera_id=camera_id, image_id=number + 1)
-    database.write_image(image, use_image_id=True)
-    frame = pycolmap.Frame(frame_id=number + 1, rig_id=camera_id)
-    frame.add_data_id(image.data_id)
-    database.write_frame(frame, use_frame_id=True)
-    database.write_keypoints(number + 1, keypoints.astype(np.float32))

@@ -23,6 +23,7 @@ from corner import NAMES, write_capture
 
 import nerfcli
 from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
+from nerfcli.poses import structure_from_motion
 from nerfcli.poses.memory import default_memory_limit, resident_bytes
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.settings import Limits, PoseSettings
@@ -30,7 +31,8 @@ from nerfcli.poses.stages import read_stage, write_stage
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, plan_poses
 from nerfcli.poses.workspace import database_bytes, drop_database, workspace
 
-ONE_THREAD = PoseSettings(max_features=300, threads=1)
+# A lens of its own choice would only be adjusted more often.
+ONE_THREAD = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
 Progress = Callable[[str, int, int], None]
 
 
@@ -79,10 +81,27 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene of a call that nothing disturbed."""
-    scene = tmp_path_factory.mktemp("whole") / "scene"
-    assert estimate(photos, scene).registered == len(NAMES)
+def unpublished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a call leaves that ends between the worker's last file and the scene's."""
+    scene = tmp_path_factory.mktemp("unpublished") / "scene"
+
+    def interrupted(scene_dir: Path, describe: Callable[[], None]) -> None:
+        raise KilledError
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(structure_from_motion, "publish", interrupted)
+        with pytest.raises(KilledError):
+            estimate(photos, scene)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def whole(photos: Path, unpublished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene, of a model that was there already: nothing but the last step is done."""
+    scene = shutil.copytree(unpublished, tmp_path_factory.mktemp("whole") / "scene")
+    stages: list[str] = []
+    assert estimate(photos, scene, progress=lambda stage, done, total: stages.append(stage)).registered == len(NAMES)
+    assert "map" not in stages
     return scene
 
 
@@ -101,6 +120,18 @@ def test_after_kills_in_two_stages_the_result_is_the_same_to_the_last_bit(photos
     assert estimate(photos, scene).registered == len(NAMES)
     assert model(scene) == model(whole)
     assert rows(scene, "two_view_geometries", "pair_id") == rows(whole, "two_view_geometries", "pair_id")
+
+
+def test_a_model_that_has_gone_is_made_again_whatever_its_result_says(
+    photos: Path, unpublished: Path, whole: Path, tmp_path: Path
+):
+    scene = shutil.copytree(unpublished, tmp_path / "scene")
+    images = scene / "work" / "sparse" / "0" / "images.bin"
+    images.write_bytes(images.read_bytes()[:-8])
+    stages: list[str] = []
+    estimate(photos, scene, progress=lambda stage, done, total: stages.append(stage))
+    assert "map" in stages
+    assert model(scene) == model(whole)
 
 
 def test_another_camera_model_extracts_and_matches_nothing_again(photos: Path, whole: Path, again: Path):
@@ -153,13 +184,20 @@ def test_a_changed_photo_is_extracted_again_and_no_other(photos: Path, whole: Pa
     assert after[3] == before[4]
 
 
+def _holds_the_same_again(photos: Path, whole: Path, scene: Path) -> None:
+    """All that mapping starts from: as it comes out of that is what the tests above show."""
+    with pytest.raises(KilledError):
+        estimate(photos, scene, progress=killed_at("map", 0))
+    for table, key in (("descriptors", "image_id"), ("keypoints", "image_id"), ("two_view_geometries", "pair_id")):
+        assert rows(scene, table, key) == rows(whole, table, key)
+
+
 def test_a_damaged_database_is_made_anew(photos: Path, whole: Path, again: Path):
     """As a machine that lost its power may leave it."""
     content = bytearray((again / "database.db").read_bytes())
     content[len(content) // 3 : len(content) // 2] = bytes(len(content) // 2 - len(content) // 3)
     (again / "database.db").write_bytes(content)
-    estimate(photos, again)
-    assert model(again) == model(whole)
+    _holds_the_same_again(photos, whole, again)
 
 
 @pytest.mark.parametrize(
@@ -199,8 +237,7 @@ def test_damaged_stages_are_done_again(photos: Path, whole: Path, again: Path):
         path.write_bytes(wrong.encode(errors="surrogateescape"))
     (again / "poses_report.json").write_text("[]")
     assert not is_same_scene(again, photos, ONE_THREAD)
-    estimate(photos, again)
-    assert model(again) == model(whole)
+    _holds_the_same_again(photos, whole, again)
 
 
 def test_the_database_is_one_that_colmap_reads_with_the_users_photos(whole: Path, photos: Path):
@@ -262,19 +299,30 @@ def test_planning_writes_nothing(photos: Path):
     assert sorted(path.name for path in photos.parent.iterdir()) == before
 
 
+def _wait_for_worker(scene: Path) -> None:
+    """Until the worker has seen that its parent has gone, and let go of the scene."""
+    while True:
+        try:
+            with workspace(scene):
+                return
+        except UserError:
+            time.sleep(0.05)
+
+
 @pytest.mark.slow
 def test_ten_kills_at_random_moments_change_nothing(photos: Path, whole: Path, tmp_path: Path):
     """The whole command is killed (SIGKILL); its worker then ends by itself, and the next call waits for neither."""
     rng = random.Random(0)
     scene = tmp_path / "scene"
     command = [sys.executable, "-m", "nerfcli", "poses", str(photos), "-o", str(scene), "--max-features", "300"]
+    command += ["--camera-model", "SIMPLE_RADIAL"]
     environment = {**os.environ, "PYTHONPATH": str(Path(nerfcli.__file__).parent.parent)}
     for _ in range(10):
         process = subprocess.Popen([*command, "--threads", "1", "--quiet"], env=environment, stderr=subprocess.PIPE)
         time.sleep(rng.uniform(0.5, 6.0))
         process.send_signal(signal.SIGKILL)
         process.communicate()
-        time.sleep(0.2)  # for the worker to see that its parent has gone
+        _wait_for_worker(scene)
         if (scene / "scene.json").exists():  # it was quicker: once more from the beginning
             assert model(scene) == model(whole)
             shutil.rmtree(scene)

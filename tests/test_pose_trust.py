@@ -12,13 +12,14 @@ import numpy as np
 import pycolmap
 import pytest
 import synthetic_captures as synthetic
-from synthetic_captures import LONG, WIDE, Noise, Scene, View
+from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
 from nerfcli.poses import merging
 from nerfcli.poses.acceptance import judge, leave_out_contradicting
 from nerfcli.poses.examine import Examined, examine
 from nerfcli.poses.job import Job
 from nerfcli.poses.ladder import Climb, climb
+from nerfcli.poses.lens_family import as_fisheye
 from nerfcli.poses.parallax import best_turn
 from nerfcli.poses.two_views import read_verified_pairs, rotation_errors
 from nerfcli.poses.view_graph import Bottlenecks, parts
@@ -52,7 +53,8 @@ def solve(folder: Path, views: Sequence[View], scene: Scene, noise: Noise = Nois
     synthetic.write_database(folder / "database.db", views, scene, noise=noise, seed=0, **options)
     job = synthetic.synthetic_job(folder, views, seed=0)
     climbed = climb(job, lambda *told: None)
-    return Solved(views, job, climbed, examine(climbed.models, climbed.job, lambda *told: None))
+    examined = examine(climbed.models, climbed.job, lambda *told: None, localised=climbed.localised)
+    return Solved(views, job, climbed, examined)
 
 
 @pytest.fixture(scope="module")
@@ -164,8 +166,8 @@ def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
 
 def test_a_scene_that_repeats_itself_is_recognised(tmp_path: Path):
     """A body whose back looks like its front. The mapper places every photo at half a pixel, half of them wrong."""
-    folded = solve(tmp_path, synthetic.ring(18, [WIDE], seed=0), synthetic.twofold(1200, seed=0))
-    assert folded.model.num_reg_images() == 18
+    folded = solve(tmp_path, synthetic.ring(14, [WIDE], seed=0), synthetic.twofold(800, seed=0))
+    assert folded.model.num_reg_images() == 14
     assert folded.model.compute_mean_reprojection_error() < 0.8
     assert folded.kinds == ["parts of the scene look alike (repeated structure)"]
 
@@ -173,7 +175,7 @@ def test_a_scene_that_repeats_itself_is_recognised(tmp_path: Path):
 def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
     """What fits all matches is a turn, with the true focal length."""
     views = synthetic.panorama(6, WIDE, turn_deg=120)
-    still = solve(tmp_path, views, synthetic.room(1800, seed=0))
+    still = solve(tmp_path, views, synthetic.room(900, seed=0))
     assert still.kinds[0] == "no baseline (pure rotation)"
     with pycolmap.Database.open(str(still.job.database)) as database:
         pairs = read_verified_pairs(database, min_matches=30)
@@ -185,7 +187,7 @@ def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
 
 def test_parts_that_share_nothing_are_told_apart(tmp_path: Path):
     far = (40.0, 0.0, 0.0)
-    scene = synthetic.together(synthetic.boulder(600, seed=0), synthetic.boulder(600, seed=1, centre=far))
+    scene = synthetic.together(synthetic.boulder(600, seed=0), synthetic.boulder(300, seed=1, centre=far))
     views = [*synthetic.ring(6, [WIDE], seed=0, turn_deg=150), *synthetic.ring(4, [WIDE], seed=1, at=far, turn_deg=100)]
     apart = solve(tmp_path, views, scene)
     assert apart.examined.details["parts"] == [6, 4]
@@ -204,6 +206,39 @@ def test_every_rung_is_written_down_with_its_result(tmp_path: Path):
     ]
     assert all(rung["models"] == [] for rung in weak.climbed.rungs)
     assert weak.examined.model is None
+
+
+def test_a_photo_that_no_pair_holds_is_placed_by_what_the_model_knows(tmp_path: Path):
+    """It has no match with any photo; its place is right, and is told among the rungs."""
+    views = synthetic.ring(7, [WIDE], seed=0, turn_deg=140)
+    weak = solve(tmp_path, views, synthetic.boulder(500, seed=0), pairs=lambda i, j: 3 not in (i, j))
+    assert [(rung["what"], rung["models"]) for rung in weak.climbed.rungs] == [
+        ("default thresholds", [6]),
+        ("single photos, by the points that they show", [7]),
+    ]
+    assert [(one["name"], one["refused"]) for one in weak.climbed.rungs[1]["photos"]] == [("00003.jpg", "")]
+    assert (weak.examined.verdict.accepted, weak.examined.left_out) == (True, {})
+    turned = weak.model.image(4).cam_from_world().rotation * weak.model.image(1).cam_from_world().rotation.inverse()
+    truth = synthetic.true_model(views)
+    true = truth.image(4).cam_from_world().rotation * truth.image(1).cam_from_world().rotation.inverse()
+    assert np.degrees((turned * true.inverse()).angle()) < 0.8
+
+
+def test_a_fisheye_of_which_nothing_is_known_is_recognised(tmp_path: Path):
+    """180 degrees wide, and the mapper starts from a perspective lens; a perspective capture has no such rung."""
+    scene = synthetic.together(synthetic.boulder(250, seed=0), synthetic.room(300, seed=1))
+    views = synthetic.ring(6, [UNKNOWN_FISHEYE], seed=0, radius=2.0, turn_deg=100)
+    synthetic.write_database(tmp_path / "database.db", views, scene, noise=Noise(), seed=0)
+    climbed = climb(synthetic.synthetic_job(tmp_path, views, seed=0), lambda *told: None)
+    assert [rung["what"] for rung in climbed.rungs] == ["default thresholds", "start from a fisheye lens"]
+    assert climbed.models[0].num_reg_images() == 6
+    (camera,) = climbed.models[0].cameras.values()
+    assert camera.is_perspective_fisheye()
+    assert camera.mean_focal_length() == pytest.approx(UNKNOWN_FISHEYE.params[0], rel=0.02)
+
+
+def test_pairs_of_perspective_photos_ask_for_no_fisheye(solved: Solved):
+    assert as_fisheye(solved.job) is None
 
 
 def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path):

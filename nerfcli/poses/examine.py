@@ -1,6 +1,6 @@
 """After mapping: which lens the photos can hold, what contradicts the model, whether to believe it, how sharp it is."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,6 +10,7 @@ import pycolmap
 from nerfcli.poses.acceptance import MIN_MATCHES, Verdict, judge, leave_out_contradicting, nothing_placed
 from nerfcli.poses.intrinsics import Candidate, choose_lenses
 from nerfcli.poses.job import Job
+from nerfcli.poses.localise import shared_pairs
 from nerfcli.poses.parallax import best_turn
 from nerfcli.poses.reasons import FEW_MATCHES
 from nerfcli.poses.two_views import read_verified_pairs
@@ -34,8 +35,17 @@ class Examined:
     details: dict[str, Any]
 
 
-def examine(models: list[pycolmap.Reconstruction], job: Job, report: Callable[[str, int, int], None]) -> Examined:
-    """Choose lenses, leave out what contradicts, adjust, judge, and measure the uncertainty of the largest model."""
+def examine(
+    models: list[pycolmap.Reconstruction],
+    job: Job,
+    report: Callable[[str, int, int], None],
+    *,
+    localised: Sequence[int] = (),
+) -> Examined:
+    """Choose lenses, leave out what contradicts, adjust, judge, and measure the uncertainty of the largest model.
+
+    localised: ids of images that are held by no pair but by points of the model.
+    """
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
@@ -47,7 +57,8 @@ def examine(models: list[pycolmap.Reconstruction], job: Job, report: Callable[[s
         return Examined(None, nothing_placed(turn), {}, {}, details)
     numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
     report("check", 0, 4)
-    model, left_out = leave_out_contradicting(models[0], pairs)
+    held = shared_pairs(models[0], localised, min_matches=MIN_MATCHES)
+    model, left_out = leave_out_contradicting(models[0], [*pairs, *held])
     report("check", 1, 4)
     model, tried = _with_lenses(model, job)
     details["lenses"] = [asdict(candidate) for candidate in tried]

@@ -6,15 +6,18 @@ for more matches and more features.
 
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-from nerfcli.poses.database import evidence
+from nerfcli.poses.database import evidence, register_photos
 from nerfcli.poses.features import extract, match, start_matching
+from nerfcli.poses.intrinsics import field_of_view_deg
 from nerfcli.poses.job import Job, Report, Tell
+from nerfcli.poses.lens_family import as_fisheye
+from nerfcli.poses.localise import left_out, localise
 from nerfcli.poses.mapping import Start, map_photos
 from nerfcli.poses.merging import merge_models
 from nerfcli.poses.pairs import all_pairs
@@ -30,6 +33,10 @@ _FEW_SHARE = 0.75
 _MOST_PAIRS = 12_000
 _MOST_FULL_SIZE = 150
 _MORE_FEATURES = 8192
+# A perspective lens from here on may be a fisheye.
+_WIDE_DEG = 100.0
+# Each takes some seconds; where more are missing, it is not single photos that are.
+_MOST_SINGLE_PHOTOS = 60
 
 SMALLER_BASELINE = Start(init_min_tri_angle=8.0, init_min_num_inliers=50)
 LOW_ANGLES = Start(
@@ -41,12 +48,14 @@ LOW_ANGLES = Start(
 class Climb:
     """What the ladder led to: the models, largest first, the job whose features and matches they are of, the rungs.
 
-    A rung is {"what", "models": sizes, largest first}.
+    A rung is {"what", "models": sizes, largest first}; the one that looks for single photos has "photos" too: what was
+    found for each. localised: ids of the images that are placed by the model's points, without a pair that holds them.
     """
 
     models: list[pycolmap.Reconstruction]
     job: Job
     rungs: list[dict[str, Any]]
+    localised: tuple[int, ...] = ()
 
 
 class _Ladder:
@@ -88,6 +97,22 @@ class _Ladder:
             if _placed(merged) > _placed(models):
                 self._take("sub-models merged", merged, job)
 
+    def attempt_instead(self, what: str, job: Job, start: Start) -> None:
+        """Map once; the result counts if it places as many photos as the best so far, which rests on something else."""
+        best = self.best
+        self.best = Climb([], job, [])
+        self.attempt(what, job, start)
+        if _placed(self.best.models) < _placed(best.models):
+            self.best = best
+
+    def is_wide(self) -> bool:
+        """Whether a camera of the best model sees so much that it may be a fisheye."""
+        if not self.best.models:
+            return False
+        model = self.best.models[0]
+        cameras = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+        return any(field_of_view_deg(model.camera(camera_id)) > _WIDE_DEG for camera_id in cameras)
+
     def go_on(self, what: str, start: Start) -> None:
         """Try to place the rest from the best model as it is."""
         models, job = self.best.models, self.best.job
@@ -97,6 +122,25 @@ class _Ladder:
         grown = map_photos(job, self._report, attempt=len(self.rungs), start=start, base=models[0])
         if grown:
             self._take(what, [grown[0], *models[1:]], job)
+
+    def find_left_out(self, what: str) -> None:
+        """Place, one by one, photos of which no pair is strong enough, by what the best model knows."""
+        models, job = self.best.models, self.best.job
+        if not models:
+            return
+        left = left_out(models[0], job)
+        if not 0 < len(left) <= _MOST_SINGLE_PHOTOS:
+            return
+        self.announce(what)
+        grown, attempts = localise(models[0], job, image_ids=left)
+        placed = tuple(attempt.image_id for attempt in attempts if not attempt.refused)
+        names = dict(zip(job.image_ids, job.names, strict=True))
+        found = [{"name": names[one.image_id], **asdict(one)} for one in attempts]
+        rest = [model for model in models[1:] if not set(model.reg_image_ids()) <= set(grown.reg_image_ids())]
+        self._take(what, [grown, *rest], job)
+        self.rungs[-1]["photos"] = found
+        if placed:
+            self.best = replace(self.best, localised=placed)
 
     def _take(self, what: str, models: list[pycolmap.Reconstruction], job: Job) -> None:
         self.rungs.append({"what": what, "models": [model.num_reg_images() for model in models]})
@@ -111,14 +155,17 @@ class _Ladder:
 def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Climb:
     """Map a job's photos, with as many attempts as it takes.
 
-    The first attempt has pycolmap's own thresholds. If it leaves out many photos that match some other one well, the
-    next ones start from a pair with a smaller baseline, from the strongest pair that was left out, and with low angles.
-    If photos with features are still missing, all pairs are compared that were not, and last, more features are sought
-    in the photos' full size. If the first attempt is not the last, `tell` is told each attempt and its result.
+    The first attempt has pycolmap's own thresholds. If its lens came out wide or it leaves out many photos, the next
+    one starts from a fisheye, where pairs of photos say that it was one. If photos that match some other one well are
+    still left out, the next ones start from a pair with a smaller baseline, from the strongest pair that was left out,
+    and with low angles. Then all pairs are compared that were not, and more features are sought in the photos' full
+    size. Last, single photos are placed by the points that they show (see `localise`). If the first attempt is not the
+    last, `tell` is told each attempt and its result.
     """
     ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, Start())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
+    job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
     _other_starts(ladder, job)
     compared = set(job.pairs)
     rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
@@ -140,6 +187,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Climb:
         match(full, full.pairs, report)
         ladder.attempt("more features, full size", full, Start())
         _other_starts(ladder, full)
+    ladder.find_left_out("single photos, by the points that they show")
     if len(ladder.rungs) > 1:
         ladder.tell_results()
     return replace(ladder.best, rungs=ladder.rungs)
@@ -158,6 +206,24 @@ def _other_starts(ladder: _Ladder, job: Job) -> None:
         if ladder.share(candidates) >= _GOOD_SHARE:
             return
         step()
+
+
+def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:
+    """Start from a fisheye, if the result asks for it and pairs of photos say so; the job of the better result."""
+    if share >= _GOOD_SHARE and not ladder.is_wide():
+        return job
+    fisheye = as_fisheye(job)
+    if fisheye is None:
+        return job
+    ladder.announce("start from a fisheye lens")
+    register_photos(fisheye)  # which takes out what was verified with another lens
+    match(fisheye, fisheye.pairs, report)
+    ladder.attempt_instead("start from a fisheye lens", fisheye, Start())
+    if ladder.best.job is fisheye:
+        return fisheye
+    register_photos(job)
+    match(job, job.pairs, report)
+    return job
 
 
 def _from_left_out(ladder: _Ladder, job: Job) -> None:

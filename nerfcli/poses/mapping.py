@@ -9,6 +9,7 @@ import pycolmap
 
 from nerfcli.poses.job import Job, Report
 from nerfcli.poses.reasons import FEW_MATCHES
+from nerfcli.poses.stages import file_key
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class Start:
 
 def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
     """Numbers of the photos that a model places, rising."""
-    return sorted(job.files.index(model.image(image_id).name) for image_id in model.reg_image_ids())
+    numbers = {file: number for number, file in enumerate(job.files)}
+    return sorted(numbers[model.image(image_id).name] for image_id in model.reg_image_ids())
 
 
 def describe_cameras(model: pycolmap.Reconstruction, job: Job) -> list[dict[str, Any]]:
@@ -49,12 +51,23 @@ def describe_cameras(model: pycolmap.Reconstruction, job: Job) -> list[dict[str,
 
 def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
     """Write sparse/0 into the job's folder, with the photos' own names."""
+    names = dict(zip(job.files, job.names, strict=True))
     for image in model.images.values():
-        image.name = job.names[job.files.index(image.name)]
-    folder = Path(job.folder) / "sparse" / "0"
+        image.name = names[image.name]
+    folder = _model_folder(job)
     shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed before it said that it was complete
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
+
+
+def model_keys(job: Job) -> dict[str, str]:
+    """A hash of each file of the model in the job's folder, by the file's name; none if there is no model."""
+    folder = _model_folder(job)
+    return {path.name: file_key(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+
+
+def _model_folder(job: Job) -> Path:
+    return Path(job.folder) / "sparse" / "0"
 
 
 def map_photos(

@@ -29,7 +29,7 @@ from nerfcli.poses.examine import examine
 from nerfcli.poses.features import extract, match, start_matching
 from nerfcli.poses.job import Job, Report, Tell, read_job
 from nerfcli.poses.ladder import climb
-from nerfcli.poses.mapping import describe_cameras, photo_numbers, write_model
+from nerfcli.poses.mapping import describe_cameras, model_keys, photo_numbers, write_model
 from nerfcli.poses.retrieval import with_neighbours
 from nerfcli.poses.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.strict import place_held_out, training_part
@@ -57,7 +57,7 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
     seconds: dict[str, float] = {}
     job = _matched(job, report, seconds=seconds)
     result, key = Path(job.folder) / RESULT, mapping_key(job)
-    if read_stage(result, key) is None:
+    if not _is_complete(job, key):
         result.unlink(missing_ok=True)
         write_stage(result, key, _map(job, report, tell, seconds=seconds))
     name_images(job)
@@ -66,13 +66,14 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
 def _solve_strictly(job: Job, report: Report, tell: Tell) -> None:
     """All that with the training photos alone; the held-out ones are placed in what comes of it."""
     result, key = Path(job.folder) / RESULT, mapping_key(job)
-    if read_stage(result, key) is None:
+    if not _is_complete(job, key):
         result.unlink(missing_ok=True)
         seconds: dict[str, float] = {}
         training = _matched(training_part(job), report, seconds=seconds)
         found = _map(training, report, tell, seconds=seconds)
         with _timed(seconds, "place"):
             found = place_held_out(job, training, found, report)
+        found["model_files"] = model_keys(job)  # which the held-out photos are in now
         write_stage(result, key, found)
     name_images(job)
 
@@ -88,6 +89,12 @@ def _matched(job: Job, report: Report, *, seconds: dict[str, float]) -> Job:
     return job
 
 
+def _is_complete(job: Job, key: str) -> bool:
+    """Whether the result is there and its model is the one that was written with it."""
+    there = read_stage(Path(job.folder) / RESULT, key)
+    return there is not None and there["model_files"].items() <= model_keys(job).items()
+
+
 def mapping_key(job: Job) -> str:
     """A hash of all that the model depends on."""
     content = asdict(job)
@@ -101,7 +108,7 @@ def _map(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> 
     with _timed(seconds, "map"):
         climbed = climb(job, report, tell)
     with _timed(seconds, "check"):
-        examined = examine(climbed.models, climbed.job, report)
+        examined = examine(climbed.models, climbed.job, report, localised=climbed.localised)
     model = examined.model
     placed = [] if model is None else photo_numbers(model, job)
     result: dict[str, Any] = {
@@ -121,6 +128,7 @@ def _map(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> 
         result["cameras"] = describe_cameras(model, job)
         result["points"] = model.num_points3D()
         write_model(model, job)
+    result["model_files"] = model_keys(job) if model is not None else {}
     return result
 
 

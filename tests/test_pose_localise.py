@@ -1,0 +1,132 @@
+"""Photos placed by the points of a model, against known poses; and photos that must not be placed.
+
+The model is the truth of `synthetic_captures`, with half a pixel of noise in what is seen; features look like their
+points, as descriptors of real photos do.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import synthetic_captures as synthetic
+from synthetic_captures import WIDE, View, looking_at
+
+from nerfcli.poses.acceptance import leave_out_contradicting
+from nerfcli.poses.job import Job
+from nerfcli.poses.localise import Attempt, left_out, localise, shared_pairs
+
+POINTS = synthetic.boulder(700, seed=0)
+VIEWS = synthetic.ring(7, [WIDE], seed=0, turn_deg=180)
+LAST = 8  # the id of the photo that is left out
+# What a photo shows: pixels (n, 2), and the points that they look like.
+Shown = tuple[np.ndarray, np.ndarray]
+
+
+def shown(view: View, *, clutter: int = 150, seed: int = 5) -> Shown:
+    rng = np.random.default_rng(seed)
+    points, pixels = synthetic.seen(view, POINTS)
+    clutter_px = rng.uniform(0, [WIDE.width, WIDE.height], size=(clutter, 2))
+    noisy = np.vstack([pixels + rng.normal(scale=0.5, size=pixels.shape), clutter_px])
+    return noisy, np.concatenate([points, np.full(clutter, -1)])
+
+
+def capture(folder: Path, last: Shown, *, camera_id: int = 1) -> tuple[pycolmap.Reconstruction, Job]:
+    """A model of seven photos, and the database in which an eighth shows `last`."""
+    model = synthetic.observed_model(VIEWS, POINTS, noise_px=0.5, seed=1)
+    with pycolmap.Database.open(str(folder / "database.db")) as database:
+        synthetic.write_camera(database, model.camera(1))
+        other = pycolmap.Camera.create_from_model_name(2, "SIMPLE_RADIAL", 1200, WIDE.width, WIDE.height)
+        synthetic.write_camera(database, other)
+        for number, view in enumerate(VIEWS):
+            pixels = np.array([point.xy for point in model.image(number + 1).points2D])
+            looks = synthetic.seen(view, POINTS)[0]
+            synthetic.write_image(database, number, 1, keypoints=pixels, looks=looks)
+        synthetic.write_image(database, LAST - 1, camera_id, keypoints=last[0], looks=last[1])
+    return model, synthetic.synthetic_job(folder, [*VIEWS, VIEWS[0]], seed=0)
+
+
+def refusal(folder: Path, last: Shown) -> str:
+    model, job = capture(folder, last)
+    grown, (attempt,) = localise(model, job, image_ids=[LAST])
+    assert grown.num_reg_images() == len(VIEWS)
+    return attempt.refused
+
+
+@pytest.mark.parametrize("angle_deg", [77.0, 215.0])
+def test_a_photo_without_any_pair_is_placed_where_it_was_taken(tmp_path: Path, angle_deg: float):
+    """Between others, and beyond the last of them; as near as the noise lets half a ring of photos be adjusted."""
+    angle = np.radians(angle_deg)
+    view = View(WIDE, looking_at(np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.5]), np.array([0.1, 0.0, 0.1])))
+    model, job = capture(tmp_path, shown(view))
+    assert left_out(model, job) == [LAST]
+    grown, (attempt,) = localise(model, job, image_ids=[LAST])
+    assert (attempt.refused, model.num_reg_images()) == ("", len(VIEWS))
+    assert attempt.found > 10 * attempt.beside
+    relative = grown.image(LAST).cam_from_world() * grown.image(1).cam_from_world().inverse()
+    true = pycolmap.Rigid3d(view.cam_from_world) * pycolmap.Rigid3d(VIEWS[0].cam_from_world).inverse()
+    assert np.degrees((relative.rotation * true.rotation.inverse()).angle()) < 0.8
+    np.testing.assert_allclose(
+        relative.translation, true.translation, atol=0.01 * float(np.linalg.norm(true.translation))
+    )
+    # What it sees now are the points that it shows.
+    assert grown.image(LAST).num_points3D > 0.8 * attempt.found
+    assert grown.image(LAST).name == synthetic.photo_name(LAST - 1)
+    # No pair holds it, and yet a contradiction between others does not tear it off.
+    held = shared_pairs(grown, [LAST], min_matches=15)
+    assert {pair.other for pair in held} == {LAST}
+    assert leave_out_contradicting(grown, held)[1] == {}
+
+
+def test_a_photo_of_something_else_is_not_placed(tmp_path: Path):
+    pixels, looks = shown(VIEWS[2])
+    assert refusal(tmp_path, (pixels, np.full(len(looks), -1))).startswith("only ")
+
+
+def test_a_detail_that_looks_like_one_elsewhere_places_nothing(tmp_path: Path):
+    """A picture of the boulder, seen from afar so that it fills a fiftieth of the photo; all around is unknown."""
+    far = View(WIDE, looking_at(np.array([9.0, 6.0, 3.0]), np.zeros(3)))
+    pixels, looks = shown(far, clutter=600)
+    assert "of the picture agrees with the model" in refusal(tmp_path, (pixels, looks))
+
+
+def test_a_photo_that_may_be_of_two_places_is_not_placed(tmp_path: Path):
+    (one, one_looks), (other, other_looks) = shown(VIEWS[1]), shown(VIEWS[5])
+    both = np.intersect1d(one_looks, other_looks)
+    one_looks = np.where(np.isin(one_looks, both), -1, one_looks)
+    last = np.vstack([one, other]), np.concatenate([one_looks, np.where(np.isin(other_looks, both), -1, other_looks)])
+    assert "agree on another place" in refusal(tmp_path, last)
+
+
+def test_a_place_that_the_photos_own_matches_contradict_is_not_kept(tmp_path: Path):
+    model, job = capture(tmp_path, shown(VIEWS[3]))
+    rng = np.random.default_rng(0)
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED.value
+    geometry.inlier_matches = rng.permutation(120)[:80].reshape(40, 2).astype(np.uint32)
+    with pycolmap.Database.open(str(job.database)) as database:
+        database.write_two_view_geometry(4, LAST, geometry)
+    grown, (attempt,) = localise(model, job, image_ids=[LAST])
+    assert attempt.refused == "40 verified matches contradict its place"
+    assert LAST not in grown.reg_image_ids()
+
+
+def test_nothing_is_placed_without_a_known_lens(tmp_path: Path):
+    """A camera of its own, of which nobody has said anything."""
+    model, job = capture(tmp_path, shown(VIEWS[3]), camera_id=2)
+    _, attempts = localise(model, job, image_ids=[LAST])
+    assert attempts == [Attempt(LAST, refused="nothing is known of its camera")]
+
+
+def test_a_model_without_points_places_nothing(tmp_path: Path):
+    _, job = capture(tmp_path, shown(VIEWS[3]))
+    _, (attempt,) = localise(synthetic.true_model(VIEWS), job, image_ids=[LAST])
+    assert attempt.refused == "the model has too few points"
+
+
+def test_what_is_drawn_at_random_depends_on_the_seed_alone(tmp_path: Path):
+    model, job = capture(tmp_path, shown(VIEWS[3]))
+    runs = [localise(model, replace(job, threads=1), image_ids=[LAST]) for _ in range(2)]
+    poses = [grown.image(LAST).cam_from_world().matrix() for grown, _ in runs]
+    np.testing.assert_array_equal(poses[0], poses[1])
