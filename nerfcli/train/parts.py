@@ -12,8 +12,8 @@ from nerfcli.train.components import Components
 from nerfcli.train.losses import over_background
 from nerfcli.train.photos import Drawn, Pool
 
-# Learning rates as multiples of the field's. Gains of photos are scalars that every ray of a photo pulls at: at 0.3 they are
-# a tenth of the way after 300 steps, at 2 half of it, and no further at 5.
+# Learning rates as multiples of the field's. After 300 steps at 0.3, gains of photos are a tenth of the way to the true
+# ones, at 2 half of it, at 5 no further.
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
 # From here on a photo's level says only that the light was at least that bright.
 SATURATED = 254.5 / 255
