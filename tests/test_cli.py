@@ -210,6 +210,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train x --stepz 3", "--stepz"),
         ("train x --steps 0", "--steps"),
         ("train x --downscale 3", "'3'; choose auto, 1, 2, 4 or 8"),
+        ("train x --field gaussians", "'gaussians'; choose hash, voxels, mlp"),
         ("train x --budget soon", "'soon' is not a time"),
         ("train x --device tpu", "'tpu'"),
         ("poses x --camera-model PERSPECTIVE", "'PERSPECTIVE'; choose auto"),

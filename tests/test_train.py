@@ -196,6 +196,24 @@ def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, tmp_path):
     assert log[-1]["samples"] == read_log(tmp_path / "straight")[-1]["samples"]
 
 
+@pytest.mark.parametrize("kind", ["voxels", "mlp"])
+def test_fields_of_other_kinds_train_and_resume_bit_for_bit(kind, views, tmp_path):
+    def stop(progress: Progress) -> None:
+        if progress.step == 5:
+            raise KeyboardInterrupt
+
+    settings = replace(FEW, steps=10, field=kind, field_memory_bytes=50_000)
+    straight = fit(views, tmp_path / "straight", settings)
+    with pytest.raises(KeyboardInterrupt):
+        fit(views, tmp_path / "parts", settings, on_progress=stop)
+    second = fit(views, tmp_path / "parts", settings, resume=True)
+    assert [progress.loss for progress in second] == [progress.loss for progress in straight[5:]]
+    assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
+    assert load_model(tmp_path / "parts" / "field.safetensors", "cpu").field.settings.kind == kind
+    with pytest.raises(UserError, match="was trained with another field"):
+        fit(views, tmp_path / "parts", replace(settings, field="hash"), resume=True)
+
+
 def test_resume_goes_on_to_a_larger_total(views, tmp_path):
     fit(views, tmp_path / "run", replace(FEW, steps=3))
     second = fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True)
@@ -323,6 +341,7 @@ def test_a_fresh_training_replaces_all_of_an_old_one(views, tmp_path):
         ({"budget_seconds": -1.0}, "budget is not positive"),
         ({"steps": -3}, "budget is not positive"),
         ({"downscale": 3}, "downscale 3 is not possible"),
+        ({"field": "gaussians"}, "there is no field of the kind 'gaussians'"),
     ],
 )
 def test_impossible_settings_are_refused(wrong, message):

@@ -8,6 +8,7 @@ import typer
 
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
+from nerfcli.cli.costs import cost_lines, costs_of_run
 from nerfcli.cli.options import Json
 from nerfcli.cli.words import words_of
 
@@ -28,6 +29,10 @@ def info(
     Of a failure that a training kept: which numbers became non-finite, where, and whether they do again.
 
     \b
+    Of a run, by arithmetic: bytes of weights, optimiser (gradients and moments) and what a step keeps; operations and
+    memory traffic per sample and per picture, for its field and for the other kinds at equal storage.
+
+    \b
     Examples:
       nerfcli info photos-scene
       nerfcli info photos-scene-run --json
@@ -43,7 +48,12 @@ def info(
         elif "in_words" in content:
             typer.echo("\n".join([str(folder), *(f"  {line}" for line in words_of(content))]))
         else:
-            typer.echo("\n".join([str(folder), *(f"  {key}: {_text(value)}" for key, value in content.items())]))
+            costs = content.pop("cost", {})
+            lines = [f"{key}: {_text(value)}" for key, value in content.items()]
+            if costs:
+                lines += [f"storage and work of the {next(iter(costs))} field, and of others of as many bytes:"]
+                lines += [f"  {line}" for line in cost_lines(costs)]
+            typer.echo("\n".join([str(folder), *(f"  {line}" for line in lines)]))
 
     for_each_input(path, work)
 
@@ -111,9 +121,11 @@ def _describe_run(folder: Path) -> dict[str, Any]:
     if (folder / FIELD).exists():
         model = load_model(folder / FIELD, "cpu")
         content |= {
+            "field": model.field.settings.to_json(),
             "field_bytes": field_bytes(model.field),
             "occupied_share": round(model.occupied.float().mean().item(), 4),
             "unbounded": model.field.settings.unbounded,
+            "cost": costs_of_run(model, cameras["train"], config.get("settings", {}), log),
         }
     if (folder / METRICS).exists():
         content["metrics"] = json_module.loads((folder / METRICS).read_text(encoding="utf-8"))["mean"]

@@ -42,6 +42,11 @@ Strict = Annotated[
     bool,
     typer.Option("--strict", help="Poses without the held-out photos, which are placed afterwards, all else fixed."),
 ]
+FieldKind = Annotated[str, typer.Option("--field", help="What the field is made of: hash, voxels or mlp.")]
+FieldMemory = Annotated[
+    str | None,
+    typer.Option(help="About what its numbers may take: 4MB, 64MB.  [default: hash 8MiB, voxels 64MiB, mlp 256KiB]"),
+]
 Json = Annotated[bool, typer.Option("--json", help="Results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No notes and no progress; warnings and errors stay.")]
@@ -71,6 +76,19 @@ def downscale_factor(downscale: str) -> int | None:
     if downscale not in ("auto", "1", "2", "4", "8"):
         raise typer.BadParameter(f"{downscale!r}; choose auto, 1, 2, 4 or 8", param_hint="--downscale")
     return None if downscale == "auto" else int(downscale)
+
+
+def field_kind(kind: str) -> str:
+    """One of the kinds of fields.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    from nerfcli.field.kinds import KINDS
+
+    if kind not in KINDS:
+        raise typer.BadParameter(f"{kind!r}; choose {', '.join(KINDS)}", param_hint="--field")
+    return kind
 
 
 def bytes_from_text(text: str) -> int:

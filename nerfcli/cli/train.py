@@ -12,6 +12,8 @@ from nerfcli.cli.options import (
     Device,
     Downscale,
     Exclude,
+    FieldKind,
+    FieldMemory,
     Holdout,
     Include,
     Json,
@@ -20,8 +22,10 @@ from nerfcli.cli.options import (
     Quiet,
     Seed,
     Threads,
+    bytes_from_text,
     device_name,
     downscale_factor,
+    field_kind,
     holdout_rule,
     seconds_from_text,
     thread_count,
@@ -46,9 +50,11 @@ def train(
     steps: Annotated[int | None, typer.Option(help="Optimiser steps in all; repeatable bit for bit.", min=1)] = None,
     include: Include = None,
     exclude: Exclude = None,
+    field: FieldKind = "hash",
+    field_memory: FieldMemory = None,
     downscale: Downscale = "auto",
     log2_rows: Annotated[
-        int, typer.Option(help="Rows of each of the field's tables, as a power of two.", min=4, max=24)
+        int, typer.Option(help="Rows of each table of a hash grid, as a power of two.", min=4, max=24)
     ] = 16,
     levels: Annotated[int, typer.Option(help="Tables of the field; other numbers than 8 are slow.", min=1)] = 8,
     width: Annotated[int, typer.Option(help="Neurons of its layers; other numbers than 32 are slow.", min=1)] = 32,
@@ -74,6 +80,10 @@ def train(
     surfaces at points of structure from motion), entropy (a weight: rays are opaque or clear), near (smaller gradients
     near cameras), distortion (a weight: the light of a ray in one place).
 
+    Fields, for --field: hash (a multiresolution hash grid with two small networks: best for its time), voxels (a dense
+    grid of density and spherical harmonics), mlp (one network on Fourier features: small, and slow). The finest detail
+    of the last two is a pixel's footprint at the centre of the scene.
+
     \b
     Examples:
       nerfcli train photos-scene --budget 90s
@@ -81,6 +91,7 @@ def train(
       nerfcli train photos-scene --holdout block:0.15 -o gap-run
       nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
       nerfcli train photos-scene --without view --with distortion=0.01
+      nerfcli train photos-scene --field voxels --field-memory 16MB
     """
     from nerfcli.train.components import Components, choose
     from nerfcli.train.settings import TrainSettings
@@ -101,6 +112,8 @@ def train(
         levels=levels,
         log2_rows=log2_rows,
         width=width,
+        field=field_kind(field),
+        field_memory_bytes=None if field_memory is None else bytes_from_text(field_memory),
     )
     rule = holdout_rule(holdout)
 

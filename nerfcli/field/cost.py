@@ -1,11 +1,36 @@
 """Storage and work, by arithmetic: what a field costs before anything is run."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
 from torch import nn
 
+from nerfcli.field.fourier_field import FourierFieldSettings
+from nerfcli.field.hash_field import GEOMETRY, HARMONICS, HashFieldSettings
+from nerfcli.field.interface import FieldSettings
+from nerfcli.field.voxel_field import FEATURES, VoxelFieldSettings
 
-def parameter_bytes(count: int, *, bytes_per_value: int = 4) -> int:
+FLOAT_BYTES = 4
+CORNERS = 8
+# A forward and a backward pass, in operations and in bytes of rows: gradients of a product are two more of its size,
+# and the gradient of a row is read and written.
+TRAINING = 3
+
+
+def parameter_bytes(count: int, *, bytes_per_value: int = FLOAT_BYTES) -> int:
     """Bytes of `count` parameters, without activations and optimiser state."""
     return count * bytes_per_value
+
+
+def optimiser_bytes(count: int) -> int:
+    """Bytes that training needs beside `count` parameters: their gradients and the two moments of Adam."""
+    return 3 * parameter_bytes(count)
+
+
+def occupancy_bytes(side: int) -> int:
+    """Bytes of the occupancy grid that rendering needs: a flag per cell."""
+    return side**3
 
 
 def field_bytes(field: nn.Module) -> int:
@@ -13,7 +38,7 @@ def field_bytes(field: nn.Module) -> int:
     return sum(parameter_bytes(p.numel(), bytes_per_value=p.element_size()) for p in field.parameters())
 
 
-def dense_grid_bytes(side: int, channels: int, *, bytes_per_value: int = 4) -> int:
+def dense_grid_bytes(side: int, channels: int, *, bytes_per_value: int = FLOAT_BYTES) -> int:
     """Bytes of a dense grid of side^3 cells with `channels` values each."""
     return parameter_bytes(side**3 * channels, bytes_per_value=bytes_per_value)
 
@@ -21,3 +46,106 @@ def dense_grid_bytes(side: int, channels: int, *, bytes_per_value: int = 4) -> i
 def field_queries(width: int, height: int, samples_per_ray: float) -> int:
     """Field evaluations for one picture without skipping and early stop."""
     return round(width * height * samples_per_ray)
+
+
+@dataclass(frozen=True)
+class Work:
+    """What asking a field costs, per sample, forward.
+
+    Operations are multiplications and additions of products and interpolations; activations, sines, harmonics and
+    index arithmetic are left out. Bytes moved are those of the rows that a sample reads, each once; of a network
+    without rows, those of its layers' values, written and read again. Weights that all samples share are left out.
+
+    Args:
+        parameters: numbers that are learned.
+        density_operations, colour_operations: for the density, and for the colour on top of it.
+        density_bytes, colour_bytes: moved for the density, and for the colour on top of it.
+        kept_values: numbers of a sample that training keeps for the backward pass.
+    """
+
+    parameters: int
+    density_operations: int
+    colour_operations: int
+    density_bytes: int
+    colour_bytes: int
+    kept_values: int
+
+    @property
+    def operations(self) -> int:
+        return self.density_operations + self.colour_operations
+
+    @property
+    def bytes_moved(self) -> int:
+        return self.density_bytes + self.colour_bytes
+
+    def activation_bytes(self, samples: int) -> int:
+        """Bytes that a training step over this many samples keeps."""
+        return self.kept_values * samples * FLOAT_BYTES
+
+
+def work(settings: FieldSettings) -> Work:
+    """The counts of a field of these settings."""
+    match settings:
+        case HashFieldSettings():
+            return _hash_grid(settings)
+        case VoxelFieldSettings():
+            return _voxels(settings)
+        case FourierFieldSettings():
+            return _network(settings)
+        case _:
+            raise ValueError(f"the work of {type(settings).__name__} is not known")
+
+
+# Of a sample whatever the field: its place, its interval, density and colour, and the weight of its colour.
+_OF_A_SAMPLE = 3 + 2 + 1 + 3 + 1
+
+
+def _hash_grid(settings: HashFieldSettings) -> Work:
+    encoded, width = settings.levels * settings.features, settings.width
+    density = (encoded, width, GEOMETRY)
+    colour = (GEOMETRY + HARMONICS, width, width, 3)
+    weights = _products(density) + _products(colour)
+    return Work(
+        parameters=settings.levels * 2**settings.log2_rows * settings.features + weights,
+        density_operations=_interpolation(settings.levels, settings.features) + 2 * _products(density),
+        colour_operations=2 * _products(colour),
+        density_bytes=settings.levels * CORNERS * settings.features * FLOAT_BYTES,
+        colour_bytes=0,
+        kept_values=encoded + _OF_A_SAMPLE,  # the compiled networks compute their layers again
+    )
+
+
+def _voxels(settings: VoxelFieldSettings) -> Work:
+    layers, harmonics = settings.layers, settings.harmonics
+    return Work(
+        parameters=layers * 2**settings.log2_vertices * FEATURES,
+        density_operations=_interpolation(1, FEATURES),
+        colour_operations=_interpolation(layers - 1, FEATURES) + 2 * 3 * harmonics,
+        density_bytes=CORNERS * FEATURES * FLOAT_BYTES,
+        colour_bytes=(layers - 1) * CORNERS * FEATURES * FLOAT_BYTES,
+        kept_values=layers * FEATURES + harmonics + 3 * harmonics + _OF_A_SAMPLE,
+    )
+
+
+def _network(settings: FourierFieldSettings) -> Work:
+    trunk = (6 * settings.octaves, *[settings.width] * settings.layers)
+    colour = (settings.width + HARMONICS, settings.width // 2, 3)
+    biases = sum(trunk[1:]) + 1 + sum(colour[1:])
+    return Work(
+        parameters=_products(trunk) + settings.width + _products(colour) + biases,
+        density_operations=2 * (_products(trunk) + settings.width),
+        colour_operations=2 * _products(colour),
+        density_bytes=2 * FLOAT_BYTES * sum(trunk),
+        colour_bytes=2 * FLOAT_BYTES * sum(colour[:2]),
+        kept_values=sum(trunk) + sum(colour[:2]) + _OF_A_SAMPLE,
+    )
+
+
+def _products(sizes: Sequence[int]) -> int:
+    """Weights of layers one after the other, without biases: a multiplication and an addition each per sample."""
+    return sum(inputs * outputs for inputs, outputs in pairwise(sizes))
+
+
+def _interpolation(levels: int, features: int) -> int:
+    """Of trilinear interpolation: the weight of a corner is two products, then a product and a sum per feature."""
+    return levels * CORNERS * (2 + 2 * features)

@@ -48,10 +48,12 @@ class Samples(NamedTuple):
 class Field(nn.Module, abc.ABC):
     """Density by position, colour by position and direction, on the unit cube of `kernels.grid_coordinates`.
 
-    `rate_factor` is how much faster than the hash grid this kind learns best.
+    How this kind is trained best: `rate_factor` times the learning rate, and `closing_steps` until rays pass over cells
+    that hold little.
     """
 
-    rate_factor: ClassVar[float] = 1.0
+    rate_factor: float = 1.0
+    closing_steps: ClassVar[int] = 150
 
     @property
     @abc.abstractmethod

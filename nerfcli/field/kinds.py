@@ -3,8 +3,12 @@
 from typing import Any
 
 from nerfcli.errors import UserError
+from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
+from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+
+KINDS = (HashFieldSettings.kind, VoxelFieldSettings.kind, FourierFieldSettings.kind)
 
 
 def fresh_field(settings: FieldSettings) -> Field:
@@ -12,6 +16,10 @@ def fresh_field(settings: FieldSettings) -> Field:
     match settings:
         case HashFieldSettings():
             return HashField(settings)
+        case VoxelFieldSettings():
+            return VoxelField(settings)
+        case FourierFieldSettings():
+            return FourierField(settings)
         case _:
             raise ValueError(f"no field is made from {type(settings).__name__}")
 
@@ -26,5 +34,9 @@ def settings_from_json(content: dict[str, Any]) -> FieldSettings:
     match content.get("kind", HashFieldSettings.kind):
         case HashFieldSettings.kind:
             return HashFieldSettings(**sizes)
+        case VoxelFieldSettings.kind:
+            return VoxelFieldSettings(**sizes)
+        case FourierFieldSettings.kind:
+            return FourierFieldSettings(**sizes)
         case kind:
             raise UserError(f"fields of the kind {kind!r} are not known here", "use the nerfcli that trained it")

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from nerfcli import kernels
 from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import fresh_field
+from nerfcli.field.sizes import chosen_size
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
 from nerfcli.train.losses import colour_loss, distortion_loss, opacity_entropy
@@ -29,7 +31,6 @@ DEEPEST = 7.0
 # Rays pass over cells where a step takes away less light than this: hardly any at first, when all of space is thin fog
 # and nothing tells yet where the surfaces are; then ever more, so that surfaces have to become compact.
 FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
-CLOSING_STEPS = 150
 # Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
 STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
 
@@ -56,7 +57,10 @@ class StepResult:
 
 
 class Fitting:
-    """The state of a training. Same seed, threads and device give the same numbers, step for step."""
+    """The state of a training. Same seed, threads and device give the same numbers, step for step.
+
+    The field has the given size, else the one that `sizes.chosen_size` gives for the settings and the pool.
+    """
 
     def __init__(
         self,
@@ -67,6 +71,7 @@ class Fitting:
         settings: TrainSettings,
         log_gains: Tensor | None = None,
         points: PointRays | None = None,
+        size: FieldSettings | None = None,
     ):
         device = pool.colours.device
         torch.manual_seed(settings.seed)
@@ -75,13 +80,19 @@ class Fitting:
         self.settings = settings
         self.step = 0
         self.components = settings.components
-        size = HashFieldSettings(
-            unbounded=unbounded,
-            levels=settings.levels,
-            log2_rows=settings.log2_rows,
-            width=settings.width,
-            view_degree=self.components.view,
-        )
+        if size is None:
+            size = chosen_size(
+                settings.field,
+                hash_grid=HashFieldSettings(
+                    unbounded=unbounded,
+                    levels=settings.levels,
+                    log2_rows=settings.log2_rows,
+                    width=settings.width,
+                    view_degree=self.components.view,
+                ),
+                footprint=pool.footprint,
+                memory_bytes=settings.field_memory_bytes,
+            )
         self.field = fresh_field(size).to(device)
         gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
         self.points = points
@@ -206,7 +217,7 @@ class Fitting:
 
     def _open_cells(self) -> Tensor:
         """The cells that rays look into: those that take away more light than the threshold of this step."""
-        closed = min(1.0, self.step / CLOSING_STEPS)
+        closed = min(1.0, self.step / self.field.closing_steps)
         threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
         return self.occupancy.above(threshold)
 

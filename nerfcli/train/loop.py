@@ -15,6 +15,7 @@ from nerfcli import kernels
 from nerfcli.atomic import cannot_write, write_json
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
+from nerfcli.field.cost import field_bytes
 from nerfcli.render.model import Model, save_model
 from nerfcli.scene import Scene
 from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
@@ -116,6 +117,8 @@ def train(
     gains = relative_log_exposures(scene.train_frames, reference)
     log_gains = torch.from_numpy(gains)[:, None].expand(-1, 3)
     fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings, log_gains=log_gains, points=points)
+    size = ", ".join(f"{name} {value}" for name, value in fitting.field.settings.to_json().items())
+    notify(f"field: {size}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     totals = _Totals()
     if resume:
         totals = _restore(fitting, run)

@@ -16,6 +16,7 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.media.images import downscale, read_image
 from nerfcli.media.masks import read_mask
+from nerfcli.train.footprint import pixel_footprint
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,7 @@ class Pool(Protocol):
 
     colours: Tensor
     first_pixel: Tensor
+    footprint: float
 
     @property
     def has_alpha(self) -> bool:
@@ -115,7 +117,7 @@ class PixelPool:
     """All usable pixels of some photos, and the ray of each, in the training frame; `frames` are those of the photos.
 
     Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
-    pixels that the lens model has no direction for, which are left out.
+    pixels that the lens model has no direction for, which are left out; `footprint` is that of `pixel_footprint`.
     """
 
     def __init__(self, photos: Sequence[Photo], training_from_scene: Similarity, device: torch.device):
@@ -128,6 +130,8 @@ class PixelPool:
         self.frames = tuple(photo.frame for photo in photos)
         poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
         self.poses = torch.tensor(np.array(poses), dtype=torch.float32, device=device)
+
+        self.footprint = pixel_footprint([photo.frame for photo in photos], training_from_scene)
 
         first_bearing: dict[Camera, int] = {}
         bearings, valid = [], []

@@ -7,6 +7,7 @@ that turns bad is found, with its step and its pixels. The state before that ste
 to the copy, with half the learning rate.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.field.kinds import settings_from_json
 from nerfcli.render.model import Marching
 from nerfcli.train.fitting import Fitting, StepResult
 from nerfcli.train.photos import Drawn, PixelPool
@@ -152,6 +154,7 @@ class _SavedBatch:
         self.colours, self.first_pixel = tensors["batch.colours"], tensors["batch.first_pixel"]
         self._drawn = Drawn(**{name: tensors[f"batch.{name}"] for name in Drawn._fields})
         self._after_draw = tensors["batch.after_draw"]
+        self.footprint = math.nan  # the field's size is known
 
     @property
     def has_alpha(self) -> bool:
@@ -179,11 +182,13 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
         raise UserError(f"{path} holds {description.get('format')!r}", "give a failure-STEP.safetensors of a run")
     settings = replace(TrainSettings.from_json(description["settings"]), device="cpu")
     torch.set_num_threads(settings.threads)
+    size = settings_from_json(description["state"]["field"])
     fitting = Fitting(
         _SavedBatch(tensors),
         Marching(**description["marching"]),
-        unbounded=description["state"]["field"]["unbounded"],
+        unbounded=size.unbounded,
         settings=settings,
+        size=size,
     )
     fitting.restore({name: t for name, t in tensors.items() if not name.startswith("batch.")}, description["state"])
     return description, _watched_step(fitting, description["share"])[1]

@@ -1,9 +1,12 @@
 """Everything a training depends on, besides the scene."""
 
-from dataclasses import asdict, dataclass, field
+import dataclasses
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from nerfcli.errors import UserError
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.kinds import KINDS
 from nerfcli.train.components import Components
 
 DOWNSCALES = (1, 2, 4, 8)
@@ -26,12 +29,14 @@ class TrainSettings:
             number of rays follows. Small steps learn more from a sample, large ones cost less each.
         learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
         warmup_steps: steps over which the learning rate rises from 0.
-        levels, log2_rows, width: size of the field; see `HashFieldSettings`. There are compiled kernels for 8 levels
+        levels, log2_rows, width: size of a hash grid; see `HashFieldSettings`. There are compiled kernels for 8 levels
             and width 32; other sizes train in plain torch, many times slower.
         components: what is in the model and in its loss.
+        field: what the field is made of, one of `kinds.KINDS`.
+        field_memory_bytes: what the field's numbers may take; None for what suits the kind, see `sizes.chosen_size`.
 
     Raises:
-        UserError: neither or a non-positive limit, or an unknown downscale.
+        UserError: neither or a non-positive limit, an unknown downscale or kind of field.
     """
 
     budget_seconds: float | None = 120.0
@@ -48,7 +53,9 @@ class TrainSettings:
     levels: int = 8
     log2_rows: int = 16
     width: int = 32
-    components: Components = field(default_factory=Components)
+    components: Components = dataclasses.field(default_factory=Components)
+    field: str = HashFieldSettings.kind
+    field_memory_bytes: int | None = None
 
     def __post_init__(self) -> None:
         if min(self.levels, self.width) < 1 or not 4 <= self.log2_rows <= 24:
@@ -60,6 +67,8 @@ class TrainSettings:
             raise UserError("the training budget is not positive", "give for example --budget 2m or --steps 2000")
         if self.downscale not in (None, *DOWNSCALES):
             raise UserError(f"downscale {self.downscale} is not possible", "choose auto, 1, 2, 4 or 8")
+        if self.field not in KINDS:
+            raise UserError(f"there is no field of the kind {self.field!r}", f"choose {', '.join(KINDS)}")
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)

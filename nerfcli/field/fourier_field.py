@@ -1,0 +1,122 @@
+"""The radiance field as one network: everything is in weights that take part in every sample."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from nerfcli.field.encodings import fourier_features, spherical_harmonics
+from nerfcli.field.interface import Field, FieldSettings, Samples
+from nerfcli.field.plain_marching import visible_samples
+from nerfcli.kernels.activations import density_from_log
+
+HARMONICS = 16
+# Wide layers move further by the same step: the rate goes with 1 / width, and is this at this width.
+# Source: Yang et al. 2022, Tensor programs V, arXiv:2203.03466, table 3.
+RATE, RATE_WIDTH = 0.3, 64
+
+
+@dataclass(frozen=True)
+class FourierFieldSettings(FieldSettings):
+    """Size of the field.
+
+    Args:
+        octaves: frequencies of the Fourier features of each coordinate; the finest has a period of 2^(1 - octaves) of
+            the cube's side.
+        width: neurons of the hidden layers; half of it in the colour's.
+        layers: hidden layers in front of the density.
+    """
+
+    kind: ClassVar[str] = "mlp"
+
+    octaves: int = 10
+    width: int = 128
+    layers: int = 4
+
+
+class FourierField(Field):
+    """Fourier features, rectified layers, a density; then the direction, one more layer, a colour.
+
+    The density network's biases start at zero and its last weights small: a fog of density about 1.
+    Source: Mildenhall et al. 2020, NeRF, arXiv:2003.08934, section 5.1 and appendix A, with half of the layers.
+    """
+
+    closing_steps = 600
+
+    def __init__(self, settings: FourierFieldSettings):
+        super().__init__()
+        self._settings = settings
+        width = settings.width
+        self.rate_factor = RATE * RATE_WIDTH / width
+        sizes = (6 * settings.octaves, *[width] * settings.layers)
+        self.trunk = nn.Sequential()
+        for inputs, outputs in pairwise(sizes):
+            self.trunk.extend([_linear(inputs, outputs), nn.ReLU()])
+        self.log_density = _linear(width, 1)
+        with torch.no_grad():
+            self.log_density.weight.mul_(0.1)
+        self.colour = nn.Sequential(_linear(width + HARMONICS, width // 2), nn.ReLU(), _linear(width // 2, 3))
+
+    @property
+    def settings(self) -> FourierFieldSettings:
+        return self._settings
+
+    def rows(self) -> None:
+        return None
+
+    def density(self, coordinates: Tensor) -> Tensor:
+        return density_from_log(self.log_density(self._hidden(coordinates))[:, 0])
+
+    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+        hidden = self._hidden(coordinates)
+        harmonics = spherical_harmonics(directions, self.settings.view_degree)[rays]
+        rgb = torch.sigmoid(self.colour(torch.cat([hidden, harmonics], dim=-1)))
+        return density_from_log(self.log_density(hidden)[:, 0]), rgb
+
+    def visible_samples(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        edges: Tensor,
+        *,
+        jitter: Tensor,
+        occupied: Tensor,
+        deepest: float,
+    ) -> Samples:
+        # Training needs the layers again, with gradients: the code is no more than the place.
+        return visible_samples(
+            origins,
+            directions,
+            edges,
+            jitter=jitter,
+            occupied=occupied,
+            unbounded=self.settings.unbounded,
+            deepest=deepest,
+            density=self.density,
+            code=lambda coordinates: coordinates,
+        )
+
+    def colour_of_code(self, code: Tensor, directions: Tensor, rays: Tensor) -> Tensor:
+        return self.radiance(code, directions, rays)[1]
+
+    def radiance_of_samples(
+        self, samples: Samples, directions: Tensor, rays: Tensor, *, sink: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        return self.radiance(samples.coordinates, directions, rays)
+
+    def _hidden(self, coordinates: Tensor) -> Tensor:
+        """The last hidden layer (N, width)."""
+        return self.trunk(fourier_features(2.0 * coordinates - 1.0, self.settings.octaves))
+
+
+def _linear(inputs: int, outputs: int) -> nn.Linear:
+    """A layer that keeps the variance of rectified inputs, without bias at first.
+
+    Source: He et al. 2015, arXiv:1502.01852, eq. 10.
+    """
+    layer = nn.Linear(inputs, outputs)
+    nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu")
+    nn.init.zeros_(layer.bias)
+    return layer

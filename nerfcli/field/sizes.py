@@ -1,0 +1,90 @@
+"""How large a field is made: from how fine the photos are, and the memory it may take."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from nerfcli.errors import UserError
+from nerfcli.field.cost import parameter_bytes, work
+from nerfcli.field.fourier_field import FourierFieldSettings
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.interface import FieldSettings
+from nerfcli.field.voxel_field import VoxelFieldSettings
+
+# A field may be larger than asked for by this share: a hash grid of 2^20 bytes and its networks are 1 MB, too.
+SLACK = 0.07
+# What the kinds take when nothing is said.
+VOXEL_BYTES, NETWORK_BYTES = 2**26, 2**18
+# Harmonics above this degree would make a vertex of a dense grid larger by three quarters.
+VOXEL_DEGREE = 2
+LOG2_ROWS = range(8, 25)
+LOG2_VERTICES = range(6, 28)
+WIDTHS = range(16, 8193, 16)
+OCTAVES = (4, 12)
+
+
+def chosen_size(
+    kind: str, *, hash_grid: HashFieldSettings, footprint: float, memory_bytes: int | None
+) -> FieldSettings:
+    """The field of a kind that fits a capture.
+
+    What is finer than a pixel, no photo shows: a dense grid has no cells smaller than a pixel's footprint, and the
+    finest octave of Fourier features has no shorter period than two footprints. How many numbers there are is the
+    memory's business.
+
+    Args:
+        kind: one of `kinds.KINDS`.
+        hash_grid: a hash grid, whose `unbounded` and `view_degree` hold for every kind; its rows are set where there is
+            a `memory_bytes`.
+        footprint: what a pixel covers at the centre of the scene, in units of the training frame; the median photo's.
+        memory_bytes: what the field's numbers may take; None for a hash grid as it is, 64 MiB in a dense grid, 1/4 MiB
+            in a network, whose every number costs time at every sample.
+
+    Raises:
+        UserError: the smallest field is larger than the memory.
+        ValueError: an unknown kind.
+    """
+    unbounded, view_degree = hash_grid.unbounded, hash_grid.view_degree
+    cells = cells_of_footprint(footprint, unbounded)
+
+    def voxels(log2_vertices: int) -> VoxelFieldSettings:
+        degree = min(view_degree, VOXEL_DEGREE)
+        return VoxelFieldSettings(unbounded=unbounded, view_degree=degree, log2_vertices=log2_vertices)
+
+    def network(width: int) -> FourierFieldSettings:
+        octaves = min(max(math.floor(math.log2(cells)), OCTAVES[0]), OCTAVES[1])
+        return FourierFieldSettings(unbounded=unbounded, view_degree=view_degree, width=width, octaves=octaves)
+
+    match kind:
+        case HashFieldSettings.kind:
+            if memory_bytes is None:
+                return hash_grid
+            return largest_within(LOG2_ROWS, lambda log2_rows: replace(hash_grid, log2_rows=log2_rows), memory_bytes)
+        case VoxelFieldSettings.kind:
+            sizes = [size for size in LOG2_VERTICES if voxels(size).resolution <= cells] or LOG2_VERTICES[:1]
+            return largest_within(sizes, voxels, memory_bytes or VOXEL_BYTES)
+        case FourierFieldSettings.kind:
+            return largest_within(WIDTHS, network, memory_bytes or NETWORK_BYTES)
+        case _:
+            raise ValueError(f"no field is of the kind {kind!r}")
+
+
+def cells_of_footprint(footprint: float, unbounded: bool) -> float:
+    """How many cells along the cube's side are as wide as a pixel's footprint; see `kernels.grid_coordinates`."""
+    return (4.0 if unbounded else 2.0) / footprint
+
+
+def largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings], memory_bytes: int) -> FieldSettings:
+    """The last of increasing sizes whose numbers fit into the memory, give or take `SLACK`.
+
+    Raises:
+        UserError: not even the first one does.
+    """
+    smallest = parameter_bytes(work(settings(sizes[0])).parameters)
+    limit = memory_bytes * (1 + SLACK)
+    if smallest > limit:
+        raise UserError(
+            f"no field fits into {memory_bytes} bytes: the smallest takes {smallest}", "give a larger --field-memory"
+        )
+    fitting = [size for size in sizes if parameter_bytes(work(settings(size)).parameters) <= limit]
+    return settings(fitting[-1])

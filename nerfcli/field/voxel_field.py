@@ -1,0 +1,127 @@
+"""The radiance field as a dense grid: a density and the harmonics of a colour at every vertex, interpolated."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from nerfcli import kernels
+from nerfcli.field.encodings import spherical_harmonics
+from nerfcli.field.interface import Field, FieldSettings, Samples
+from nerfcli.field.plain_marching import visible_samples
+from nerfcli.kernels.activations import density_from_log
+
+# Numbers that the compiled interpolation takes at a time.
+FEATURES = 4
+
+
+@dataclass(frozen=True)
+class VoxelFieldSettings(FieldSettings):
+    """Size of the field.
+
+    Args:
+        log2_vertices: there is room for this power of two of vertices; the grid is the largest cube of them.
+    """
+
+    kind: ClassVar[str] = "voxels"
+
+    log2_vertices: int = 17
+
+    @property
+    def resolution(self) -> int:
+        """Cells per axis."""
+        side = round(2 ** (self.log2_vertices / 3))
+        return side - 1 if side**3 <= 2**self.log2_vertices else side - 2
+
+    @property
+    def harmonics(self) -> int:
+        """Spherical harmonics of each channel."""
+        return (self.view_degree + 1) ** 2
+
+    @property
+    def layers(self) -> int:
+        """Tables of `FEATURES` numbers that hold a log density and three times the harmonics."""
+        return -(-(1 + 3 * self.harmonics) // FEATURES)
+
+
+class VoxelField(Field):
+    """log density and harmonics of the colour are interpolated; exponential and sigmoid come after.
+
+    density = exp(v_0),  rgb = sigmoid(sum_k Y_k(direction) (v_(1 + 3k), v_(2 + 3k), v_(3 + 3k)))
+
+    A surface may then be sharper than a cell. The grid is a hash grid without collisions whose levels all have the same
+    resolution, and goes through the same kernels. It starts near zero: a grey fog of density 1.
+    Source: Yu et al. 2022, Plenoxels, arXiv:2112.05131, section 3.1; Sun et al. 2022, DVGO, arXiv:2111.11215,
+    section 4.1 on activations after interpolation.
+    """
+
+    rate_factor = 30.0
+
+    def __init__(self, settings: VoxelFieldSettings):
+        super().__init__()
+        self._settings = settings
+        shape = (settings.layers, 2**settings.log2_vertices, FEATURES)
+        self.table = nn.Parameter(torch.empty(shape).uniform_(-1e-4, 1e-4))
+
+    @property
+    def settings(self) -> VoxelFieldSettings:
+        return self._settings
+
+    def rows(self) -> nn.Parameter:
+        return self.table
+
+    def density(self, coordinates: Tensor) -> Tensor:
+        # The log density stands in the first table; there is no need to look into the others.
+        resolutions = (self.settings.resolution,)
+        return density_from_log(kernels.hash_encode(coordinates, self.table[:1], resolutions)[:, 0])
+
+    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+        return self._radiance_of_values(self._interpolated(coordinates), directions, rays)
+
+    def visible_samples(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        edges: Tensor,
+        *,
+        jitter: Tensor,
+        occupied: Tensor,
+        deepest: float,
+    ) -> Samples:
+        return visible_samples(
+            origins,
+            directions,
+            edges,
+            jitter=jitter,
+            occupied=occupied,
+            unbounded=self.settings.unbounded,
+            deepest=deepest,
+            density=self.density,
+            code=self._interpolated,
+        )
+
+    def colour_of_code(self, code: Tensor, directions: Tensor, rays: Tensor) -> Tensor:
+        return self._radiance_of_values(code, directions, rays)[1]
+
+    def radiance_of_samples(
+        self, samples: Samples, directions: Tensor, rays: Tensor, *, sink: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        values = kernels.hash_encode(
+            samples.coordinates, self.table, self._resolutions(), sink=sink, known=samples.code
+        )
+        return self._radiance_of_values(values, directions, rays)
+
+    def _resolutions(self) -> tuple[int, ...]:
+        return (self.settings.resolution,) * self.settings.layers
+
+    def _interpolated(self, coordinates: Tensor) -> Tensor:
+        """(N, layers * FEATURES): log density, then red, green and blue of each harmonic; numbers at the end unused."""
+        return kernels.hash_encode(coordinates, self.table, self._resolutions())
+
+    def _radiance_of_values(self, values: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+        count = self.settings.harmonics
+        harmonics = spherical_harmonics(directions, self.settings.view_degree)[:, :count]
+        channels = values[:, 1 : 1 + 3 * count].unflatten(1, (count, 3))
+        rgb = torch.sigmoid((harmonics[rays][:, :, None] * channels).sum(1))
+        return density_from_log(values[:, 0]), rgb

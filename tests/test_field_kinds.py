@@ -1,0 +1,298 @@
+"""The kinds of fields: interpolation against SciPy, harmonics and features in closed form, gradients, checkpoints."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import map_coordinates
+from scipy.special import sph_harm_y
+
+from nerfcli import kernels
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.field.encodings import fourier_features, spherical_harmonics
+from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.interface import Field, FieldSettings
+from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
+from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.render.model import Marching, Model, load_model, save_model
+from nerfcli.train.optimiser import FieldOptimiser
+
+SMALL: dict[str, FieldSettings] = {
+    "hash": HashFieldSettings(unbounded=False, log2_rows=8, coarsest=4, finest=32),
+    "voxels": VoxelFieldSettings(unbounded=False, view_degree=2, log2_vertices=9),
+    "mlp": FourierFieldSettings(unbounded=False, octaves=4, width=16, layers=2),
+}
+
+
+@pytest.fixture(params=KINDS)
+def field(request: pytest.FixtureRequest) -> Field:
+    """A field of each kind whose numbers are not small."""
+    torch.manual_seed(0)
+    made = fresh_field(SMALL[request.param])
+    rows = made.rows()
+    if rows is not None:
+        with torch.no_grad():
+            rows.normal_()
+    return made
+
+
+def places(count: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(1), dtype=dtype)
+
+
+def looks(count: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    g = torch.Generator().manual_seed(2)
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=g, dtype=dtype), dim=-1)
+
+
+def test_every_kind_is_made_here():
+    assert set(SMALL) == set(KINDS)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_dense_grid_interpolates_as_scipy_does(dtype):
+    """Log density and harmonics, by scipy.ndimage.map_coordinates of order 1, borders included."""
+    torch.manual_seed(0)
+    settings = VoxelFieldSettings(unbounded=False, view_degree=1, log2_vertices=10)
+    field = VoxelField(settings).to(dtype)
+    with torch.no_grad():
+        field.table.normal_()
+    side = settings.resolution + 1
+    corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 0.0, 0.5]], dtype=dtype)
+    coordinates = torch.cat([places(200, dtype), corners])
+    volumes = field.table[:, : side**3].detach().double().numpy().reshape(settings.layers, side, side, side, 4)
+    at = (coordinates.double().numpy() * settings.resolution)[:, ::-1].T  # the grid is indexed [z, y, x]
+    values = np.concatenate(
+        [map_coordinates(volumes[layer, ..., i], at, order=1)[:, None] for layer in range(4) for i in range(4)], axis=1
+    )
+    directions = looks(len(coordinates), dtype)
+    density, rgb = field.radiance(coordinates, directions, torch.arange(len(coordinates)))
+    tolerance = 1e-5 if dtype == torch.float32 else 1e-12
+    np.testing.assert_allclose(density.detach().log().numpy(), values[:, 0], atol=tolerance)
+    np.testing.assert_allclose(field.density(coordinates).detach().log().numpy(), values[:, 0], atol=tolerance)
+    # Harmonics of degree 0 and 1 from SciPy, without its Condon-Shortley phase.
+    x, y, z = directions.double().numpy().T
+    polar, azimuth = np.arccos(z), np.arctan2(y, x)
+    first = np.asarray(sph_harm_y(1, 1, polar, azimuth)) * -math.sqrt(2)
+    basis = (np.full_like(z, 0.5 / math.sqrt(math.pi)), first.imag, sph_harm_y(1, 0, polar, azimuth).real, first.real)
+    colours = sum(y[:, None] * values[:, 1 + 3 * k : 4 + 3 * k] for k, y in enumerate(basis))
+    np.testing.assert_allclose(rgb.detach().numpy(), 1 / (1 + np.exp(-colours)), atol=tolerance)
+
+
+def test_the_dense_grid_has_as_many_cells_as_fit():
+    # The cube of vertices fits into the power of two, and the next larger one does not.
+    for log2_vertices in range(6, 28):
+        side = VoxelFieldSettings(unbounded=False, log2_vertices=log2_vertices).resolution + 1
+        assert side**3 <= 2**log2_vertices < (side + 1) ** 3
+
+
+def test_fourier_features_of_a_line_have_one_frequency_each():
+    """By the FFT: over two units, octave k is a pure tone of 2^k periods, sine and cosine a quarter apart."""
+    x = torch.arange(256, dtype=torch.float64)[:, None] / 128
+    spectrum = np.fft.rfft(fourier_features(x, 5).numpy(), axis=0) / 128
+    for octave in range(5):
+        for column, expected in ((2 * octave, -1j), (2 * octave + 1, 1.0)):
+            tone = np.zeros(129, complex)
+            tone[2**octave] = expected
+            np.testing.assert_allclose(spectrum[:, column], tone, atol=1e-12)
+
+
+def test_the_network_field_is_its_formula():
+    torch.manual_seed(0)
+    field = FourierField(FourierFieldSettings(unbounded=False, octaves=3, width=8, layers=2)).double()
+    coordinates, directions = places(20, torch.float64), looks(4, torch.float64)
+    rays = torch.arange(20) // 5
+    numbers = {name: value.detach().numpy() for name, value in field.named_parameters()}
+
+    def layer(name: str, x: np.ndarray) -> np.ndarray:
+        return x @ numbers[f"{name}.weight"].T + numbers[f"{name}.bias"]
+
+    hidden = fourier_features(2 * coordinates - 1, 3).numpy()
+    for name in ("trunk.0", "trunk.2"):
+        hidden = np.maximum(layer(name, hidden), 0)
+    seen = np.concatenate([hidden, np.asarray(spherical_harmonics(directions)[rays])], axis=1)
+    rgb = 1 / (1 + np.exp(-layer("colour.2", np.maximum(layer("colour.0", seen), 0))))
+    density, colours = field.radiance(coordinates, directions, rays)
+    np.testing.assert_allclose(density.detach().numpy(), np.exp(layer("log_density", hidden)[:, 0]), rtol=1e-12)
+    np.testing.assert_allclose(colours.detach().numpy(), rgb, rtol=1e-12)
+
+
+def test_gradients_of_every_kind(field):
+    """gradcheck in float64 of density and colour by all parameters, rows among them."""
+    field = field.double()
+    coordinates, directions = places(3, torch.float64), looks(2, torch.float64)
+    rays = torch.tensor([0, 0, 1])
+    names = [f"field.{name}" for name, _ in field.named_parameters()]
+    chosen = [parameter.detach().clone().requires_grad_() for parameter in field.parameters()]
+
+    def outputs(*values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        replaced = dict(zip(names, values, strict=True))
+        return torch.func.functional_call(_Radiance(field), replaced, (coordinates, directions, rays))
+
+    assert torch.autograd.gradcheck(outputs, chosen, fast_mode=True)
+
+
+class _Radiance(torch.nn.Module):
+    """`Field.radiance` as a call."""
+
+    def __init__(self, field: Field):
+        super().__init__()
+        self.field = field
+
+    def forward(self, *asked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.field.radiance(*asked)
+
+
+@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_visible_samples_are_the_definition(kind, unbounded):
+    """Marched by the reference, with the field's own density, and cut where the optical depth reaches the limit."""
+    torch.manual_seed(0)
+    field = fresh_field(replace(SMALL[kind], unbounded=unbounded))
+    rows = field.rows()
+    if rows is not None:
+        with torch.no_grad():
+            rows.normal_(2.0, 1.0)
+    g = torch.Generator().manual_seed(3)
+    directions = looks(17)
+    origins, jitter = -2 * directions + 0.2 * torch.randn(17, 3, generator=g), torch.rand(17, generator=g)
+    edges = torch.linspace(0.5, 4.0, 60)
+    occupied = torch.rand(8, 8, 8, generator=g) > 0.4
+    with torch.no_grad():
+        everything = field.visible_samples(origins, directions, edges, jitter=jitter, occupied=occupied, deepest=1e9)
+        depths = everything.density * (everything.ends - everything.starts)
+        deepest = 0.3 * float(kernels.sum_along_rays(depths, everything.offsets).median())
+        samples = field.visible_samples(origins, directions, edges, jitter=jitter, occupied=occupied, deepest=deepest)
+        starts, ends, offsets = kernels.reference.march(
+            origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded
+        )
+        kept = []
+        for ray in range(17):
+            depth = 0.0
+            for i in range(int(offsets[ray]), int(offsets[ray + 1])):
+                if depth >= deepest:
+                    break
+                point = origins[ray] + directions[ray] * (starts[i] + ends[i]) / 2
+                at = kernels.grid_coordinates(point[None], unbounded)
+                density = float(field.density(at))
+                kept.append((ray, float(starts[i]), float(ends[i]), density))
+                depth += density * float(ends[i] - starts[i])
+        rays = kernels.ray_indices(samples.offsets)
+        found = torch.stack([rays.float(), samples.starts, samples.ends, samples.density], dim=1)
+        np.testing.assert_allclose(found.numpy(), np.array(kept), rtol=2e-4, atol=1e-6)
+        assert len(kept) < int(offsets[-1])  # some stand behind others
+        density, rgb = field.radiance(samples.coordinates, directions, rays)
+        torch.testing.assert_close(samples.density, density, rtol=1e-4, atol=0)
+        torch.testing.assert_close(field.colour_of_code(samples.code, directions, rays), rgb, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("sizes", [(0, 9), (1, 9), (5, 3), (123, 40)])
+@pytest.mark.parametrize("unbounded", [False, True])
+def test_compiled_marching_is_the_reference(sizes, unbounded):
+    rays, intervals = sizes
+    g = torch.Generator().manual_seed(rays)
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=g), dim=-1)
+    origins, jitter = torch.randn(rays, 3, generator=g), torch.rand(rays, generator=g)
+    edges, occupied = torch.linspace(0.1, 5.0, intervals + 2), torch.rand(6, 6, 6, generator=g) > 0.5
+    arguments = {"jitter": jitter, "occupied": occupied, "unbounded": unbounded}
+    fast = kernels.occupied_samples(origins, directions, edges, **arguments)
+    slow = kernels.marching.occupied_samples(origins, directions, edges, **arguments)
+    assert torch.equal(fast[3], slow[3])
+    for one, other in zip(fast[:3], slow[:3], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+
+
+def test_the_sink_gets_the_gradient_of_the_rows(field):
+    """As autograd gives it, up to the order of sums; then the optimiser has changed only what a sample touched."""
+    directions, occupied = looks(5), torch.ones(4, 4, 4, dtype=torch.bool)
+    samples = field.visible_samples(
+        -2 * directions, directions, torch.linspace(1, 3, 9), jitter=torch.zeros(5), occupied=occupied, deepest=50.0
+    )
+    rays = kernels.ray_indices(samples.offsets)
+    optimiser = FieldOptimiser(field)
+    before = {name: value.detach().clone() for name, value in field.named_parameters()}
+    density, rgb = field.radiance_of_samples(samples, directions, rays, sink=optimiser.sink)
+    (density.sum() + rgb.sum()).backward()
+    rows, sink = field.rows(), optimiser.sink
+    touched = torch.zeros(0)
+    if rows is not None and sink is not None:
+        assert rows.grad is None
+        density, rgb = field.radiance(samples.coordinates, directions, rays)
+        (wanted,) = torch.autograd.grad(density.sum() + rgb.sum(), rows)
+        torch.testing.assert_close(sink, wanted, rtol=1e-4, atol=1e-4 * float(wanted.abs().max()))
+        touched = (wanted != 0).any(-1)
+    optimiser.step(1, 1e-3)
+    assert sink is None or not sink.any()
+    for name, value in field.named_parameters():
+        changed = value != before[name]
+        if value is rows:
+            assert torch.equal(changed.any(-1), touched)
+        else:
+            assert changed.float().mean() > 0.5
+
+
+def test_the_state_of_the_optimiser_comes_back(field):
+    def stepped(optimiser: FieldOptimiser, number: int) -> None:
+        optimiser.zero_grad()
+        density, rgb = field.radiance(places(9), looks(9), torch.arange(9))
+        (density.sum() + rgb.sum()).backward()
+        rows = field.rows()
+        if rows is not None and optimiser.sink is not None and rows.grad is not None:
+            optimiser.sink.add_(rows.grad)
+            rows.grad = None
+        optimiser.step(number, 1e-3)
+
+    first = FieldOptimiser(field)
+    stepped(first, 1)
+    numbers = {name: value.clone() for name, value in field.state_dict().items()}
+    second = FieldOptimiser(field)
+    second.restore({name: value.clone() for name, value in first.state().items()})
+    stepped(first, 2)
+    straight = {name: value.clone() for name, value in field.state_dict().items()}
+    field.load_state_dict(numbers)
+    stepped(second, 2)
+    for name, value in field.state_dict().items():
+        assert torch.equal(value, straight[name]), name
+
+
+def model_of(field: Field) -> Model:
+    return Model(
+        field=field,
+        occupied=torch.rand(4, 4, 4) > 0.5,
+        marching=Marching(near=0.1, far=4.0, shortest_step=0.01, growth=0.0),
+        background=(0.0, 0.0, 0.0),
+        training_from_scene=Similarity.identity(),
+        unit="arbitrary",
+    )
+
+
+def test_every_kind_comes_back_bit_for_bit(field, tmp_path):
+    save_model(tmp_path / "a.safetensors", model_of(field))
+    loaded = load_model(tmp_path / "a.safetensors", "cpu").field
+    assert loaded.settings == field.settings
+    assert type(loaded) is type(field)
+    for name, value in field.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value), name
+
+
+def test_a_field_from_before_there_were_kinds_is_a_hash_grid(tmp_path):
+    torch.manual_seed(0)
+    field = fresh_field(SMALL["hash"])
+    save_model(tmp_path / "new.safetensors", model_of(field))
+    tensors, description = load_tensors(tmp_path / "new.safetensors", "cpu")
+    del description["field"]["kind"], description["field"]["view_degree"]
+    save_tensors(tmp_path / "old.safetensors", tensors, description)
+    loaded = load_model(tmp_path / "old.safetensors", "cpu").field
+    assert loaded.settings == field.settings
+    assert torch.equal(loaded.density(places(7)), field.density(places(7)))
+
+
+def test_a_kind_of_a_later_version_is_told():
+    with pytest.raises(UserError, match="fields of the kind 'gaussians' are not known here") as caught:
+        settings_from_json({"kind": "gaussians", "unbounded": True})
+    assert caught.value.exit_code == BAD_INPUT
