@@ -201,6 +201,22 @@ class Fitting:
         watch.values("loss", loss)
         return loss, len(starts)
 
+    @torch.no_grad()
+    def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
+        """What the model says of pixels now, and what the photos say, both (N, 3) sRGB; alpha on white."""
+        origins, directions = drawn.origins, drawn.directions
+        middle = torch.full_like(origins[:, 0], 0.5)
+        behind = torch.full_like(origins, 1.0 if self.pool.has_alpha else 0.0)
+        samples = self.field.visible_samples(
+            origins, directions, self.edges, jitter=middle, occupied=self.occupied, deepest=DEEPEST
+        )
+        rays = kernels.ray_indices(samples.offsets)
+        density, rgb = self.field.radiance_of_samples(samples, directions, rays, sink=None)
+        rendered, transmittance, _ = kernels.composite(
+            density, rgb, samples.ends - samples.starts, offsets=samples.offsets, background=behind
+        )
+        return self.parts.compared(rendered, transmittance, drawn, behind=behind)
+
     def _refresh_occupancy(self) -> None:
         # The whole grid once, after a warm-up in which everything is open; then a share at a time.
         if self.step == 0:
