@@ -94,24 +94,41 @@ class Scripted:
 
 
 def test_what_is_kept_is_in_the_model_and_seeds_are_paired():
-    scripted, told = Scripted(), []
+    scripted = Scripted()
     chosen = select(
         scripted,  # type: ignore[arg-type]
         Components(),
         [("view", 0), ("near", False)],
         seconds=60.0,
         steps=None,
-        on_trial=lambda done, total: told.append((done, total)),
     )
     assert chosen.components == Components(view=0)
     assert [decision.kept for decision in chosen.decisions] == [True, False]
-    assert told == [(index + 1, 6) for index in range(6)]
     assert [seed for _, seed, _ in scripted.asked] == [0, 1] * 3
     assert {steps for _, _, steps in scripted.asked[1:]} == {100}
     assert math.isfinite(chosen.seconds)
 
 
+def test_of_two_that_gain_the_same_only_one_is_kept():
+    """view=0 and near=False each gain 0.5 dB, and both together no more than 0.4."""
+
+    class Overlapping(Scripted):
+        def run(self, components: Components, *, seed: int, steps: int | None, seconds: float | None = None) -> Trial:
+            changed = (components.view == 0) + (not components.near)
+            return trial(20.0 + seed + (0.0, 0.5, 0.4)[changed])
+
+    chosen = select(
+        Overlapping(),  # type: ignore[arg-type]
+        Components(),
+        [("view", 0), ("near", False)],
+        seconds=60.0,
+        steps=None,
+    )
+    assert chosen.components == Components(view=0)
+    assert [decision.why for decision in chosen.decisions][1] == "no gain beside view"
+
+
 def test_too_few_steps_are_not_spent():
     scripted = Scripted()
-    chosen = select(scripted, Components(), [("view", 0)], seconds=None, steps=100, on_trial=lambda done, total: None)  # type: ignore[arg-type]
+    chosen = select(scripted, Components(), [("view", 0)], seconds=None, steps=100)  # type: ignore[arg-type]
     assert (chosen.components, chosen.decisions, scripted.asked) == (Components(), (), [])

@@ -100,7 +100,7 @@ def _describe_run(folder: Path) -> dict[str, Any]:
     from nerfcli.evaluate.protocol import METRICS
     from nerfcli.field.cost import field_bytes
     from nerfcli.render.model import load_model
-    from nerfcli.train.run_folder import FIELD, read_cameras, read_config, read_log
+    from nerfcli.train.run_folder import FIELD, chosen_components, read_cameras, read_config, read_log
 
     config = read_config(folder)
     cameras = read_cameras(folder)
@@ -113,7 +113,7 @@ def _describe_run(folder: Path) -> dict[str, Any]:
         "unit": config.get("unit"),
         "unit_source": config.get("unit_source"),
         "settings": {k: v for k, v in config.get("settings", {}).items() if k != "components"},
-        "components": config.get("settings", {}).get("components"),
+        "components": chosen_components(config).to_json(),
         "versions": config.get("versions"),
     }
     if log:

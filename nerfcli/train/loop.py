@@ -4,7 +4,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,22 @@ from nerfcli.train.interrupts import held_back
 from nerfcli.train.normalisation import training_frame
 from nerfcli.train.photos import PixelPool, load_photos
 from nerfcli.train.point_depth import PointRays, point_depths
-from nerfcli.train.run_folder import CONFIG, FIELD, LOG, STATE, append_log, cut_log, describe_run, write_cameras
+from nerfcli.train.run_folder import (
+    CONFIG,
+    FIELD,
+    LOG,
+    STATE,
+    append_log,
+    chosen_components,
+    cut_log,
+    describe_run,
+    read_config,
+    write_cameras,
+)
+from nerfcli.train.selection import SEARCH_SHARE, Selection, proposals, select
 from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.settings import TrainSettings, automatic_downscale
+from nerfcli.train.trials import Trials
 from nerfcli.train.watch import that_must_be_finite
 
 STATE_FORMAT = "nerfcli training 1"
@@ -52,9 +65,11 @@ class Progress:
 
 @dataclass
 class _Totals:
-    """What accumulates over the whole training, resumed parts included."""
+    """What accumulates over the whole training, resumed parts included; `searched` is the part of the seconds that the
+    choice of the components took."""
 
     seconds: float = 0.0
+    searched: float = 0.0
     samples: int = 0
     rays: int = 0
 
@@ -95,16 +110,23 @@ def train(
     similarity, marching = training_frame(scene, unbounded=unbounded)
     device = torch.device(settings.device)
     pool = PixelPool(photos, similarity, device)
-    reference = None if settings.components.exposure == "none" else mean_log_exposure(scene.train_frames)
-    heldout = None
-    if test_photos:
-        gains = relative_log_exposures(scene.test_frames, reference)
-        heldout = HeldoutPixels(test_photos, similarity, device, log_gains=gains)
     notify(
         f"{len(photos)} photos to train on, {len(test_photos)} held out, "
         f"{photos[0].frame.camera.width}x{photos[0].frame.camera.height} (1/{factor}), "
         f"{'unbounded' if unbounded else 'bounded'} scene, {settings.device}, {settings.threads} threads"
     )
+    asked, selection = settings, None
+    if resume:
+        settings = replace(settings, components=chosen_components(read_config(run)))
+    elif settings.model == "auto":
+        trials = Trials(photos, similarity, marching, unbounded=unbounded, settings=settings, log_gains=None)
+        selection = _search(trials, settings, has_alpha=pool.has_alpha, photos=len(photos), notify=notify)
+        settings = replace(settings, components=selection.components)
+    reference = None if settings.components.exposure == "none" else mean_log_exposure(scene.train_frames)
+    heldout = None
+    if test_photos:
+        gains = relative_log_exposures(scene.test_frames, reference)
+        heldout = HeldoutPixels(test_photos, similarity, device, log_gains=gains)
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
 
@@ -119,7 +141,8 @@ def train(
     fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings, log_gains=log_gains, points=points)
     size = ", ".join(f"{name} {value}" for name, value in fitting.field.settings.to_json().items())
     notify(f"field: {size}; {field_bytes(fitting.field) / 1e6:.2f} MB")
-    totals = _Totals()
+    spent = selection.seconds if selection is not None else 0.0
+    totals = _Totals(seconds=spent, searched=spent)
     if resume:
         totals = _restore(fitting, run)
         cut_log(run, fitting.step)
@@ -132,7 +155,10 @@ def train(
                 old.unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(run, error) from error
-    write_json(run / CONFIG, describe_run(scene, settings, factor))
+    if resume:
+        write_json(run / CONFIG, {**describe_run(scene, asked, factor), "selection": read_config(run).get("selection")})
+    else:
+        write_json(run / CONFIG, describe_run(scene, asked, factor, selection))
     write_cameras(run, scene.train_frames, scene.test_frames)
     background = fitting.parts.background or (ALPHA_BACKGROUND if pool.has_alpha else OPAQUE_BACKGROUND)
 
@@ -225,16 +251,16 @@ def _run(
         append_log(run, entry | measured)
         logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
 
-    checks = [share for share in HELDOUT_SHARES if share > _share(settings, fitting.step, totals.seconds)]
+    checks = [share for share in HELDOUT_SHARES if share > _share(settings, fitting.step, totals)]
     try:
-        while (share := _share(settings, fitting.step, totals.seconds)) < 1.0:
+        while (share := _share(settings, fitting.step, totals)) < 1.0:
             began = time.perf_counter()
             result = sentinel.advance(share)
             totals.seconds += time.perf_counter() - began
             totals.samples += result.samples
             totals.rays += result.rays
             loss = result.loss
-            share = _share(settings, fitting.step, totals.seconds)
+            share = _share(settings, fitting.step, totals)
             on_progress(Progress(share, fitting.step, totals.seconds, loss, speeds()[0], psnr))
             if checks and share >= checks[0]:
                 checks = [later for later in checks if later > share]
@@ -251,9 +277,31 @@ def _run(
             log()
 
 
-def _share(settings: TrainSettings, step: int, seconds: float) -> float:
-    """How much of the budget is used: the larger of the shares of time and of steps."""
-    by_time = seconds / settings.budget_seconds if settings.budget_seconds else 0.0
+def _search(
+    trials: Trials, settings: TrainSettings, *, has_alpha: bool, photos: int, notify: Callable[[str], None]
+) -> Selection:
+    """Let the scene decide on the components, and tell how it did."""
+    candidates = proposals(settings.components, has_alpha=has_alpha, photos=photos, fixed=settings.fixed)
+    budget, steps = settings.budget_seconds, settings.steps
+    notify(f"tries {len(candidates)} components in short trainings, for {SEARCH_SHARE:.0%} of the budget")
+    selection = select(
+        trials,
+        settings.components,
+        candidates,
+        seconds=None if budget is None else SEARCH_SHARE * budget,
+        steps=None if steps is None else round(SEARCH_SHARE * steps),
+    )
+    for decision in selection.decisions:
+        notify(decision.in_words())
+    if not selection.decisions:
+        notify("the budget is too small to try components; those that most scenes need are taken")
+    return selection
+
+
+def _share(settings: TrainSettings, step: int, totals: _Totals) -> float:
+    """How much of the budget is used: the larger of the shares of time, that of the search aside, and of steps."""
+    left = settings.budget_seconds - totals.searched if settings.budget_seconds else 0.0
+    by_time = (totals.seconds - totals.searched) / left if left > 0 else 0.0
     by_steps = step / settings.steps if settings.steps else 0.0
     return min(1.0, max(by_time, by_steps))
 

@@ -19,6 +19,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.scene import Scene, fingerprint
 from nerfcli.train.components import Components
+from nerfcli.train.selection import Selection
 from nerfcli.train.settings import TrainSettings
 
 CONFIG = "config.json"
@@ -29,8 +30,17 @@ LOG = "log.jsonl"
 LOCK = ".train.lock"
 
 
-def describe_run(scene: Scene, settings: TrainSettings, factor: int) -> dict[str, Any]:
-    """What RUN/config.json holds: enough to know what was done, and to tell whether it is the same again."""
+def describe_run(
+    scene: Scene, settings: TrainSettings, factor: int, selection: Selection | None = None
+) -> dict[str, Any]:
+    """What RUN/config.json holds: enough to know what was done, and to tell whether it is the same again.
+
+    Args:
+        scene: what was trained on.
+        settings: as they were asked for.
+        factor: by which photos were made smaller.
+        selection: how the components were chosen, where the scene decided.
+    """
     return {
         "scene": str(scene.root),
         "scene_kind": scene.kind,
@@ -42,6 +52,7 @@ def describe_run(scene: Scene, settings: TrainSettings, factor: int) -> dict[str
         "history": dict(scene.history),
         "missing_photos": list(scene.missing),
         "settings": {**settings.to_json(), "downscale": factor},
+        "selection": None if selection is None else selection.to_json(),
         "versions": {
             "nerfcli": __version__,
             "python": platform.python_version(),
@@ -118,6 +129,12 @@ def read_config(run: Path) -> dict[str, Any]:
         ) from error
     except (OSError, ValueError) as error:
         raise UserError(f"{run / CONFIG} cannot be read: {error}", "train again with --overwrite") from error
+
+
+def chosen_components(config: dict[str, Any]) -> Components:
+    """The components of a run that has this RUN/config.json: those that the scene decided on, or as asked for."""
+    chosen = (config.get("selection") or {}).get("components") or config.get("settings", {}).get("components", {})
+    return Components(**chosen)
 
 
 def append_log(run: Path, entry: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ between seeds and between photos is their error.
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -54,6 +54,14 @@ class Decision:
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
+    def in_words(self) -> str:
+        """A line for people: "exposure=learned: +1.20 +- 0.08 dB, +3 % time: kept, gains ..."."""
+        value = str(self.value).lower()
+        return (
+            f"{self.component}={value}: {self.gain_db:+.2f} +- {self.error_db:.2f} dB, {self.cost:+.0%} time: "
+            f"{'kept' if self.kept else 'not kept'}, {self.why}"
+        )
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -96,7 +104,6 @@ def select(
     *,
     seconds: float | None,
     steps: int | None,
-    on_trial: Callable[[int, int], None],
 ) -> Selection:
     """Try every candidate alone against `start`, keep those that are better, and check them together.
 
@@ -106,39 +113,46 @@ def select(
         candidates: see `proposals`.
         seconds: for all trials together; None to go by `steps`.
         steps: of all trials together, where there is no limit of time.
-        on_trial: called with (trials done, trials in all).
 
     Returns:
         `start` and no decisions where there is too little to spend.
     """
-    total = SEEDS * (len(candidates) + 1)
+    total = SEEDS * (len(candidates) + 2)  # of the model as it is, of each candidate, of those together that are kept
     began = time.perf_counter()
     if not candidates or (seconds is None and (steps or 0) < FEWEST_STEPS * total):
         return Selection(start, (), 0.0)
-    done = 0
 
-    def run(components: Components, *, seed: int, steps: int | None, seconds: float | None = None) -> Trial:
-        nonlocal done
-        trial = trials.run(components, seed=seed, steps=steps, seconds=seconds)
-        done += 1
-        on_trial(done, total)
-        return trial
+    def trials_of(components: Components, *, first: Sequence[Trial] = ()) -> list[Trial]:
+        left = range(len(first), SEEDS)
+        return [*first, *(trials.run(components, seed=seed, steps=length) for seed in left)]
 
     # The first trial goes by time, and tells how many steps the others are.
-    own = None if seconds is not None else max(1, (steps or 0) // total)
-    first = run(start, seed=0, steps=own, seconds=None if seconds is None else seconds / total)
-    if first.steps < FEWEST_STEPS:
+    own = None if seconds is not None else (steps or 0) // total
+    first = trials.run(start, seed=0, steps=own, seconds=None if seconds is None else seconds / total)
+    length = first.steps
+    if length < FEWEST_STEPS:
         return Selection(start, (), time.perf_counter() - began)
-    base = [first, *(run(start, seed=seed, steps=first.steps) for seed in range(1, SEEDS))]
+    base = trials_of(start, first=[first])
     tried = []
     for name, value in candidates:
         if seconds is not None and time.perf_counter() - began > seconds:
             break
-        changed = replace(start, **{name: value})
-        tried.append((name, value, [run(changed, seed=seed, steps=first.steps) for seed in range(SEEDS)]))
+        tried.append((name, value, trials_of(replace(start, **{name: value}))))
     decisions = judge(base, tried)
-    kept = {decision.component: decision.value for decision in decisions if decision.kept}
-    return Selection(replace(start, **kept), decisions, time.perf_counter() - began)
+    kept = [decision for decision in decisions if decision.kept]
+    if len(kept) > 1:
+        together = replace(start, **{decision.component: decision.value for decision in kept})
+        gain = float(np.mean([_gain(*pair) for pair in zip(base, trials_of(together), strict=True)]))
+        best = max(kept, key=lambda decision: decision.gain_db)
+        if gain < best.gain_db:
+            decisions = tuple(
+                replace(decision, kept=False, why=f"no gain beside {best.component}")
+                if decision.kept and decision is not best
+                else decision
+                for decision in decisions
+            )
+    changes = {decision.component: decision.value for decision in decisions if decision.kept}
+    return Selection(replace(start, **changes), decisions, time.perf_counter() - began)
 
 
 def judge(base: Sequence[Trial], tried: Sequence[tuple[str, Value, Sequence[Trial]]]) -> tuple[Decision, ...]:

@@ -34,6 +34,9 @@ class TrainSettings:
         components: what is in the model and in its loss.
         field: what the field is made of, one of `kinds.KINDS`.
         field_memory_bytes: what the field's numbers may take; None for what suits the kind, see `sizes.chosen_size`.
+        model: "default" takes the components as they are, "auto" lets the scene decide on those that are not `fixed`,
+            see `selection`.
+        fixed: names of components that the user has decided on.
 
     Raises:
         UserError: neither or a non-positive limit, an unknown downscale or kind of field.
@@ -56,6 +59,8 @@ class TrainSettings:
     components: Components = dataclasses.field(default_factory=Components)
     field: str = HashFieldSettings.kind
     field_memory_bytes: int | None = None
+    model: str = "default"
+    fixed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if min(self.levels, self.width) < 1 or not 4 <= self.log2_rows <= 24:
@@ -71,7 +76,7 @@ class TrainSettings:
             raise UserError(f"there is no field of the kind {self.field!r}", f"choose {', '.join(KINDS)}")
 
     def to_json(self) -> dict[str, Any]:
-        return asdict(self)
+        return {**asdict(self), "fixed": list(self.fixed)}
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "TrainSettings":

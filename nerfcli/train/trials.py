@@ -95,7 +95,9 @@ class Trials:
         self._photos = self._pool.photo_of(self._judged.numbers).cpu().numpy()
         self._num_photos = len(photos)
         self._marching, self._unbounded = marching, unbounded
-        self._settings, self._log_gains = settings, log_gains
+        # Small steps all along: they learn more from a sample, which is what a short training has few of.
+        self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
+        self._log_gains = log_gains
 
     def run(self, components: Components, *, seed: int, steps: int | None, seconds: float | None = None) -> Trial:
         """Train from the beginning to the end of a schedule, and judge.
