@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nerfcli import kernels
 from nerfcli.atomic import cannot_write, write_json
@@ -116,7 +117,8 @@ def train(
         f"{'unbounded' if unbounded else 'bounded'} scene, {settings.device}, {settings.threads} threads"
     )
     asked, selection = settings, None
-    if resume:
+    saved = load_tensors(run / STATE, settings.device) if resume else None
+    if saved is not None:
         settings = replace(settings, components=chosen_components(read_config(run)))
     elif settings.model == "auto":
         trials = Trials(photos, similarity, marching, unbounded=unbounded, settings=settings, log_gains=None)
@@ -143,8 +145,8 @@ def train(
     notify(f"field: {size}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     spent = selection.seconds if selection is not None else 0.0
     totals = _Totals(seconds=spent, searched=spent)
-    if resume:
-        totals = _restore(fitting, run)
+    if saved is not None:
+        totals = _restore(fitting, run, *saved)
         cut_log(run, fitting.step)
         notify(f"resumed at step {fitting.step}, {totals.seconds:.1f} s")
     else:
@@ -306,9 +308,8 @@ def _share(settings: TrainSettings, step: int, totals: _Totals) -> float:
     return min(1.0, max(by_time, by_steps))
 
 
-def _restore(fitting: Fitting, run: Path) -> _Totals:
-    """Bring `fitting` to the run's last checkpoint."""
-    tensors, description = load_tensors(run / STATE, fitting.settings.device)
+def _restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> _Totals:
+    """Bring `fitting` to the run's last checkpoint, which says this."""
     if description.get("format") != STATE_FORMAT:
         raise UserError(f"{run / STATE} was written by another version", "train again with --overwrite")
     if description["field"] != fitting.field.settings.to_json():
