@@ -23,8 +23,8 @@ from corner import NAMES, write_capture
 
 import nerfcli
 from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
+from nerfcli.memory import default_memory_limit, resident_bytes
 from nerfcli.poses import structure_from_motion
-from nerfcli.poses.memory import default_memory_limit, resident_bytes
 from nerfcli.poses.report import PosesReport
 from nerfcli.poses.settings import Limits, PoseSettings
 from nerfcli.poses.stages import read_stage, write_stage

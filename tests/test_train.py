@@ -392,11 +392,29 @@ def test_a_folder_that_is_no_run_is_told(tmp_path):
 
 def test_a_log_line_that_a_kill_cut_short_is_left_out(tmp_path):
     assert read_log(tmp_path) == []
-    append_log(tmp_path, {"step": 1})
-    append_log(tmp_path, {"step": 2})
-    with (tmp_path / "log.jsonl").open("a") as file:
-        file.write('{"step": 3, "sec')
-    assert read_log(tmp_path) == [{"step": 1}, {"step": 2}]
+    entry = {"step": 1, "seconds": 0.5, "loss": 0.1, "samples": 7, "rays": 3, "peak_memory_bytes": 9}
+    for broken in ('{"step": 3, "sec', "[]", "\x00", json.dumps({**entry, "samples": "7"}), json.dumps(entry)[:-2]):
+        append_log(tmp_path, entry)
+        append_log(tmp_path, {**entry, "step": 2})
+        with (tmp_path / "log.jsonl").open("a") as file:
+            file.write(broken)
+        assert read_log(tmp_path) == [entry, {**entry, "step": 2}]
+        (tmp_path / "log.jsonl").unlink()
+
+
+@pytest.mark.parametrize(("file", "read"), [("config.json", read_config), ("cameras.json", read_cameras)])
+def test_a_digit_that_changes_in_the_description_of_a_run_is_noticed(file, read, views, tmp_path):
+    fit(views, tmp_path / "run", replace(FEW, steps=1))
+    path = tmp_path / "run" / file
+    whole = path.read_text()
+    name = whole.index('"blake2b"')  # without it, it is a file of an earlier version
+    digits = [index for index, letter in enumerate(whole) if letter.isdigit() and not 0 <= index - name < 9]
+    for index in digits[:: max(1, len(digits) // 40)]:
+        path.write_text(whole[:index] + str((int(whole[index]) + 1) % 10) + whole[index + 1 :])
+        with pytest.raises(UserError, match=rf"{file} cannot be read"):
+            read(tmp_path / "run")
+    path.write_text(whole)
+    read(tmp_path / "run")
 
 
 def test_what_counts_as_the_same_run(views, tmp_path):

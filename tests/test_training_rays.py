@@ -1,6 +1,7 @@
 """What training is fed: the normalised frame, photos at the size they are trained on, pixels with their rays."""
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +12,15 @@ import torch
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
-from nerfcli.errors import UserError
+from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.media.images import downscale, write_png
+from nerfcli.memory import resident_bytes
 from nerfcli.render.rays import frame_rays
 from nerfcli.scene import Scene
 from nerfcli.train.losses import colour_loss, over_background
 from nerfcli.train.normalisation import training_frame
-from nerfcli.train.photos import Photo, PixelPool, downscaled_camera, load_photos
+from nerfcli.train.photos import Album, Photo, PixelPool, downscaled_camera, load_album, load_photos
+from nerfcli.train.room import IN_MEMORY, InFiles, Needs, Room, room_for
 
 CPU = torch.device("cpu")
 CAMERA = Camera.pinhole(40, 30, 50.0)
@@ -263,3 +266,61 @@ def test_a_pixel_is_found_again_by_its_number():
     for number in range(len(pool.colours)):
         name, x, y = pool.place(number)
         assert by_name[name][y, x, 0] == pool.colours[number, 0]
+
+
+def drawn_from(frames: list[Frame], room: Room) -> tuple[list[bytes], Album, PixelPool]:
+    album = load_album(frames, factor=2, threads=2, room=room)
+    pool = PixelPool(album.photos, SIMILARITY, CPU, colours=album.colours, room=room)
+    drawn = pool.draw(3000, torch.Generator().manual_seed(4))
+    return [tensor.numpy().tobytes() for tensor in drawn], album, pool
+
+
+@pytest.mark.parametrize("alpha", [(False, False), (True, True), (False, True)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_photos_in_files_give_the_same_rays_as_in_memory(alpha, masked, tmp_path):
+    # And both give those of photos that were loaded one by one.
+    rng = np.random.default_rng(0)
+    frames = []
+    for index, has_alpha in enumerate(alpha):
+        camera = Camera("SIMPLE_PINHOLE", 20 + 2 * index, 14, (15.0, 10.0, 7.0))
+        path, mask = tmp_path / f"{index}.png", tmp_path / f"mask{index}.png"
+        write_png(path, rng.integers(0, 256, size=(14, camera.width, 4 if has_alpha else 3), dtype=np.uint8))
+        write_png(mask, rng.choice([0, 255, 255, 255], size=(14, camera.width)).astype(np.uint8))
+        frames.append(Frame(path.name, camera, np.eye(4), path, mask if masked else None))
+    in_memory, album, pool = drawn_from(frames, IN_MEMORY)
+    in_files, _, _ = drawn_from(frames, InFiles(tmp_path / "room", 1))  # a limit that is always passed
+    assert in_files == in_memory
+    one_by_one = PixelPool(load_photos(frames, factor=2, threads=1), SIMILARITY, CPU)
+    drawn = one_by_one.draw(3000, torch.Generator().manual_seed(4))
+    assert [tensor.numpy().tobytes() for tensor in drawn] == in_memory
+    assert album.fills_frame == (not all(alpha))
+    assert pool.has_alpha == any(alpha)
+    assert not list((tmp_path / "room").iterdir())  # files without a name
+
+
+def test_pages_are_given_back_beyond_the_limit(tmp_path):
+    room = InFiles(tmp_path, resident_bytes(os.getpid()) + 2**23)
+    before = resident_bytes(os.getpid())
+    array = room.array((2**26,), np.uint8)
+    for part in range(16):
+        array[part * 2**22 : (part + 1) * 2**22] = part
+        room.relieve()
+    assert resident_bytes(os.getpid()) < before + 2**24  # of 2**26 written
+    assert [int(array[part * 2**22 + 7]) for part in range(16)] == list(range(16))
+
+
+def test_what_does_not_fit_is_refused_up_front(tmp_path):
+    needs = Needs(photos=3 * 10**9, rest=10**9)
+    assert room_for(needs, None, folder=tmp_path)[0] is IN_MEMORY
+    assert room_for(needs, 4 * 10**9, folder=tmp_path)[0] is IN_MEMORY
+    room, told = room_for(needs, 2 * 10**9, folder=tmp_path)
+    assert isinstance(room, InFiles)
+    assert "about 4.00 GB would be needed, 2.00 GB are allowed: the photos (3.00 GB) stand in files" in told
+    with pytest.raises(UserError, match=r"needs about 1\.00 GB of memory besides the photos, 0\.90 GB") as caught:
+        room_for(needs, 9 * 10**8, folder=tmp_path)
+    assert caught.value.exit_code == OUT_OF_MEMORY
+
+
+def test_a_full_disk_is_told_before_anything_is_written_to_it(tmp_path):
+    with pytest.raises(UserError, match="cannot write"):
+        InFiles(tmp_path, 1).array((2**55,), np.uint8)

@@ -47,6 +47,7 @@ FieldMemory = Annotated[
     str | None,
     typer.Option(help="About what its numbers may take: 4MB, 64MB.  [default: hash 8MiB, voxels 64MiB, mlp 256KiB]"),
 ]
+Memory = Annotated[str | None, typer.Option(help="Memory it may use: 4GB, 500MB.  [default: 4/5 of the machine's]")]
 Json = Annotated[bool, typer.Option("--json", help="Results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No notes and no progress; warnings and errors stay.")]
@@ -117,6 +118,17 @@ def holdout_rule(holdout: str | None) -> str | None:
         return None if holdout is None else check_holdout(holdout)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--holdout") from error
+
+
+def memory_limit(memory: str | None) -> int | None:
+    """The bytes of --memory; four fifths of the machine's where it is not given, None where nobody knows.
+
+    Raises:
+        typer.BadParameter: not an amount of memory.
+    """
+    from nerfcli.memory import default_memory_limit
+
+    return default_memory_limit() if memory is None else bytes_from_text(memory)
 
 
 def thread_count(threads: int) -> int:

@@ -11,14 +11,15 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Holdout,
     Json,
+    Memory,
     Output,
     Overwrite,
     Quiet,
     Seed,
     Strict,
     Threads,
-    bytes_from_text,
     holdout_rule,
+    memory_limit,
     seconds_from_text,
     thread_count,
 )
@@ -77,9 +78,7 @@ def poses(
     holdout: Holdout = None,
     strict: Strict = False,
     min_registered: Annotated[float, typer.Option(help="Share of photos that must register.", min=0, max=1)] = 0.5,
-    memory: Annotated[
-        str | None, typer.Option(help="Memory it may use: 4GB, 500MB.  [default: 4/5 of the machine's]")
-    ] = None,
+    memory: Memory = None,
     time_limit: Annotated[
         str | None, typer.Option(help="Time it may take: 90s, 10m, 2h; then it ends, and a second call goes on.")
     ] = None,
@@ -114,7 +113,6 @@ def poses(
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
     from nerfcli.holdout import DEFAULT_HOLDOUT
-    from nerfcli.poses.memory import default_memory_limit
     from nerfcli.poses.pairs import PAIRINGS
     from nerfcli.poses.settings import CAMERA_MODELS, Limits, PoseSettings
 
@@ -147,7 +145,7 @@ def poses(
         strict=strict,
     )
     limits = Limits(
-        memory_bytes=default_memory_limit() if memory is None else bytes_from_text(memory),
+        memory_bytes=memory_limit(memory),
         seconds=None if time_limit is None else seconds_from_text(time_limit),
     )
 

@@ -73,7 +73,7 @@ def run(
     from nerfcli.cli.views import Views
     from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
     from nerfcli.holdout import DEFAULT_HOLDOUT
-    from nerfcli.poses.memory import default_memory_limit
+    from nerfcli.memory import default_memory_limit
     from nerfcli.poses.settings import Limits, PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.train.settings import TrainSettings
@@ -100,6 +100,8 @@ def run(
     )
     depth = DepthRequest(convention="conditional", axis="z")
 
+    memory = default_memory_limit()
+
     def work(source: Path, one_of_many: bool) -> None:
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
         field = result_path(scene, suffix="-run", output=None, one_of_many=False)
@@ -110,13 +112,21 @@ def run(
             folder,
             scene,
             settings=pose_settings,
-            limits=Limits(memory_bytes=default_memory_limit()),
+            limits=Limits(memory_bytes=memory),
             overwrite=overwrite,
             console=console,
             given=given_intrinsics(intrinsics, folder, use=use),
         )
         resume = not overwrite and was_interrupted(scene, field, train_settings)
-        train_scene(scene, field, settings=train_settings, resume=resume, overwrite=overwrite, console=console)
+        train_scene(
+            scene,
+            field,
+            settings=train_settings,
+            memory_bytes=memory,
+            resume=resume,
+            overwrite=overwrite,
+            console=console,
+        )
         metrics, numbers = evaluate_run(field, device=torch_device, threads=cores, overwrite=overwrite, console=console)
         console.result(scene)
         console.result(field)

@@ -17,6 +17,7 @@ from nerfcli.cli.options import (
     Holdout,
     Include,
     Json,
+    Memory,
     Output,
     Overwrite,
     Quiet,
@@ -27,6 +28,7 @@ from nerfcli.cli.options import (
     downscale_factor,
     field_kind,
     holdout_rule,
+    memory_limit,
     seconds_from_text,
     thread_count,
 )
@@ -64,6 +66,7 @@ def train(
     batch: Annotated[int, typer.Option(help="Samples of a step at the end of the training.", min=2**8)] = 2**16,
     holdout: Holdout = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint to the new total.")] = False,
+    memory: Memory = None,
     device: Device = "auto",
     seed: Seed = 0,
     threads: Threads = 0,
@@ -128,9 +131,20 @@ def train(
     )
     rule = holdout_rule(holdout)
 
+    limit = memory_limit(memory)
+
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
-        train_scene(folder, run, settings=settings, resume=resume, overwrite=overwrite, console=console, holdout=rule)
+        train_scene(
+            folder,
+            run,
+            settings=settings,
+            memory_bytes=limit,
+            resume=resume,
+            overwrite=overwrite,
+            console=console,
+            holdout=rule,
+        )
         console.result(run)
 
     for_each_input(scene, work)
@@ -141,6 +155,7 @@ def train_scene(
     run: Path,
     *,
     settings: "TrainSettings",
+    memory_bytes: int | None = None,
     resume: bool,
     overwrite: bool,
     console: Console,
@@ -155,6 +170,7 @@ def train_scene(
     """
     from nerfcli import scene as scenes
     from nerfcli.cameras.orientation import rescaling_told
+    from nerfcli.evaluate.protocol import METRICS
     from nerfcli.exclusive import exclusive
     from nerfcli.train.run_folder import LOCK
 
@@ -177,7 +193,9 @@ def train_scene(
     with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
         if is_kept():  # by one that has just ended
             return
-        _fit(scene, run, settings, resume=resume, overwrite=overwrite, console=console)
+        if overwrite:
+            (run / METRICS).unlink(missing_ok=True)  # they belong to the field that goes
+        _fit(scene, run, settings, memory_bytes=memory_bytes, resume=resume, console=console)
 
 
 def _keeps(run: Path, scene: "Scene", settings: "TrainSettings", *, resume: bool, overwrite: bool) -> bool:
@@ -213,15 +231,18 @@ def _keeps(run: Path, scene: "Scene", settings: "TrainSettings", *, resume: bool
 
 
 def _fit(
-    scene: "Scene", run: Path, settings: "TrainSettings", *, resume: bool, overwrite: bool, console: Console
+    scene: "Scene",
+    run: Path,
+    settings: "TrainSettings",
+    *,
+    memory_bytes: int | None,
+    resume: bool,
+    console: Console,
 ) -> None:
-    from nerfcli.evaluate.protocol import METRICS
     from nerfcli.train.loop import Progress
     from nerfcli.train.loop import train as fit
     from nerfcli.train.run_folder import STATE
 
-    if overwrite:
-        (run / METRICS).unlink(missing_ok=True)  # they belong to the field that goes
     with console.progress(f"train {scene.root.name}") as update:
 
         def on_progress(progress: Progress) -> None:
@@ -233,7 +254,15 @@ def _fit(
             update(progress.share, detail)
 
         try:
-            fit(scene, run, settings, resume=resume, notify=console.note, on_progress=on_progress)
+            fit(
+                scene,
+                run,
+                settings,
+                resume=resume,
+                memory_bytes=memory_bytes,
+                notify=console.note,
+                on_progress=on_progress,
+            )
         except KeyboardInterrupt:
             if (run / STATE).exists():
                 paths = f"{shlex.quote(str(scene.root))} -o {shlex.quote(str(run))}"

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from nerfcli.atomic import write_json
+from nerfcli.exclusive import exclusive
 from nerfcli.export.depth_files import write_levels
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import DESCRIPTION, Order
@@ -84,28 +85,31 @@ def export_frames(
     """
     order.check()
     unfinished = unfinished_of(order, folder)
-    everything = range(len(order.frames))
-    _render_missing(model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers)
-    meta = depth_meta(model, order.settings.depth)
-    ranges = write_previews(unfinished.folder, order, meta)
-    levels = {}
-    if order.settings.in_levels:
-        scale = write_levels(unfinished.folder, order.names, settings=order.settings, meaning=meta)
-        levels = {"depth16": {"units_per_level": scale}}
-        notify(f"16-bit files: {scale_in_words(replace(meta, units_per_level=scale))}")
-    write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
-    description = {
-        **order.of_pictures(),
-        **order.settings.of_presentation(),
-        **({"depth_meaning": meta.to_json()} if order.settings.measured else {}),
-        **levels,
-        "ranges": ranges,
-        "error_meaning": ERROR_IN_WORDS,
-        "facts": {name: unfinished.facts(name) for name in order.names},
-    }
-    write_json(unfinished.folder / DESCRIPTION, description)
-    unfinished.finish(folder)
-    return order.results(folder)
+    with exclusive(unfinished.lock, f"nerfcli render is at work on {folder}"):
+        everything = range(len(order.frames))
+        _render_missing(
+            model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers
+        )
+        meta = depth_meta(model, order.settings.depth)
+        ranges = write_previews(unfinished.folder, order, meta)
+        levels = {}
+        if order.settings.in_levels:
+            scale = write_levels(unfinished.folder, order.names, settings=order.settings, meaning=meta)
+            levels = {"depth16": {"units_per_level": scale}}
+            notify(f"16-bit files: {scale_in_words(replace(meta, units_per_level=scale))}")
+        write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
+        description = {
+            **order.of_pictures(),
+            **order.settings.of_presentation(),
+            **({"depth_meaning": meta.to_json()} if order.settings.measured else {}),
+            **levels,
+            "ranges": ranges,
+            "error_meaning": ERROR_IN_WORDS,
+            "facts": {name: unfinished.facts(name) for name in order.names},
+        }
+        write_json(unfinished.folder / DESCRIPTION, description)
+        unfinished.finish(folder)
+        return order.results(folder)
 
 
 def export_part(

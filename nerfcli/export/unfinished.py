@@ -3,12 +3,14 @@
     .NAME.unfinished-DIGEST/           beside the folder NAME that it will become; DIGEST tells orders apart
         rgb/...  depth/...             files, each atomic
         .frames/order.json             what was ordered, for people
-        .frames/done/NAME.json         one for each complete frame, written last: its files with their sizes, facts
+        .frames/done/NAME.json         one for each complete frame, written last: digests of its files, facts
+        .frames/lock                   held by the one command that makes the folder complete
 
-A frame counts when its note is there and its files have the sizes that stand in it. Several commands may fill one
-folder, on one machine or on many that share a disk.
+A frame counts when its note is whole and its files are those that it was written for. Several commands may fill one
+folder, on one machine or on many that share a disk; one at a time finishes it.
 """
 
+import hashlib
 import json
 import shutil
 from collections.abc import Sequence
@@ -36,20 +38,27 @@ class Unfinished:
             files: all of them, as they stand in the folder.
             facts: what is known about the picture besides, plain values for render.json.
         """
-        sizes = {str(path.relative_to(self.folder)): path.stat().st_size for path in files}
-        write_json(self._path(name), {"bytes": sizes, "facts": facts})
+        digests = {str(path.relative_to(self.folder)): _digest(path.read_bytes()) for path in files}
+        write_json(self._path(name), {"files": digests, "facts": facts, "note": _digest_of_note(digests, facts)})
 
     def has(self, name: str) -> bool:
-        """Whether a frame is complete."""
+        """Whether a frame is complete, and nothing of it is damaged."""
         try:
             note = json.loads(self._path(name).read_text(encoding="utf-8"))
-            return all((self.folder / file).stat().st_size == size for file, size in note["bytes"].items())
-        except FileNotFoundError:
-            return False
+            return note["note"] == _digest_of_note(note["files"], note["facts"]) and all(
+                _digest((self.folder / file).read_bytes()) == digest for file, digest in note["files"].items()
+            )
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            return False  # it is rendered again
 
     def facts(self, name: str) -> dict[str, Any]:
         """What `note` was told about a frame."""
         return json.loads(self._path(name).read_text(encoding="utf-8"))["facts"]
+
+    @property
+    def lock(self) -> Path:
+        """The file that one command at a time holds while it makes the folder complete."""
+        return self.folder / _NOTES / "lock"
 
     def finish(self, folder: Path) -> None:
         """Put the folder in its place; one that stands there is replaced in this step.
@@ -64,6 +73,14 @@ class Unfinished:
 
     def _path(self, name: str) -> Path:
         return self.folder / _NOTES / "done" / f"{name}.json"
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
+
+
+def _digest_of_note(files: dict[str, str], facts: dict[str, Any]) -> str:
+    return _digest(json.dumps([files, facts], sort_keys=True).encode())
 
 
 def unfinished_of(order: Order, folder: Path) -> Unfinished:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import nerfcli
 from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
-from nerfcli.poses.memory import resident_bytes
+from nerfcli.memory import resident_bytes
 from nerfcli.poses.settings import Limits
 
 _STAGES = {

@@ -13,6 +13,7 @@ from nerfcli.render.model import Model
 from nerfcli.render.tracing import render_rays
 from nerfcli.train.losses import over_background
 from nerfcli.train.photos import Photo, PixelPool
+from nerfcli.train.room import IN_MEMORY, Room
 
 PIXELS = 4096
 SEED = 1
@@ -26,12 +27,20 @@ class HeldoutPixels:
         training_from_scene: the normalisation.
         device: where to keep them.
         log_gains: (photos,) logarithms of their exposures relative to the mean photo, as far as EXIF tells; else 0.
+        colours, room: see `PixelPool`.
     """
 
     def __init__(
-        self, photos: Sequence[Photo], training_from_scene: Similarity, device: torch.device, *, log_gains: np.ndarray
+        self,
+        photos: Sequence[Photo],
+        training_from_scene: Similarity,
+        device: torch.device,
+        *,
+        log_gains: np.ndarray,
+        colours: np.ndarray | None = None,
+        room: Room = IN_MEMORY,
     ):
-        pool = PixelPool(photos, training_from_scene, device)
+        pool = PixelPool(photos, training_from_scene, device, colours=colours, room=room)
         generator = torch.Generator(device=device).manual_seed(SEED)
         self.origins, self.directions, self.colours, numbers = pool.draw(PIXELS, generator)[:4]
         self.log_gains = torch.as_tensor(log_gains, dtype=torch.float32, device=device)[pool.photo_of(numbers)]

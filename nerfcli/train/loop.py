@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from nerfcli import kernels
-from nerfcli.atomic import cannot_write, write_json
+from nerfcli.atomic import cannot_write
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
 from nerfcli.field.cost import field_bytes
@@ -24,8 +24,9 @@ from nerfcli.train.fitting import Fitting
 from nerfcli.train.heldout import HeldoutPixels
 from nerfcli.train.interrupts import held_back
 from nerfcli.train.normalisation import training_frame
-from nerfcli.train.photos import PixelPool, load_photos
+from nerfcli.train.photos import PixelPool, load_album
 from nerfcli.train.point_depth import PointRays, point_depths
+from nerfcli.train.room import needs_of, room_for
 from nerfcli.train.run_folder import (
     CONFIG,
     FIELD,
@@ -37,6 +38,7 @@ from nerfcli.train.run_folder import (
     describe_run,
     read_config,
     write_cameras,
+    write_sealed,
 )
 from nerfcli.train.selection import SEARCH_SHARE, Selection, proposals, select
 from nerfcli.train.sentinel import FAILURES, Sentinel
@@ -81,6 +83,7 @@ def train(
     settings: TrainSettings,
     *,
     resume: bool,
+    memory_bytes: int | None = None,
     notify: Callable[[str], None],
     on_progress: Callable[[Progress], None],
 ) -> None:
@@ -91,11 +94,13 @@ def train(
         run: the folder to write; must not hold a run unless `resume`.
         settings: budget, resolution, seed, device.
         resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0.
+        memory_bytes: that may be resident; photos that do not fit stand in files, and the result is the same.
         notify: takes lines for the user.
         on_progress: called after every step.
 
     Raises:
-        UserError: unreadable photos, numbers that became non-finite, nothing to resume, an unwritable folder.
+        UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume, or a folder
+            that cannot be written.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     torch.set_num_threads(settings.threads)
@@ -104,15 +109,18 @@ def train(
         raise UserError(f"{scene.root} has no training photo", "every 8th photo is held out; at least 2 are needed")
     first = scene.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)
+    needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
+    room, told = room_for(needs, memory_bytes, folder=run)
+    notify(told)
     masks = settings.components.masks
-    photos = load_photos(scene.train_frames, factor=factor, threads=settings.threads, masks=masks)
-    test_photos = load_photos(scene.test_frames, factor=factor, threads=settings.threads, masks=masks)
-    unbounded = not all(photo.pixels.shape[-1] == 4 for photo in photos)
+    album = load_album(scene.train_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
+    photos, unbounded = album.photos, album.fills_frame
+    test_album = load_album(scene.test_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
     similarity, marching = training_frame(scene, unbounded=unbounded)
     device = torch.device(settings.device)
-    pool = PixelPool(photos, similarity, device)
+    pool = PixelPool(photos, similarity, device, colours=album.colours, room=room)
     notify(
-        f"{len(photos)} photos to train on, {len(test_photos)} held out, "
+        f"{len(photos)} photos to train on, {len(test_album.photos)} held out, "
         f"{photos[0].frame.camera.width}x{photos[0].frame.camera.height} (1/{factor}), "
         f"{'unbounded' if unbounded else 'bounded'} scene, {settings.device}, {settings.threads} threads"
     )
@@ -126,9 +134,11 @@ def train(
         settings = replace(settings, components=selection.components)
     reference = None if settings.components.exposure == "none" else mean_log_exposure(scene.train_frames)
     heldout = None
-    if test_photos:
+    if test_album.photos:
         gains = relative_log_exposures(scene.test_frames, reference)
-        heldout = HeldoutPixels(test_photos, similarity, device, log_gains=gains)
+        heldout = HeldoutPixels(
+            test_album.photos, similarity, device, log_gains=gains, colours=test_album.colours, room=room
+        )
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
 
@@ -158,9 +168,10 @@ def train(
         except OSError as error:
             raise cannot_write(run, error) from error
     if resume:
-        write_json(run / CONFIG, {**describe_run(scene, asked, factor), "selection": read_config(run).get("selection")})
+        config = {**describe_run(scene, asked, factor), "selection": read_config(run).get("selection")}
+        write_sealed(run / CONFIG, config)
     else:
-        write_json(run / CONFIG, describe_run(scene, asked, factor, selection))
+        write_sealed(run / CONFIG, describe_run(scene, asked, factor, selection))
     write_cameras(run, scene.train_frames, scene.test_frames)
     background = fitting.parts.background or (ALPHA_BACKGROUND if pool.has_alpha else OPAQUE_BACKGROUND)
 
@@ -192,6 +203,7 @@ def train(
 
         def after_step(progress: Progress) -> None:
             on_progress(progress)
+            room.after_step(progress.step)
             interrupts.answer()
 
         try:

@@ -17,6 +17,7 @@ from nerfcli.errors import UserError
 from nerfcli.media.images import downscale, read_image
 from nerfcli.media.masks import read_mask
 from nerfcli.train.footprint import pixel_footprint
+from nerfcli.train.room import IN_MEMORY, Room
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,21 @@ class Photo:
     used: np.ndarray | None
 
 
+@dataclass(frozen=True)
+class Album:
+    """Photos one after another.
+
+    Args:
+        photos: their pixels are views of `colours`; photos without alpha are opaque where others have alpha.
+        colours: (pixels of all photos, 3 or 4) uint8.
+        fills_frame: whether a photo has no alpha of its own.
+    """
+
+    photos: tuple[Photo, ...]
+    colours: np.ndarray
+    fills_frame: bool
+
+
 def load_photos(frames: Sequence[Frame], *, factor: int, threads: int, masks: str = "ignore") -> list[Photo]:
     """Read, orient and downscale the photos of `frames`, in parallel, in order.
 
@@ -48,6 +64,42 @@ def load_photos(frames: Sequence[Frame], *, factor: int, threads: int, masks: st
     """
     with ThreadPoolExecutor(max(1, threads)) as pool:
         return list(pool.map(lambda frame: _load_photo(frame, factor, masks), frames))
+
+
+def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room, masks: str = "ignore") -> Album:
+    """`load_photos` into one array, which stands where there is room.
+
+    Raises:
+        UserError: a photo cannot be read, or has another size than its camera.
+    """
+    cameras = [downscaled_camera(frame.camera, factor) for frame in frames]
+    begins = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
+    # Nobody knows before decoding whether a photo has alpha; the first one that has decides anew.
+    for channels in (3, 4):
+        colours = room.array((int(begins[-1]), channels), np.uint8)
+        fills: list[bool] = []
+
+        def place(index: int, colours: np.ndarray = colours) -> tuple[Photo, bool] | None:
+            photo = _load_photo(frames[index], factor, masks)
+            has_alpha = photo.pixels.shape[-1] == 4
+            if has_alpha and colours.shape[-1] == 3:
+                return None
+            part = colours[begins[index] : begins[index + 1]].reshape(*photo.pixels.shape[:2], -1)
+            part[...] = photo.pixels if has_alpha or colours.shape[-1] == 3 else _with_alpha(photo.pixels)
+            room.relieve()
+            return replace(photo, pixels=part), not has_alpha
+
+        photos: list[Photo] = []
+        with ThreadPoolExecutor(max(1, threads)) as pool:
+            for placed in pool.map(place, range(len(frames))):
+                if placed is None:
+                    pool.shutdown(cancel_futures=True)
+                    break
+                photos.append(placed[0])
+                fills.append(placed[1])
+        if len(photos) == len(frames):
+            return Album(tuple(photos), colours, any(fills))
+    raise AssertionError("four channels hold every photo")
 
 
 def _load_photo(frame: Frame, factor: int, masks: str) -> Photo:
@@ -118,13 +170,26 @@ class PixelPool:
 
     Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
     pixels that the lens model has no direction for, which are left out; `footprint` is that of `pixel_footprint`.
+
+    Args:
+        photos: one at least.
+        training_from_scene: the normalisation.
+        device: where the pixels are drawn.
+        colours: those of all photos, where they stand one after another already.
+        room: where arrays of the size of the photos go.
     """
 
-    def __init__(self, photos: Sequence[Photo], training_from_scene: Similarity, device: torch.device):
-        channels = {photo.pixels.shape[-1] for photo in photos}
-        pixels = [photo.pixels if len(channels) == 1 else _with_alpha(photo.pixels) for photo in photos]
-        self.colours = torch.from_numpy(np.concatenate([p.reshape(-1, p.shape[-1]) for p in pixels])).to(device)
-        counts = [len(p.reshape(-1, p.shape[-1])) for p in pixels]
+    def __init__(
+        self,
+        photos: Sequence[Photo],
+        training_from_scene: Similarity,
+        device: torch.device,
+        *,
+        colours: np.ndarray | None = None,
+        room: Room = IN_MEMORY,
+    ):
+        self.colours = torch.from_numpy(_one_after_another(photos) if colours is None else colours).to(device)
+        counts = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
         self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
         self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
         self.frames = tuple(photo.frame for photo in photos)
@@ -133,30 +198,35 @@ class PixelPool:
 
         self.footprint = pixel_footprint([photo.frame for photo in photos], training_from_scene)
 
-        first_bearing: dict[Camera, int] = {}
-        bearings, valid = [], []
-        for photo in photos:
-            camera = photo.frame.camera
-            if camera not in first_bearing:
-                first_bearing[camera] = sum(map(len, bearings))
-                rays, good = camera.pixel_bearings()
-                bearings.append(rays.astype(np.float32))
-                valid.append(good)
-        self.bearings = torch.from_numpy(np.concatenate(bearings)).to(device)
-        self.first_bearing = torch.tensor([first_bearing[p.frame.camera] for p in photos], device=device)
-
-        good_rays = dict(zip(first_bearing, valid, strict=True))
+        cameras = dict.fromkeys(photo.frame.camera for photo in photos)
+        sizes = [camera.width * camera.height for camera in cameras]
+        first_bearing = dict(zip(cameras, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
+        bearings = room.array((sum(sizes), 3), np.float32)
+        good_rays: dict[Camera, np.ndarray] = {}
+        for camera, first in first_bearing.items():
+            rays, good_rays[camera] = camera.pixel_bearings()
+            bearings[first : first + len(rays)] = rays
+            room.relieve()
+        self.bearings = torch.from_numpy(bearings).to(device)
+        self.first_bearing = torch.tensor([first_bearing[photo.frame.camera] for photo in photos], device=device)
         self.without_ray = sum(int((~good_rays[photo.frame.camera]).sum()) for photo in photos)
-        usable = [
-            good_rays[photo.frame.camera] if photo.used is None else good_rays[photo.frame.camera] & photo.used.ravel()
-            for photo in photos
-        ]
-        numbers = np.flatnonzero(np.concatenate(usable))
-        self.usable_count = len(numbers)
-        # A list of all pixels would be larger than the photos.
-        self.usable = None if len(numbers) == len(self.colours) else torch.from_numpy(numbers).to(device)
+
+        def usable(photo: Photo) -> np.ndarray:
+            good = good_rays[photo.frame.camera]
+            return good if photo.used is None else good & photo.used.ravel()
+
+        usable_counts = [int(usable(photo).sum()) for photo in photos]
+        self.usable_count = sum(usable_counts)
         if self.usable_count == 0:
             raise UserError("no pixel is left to train on", "check that the masks are white where pixels count")
+        self.usable: Tensor | None = None
+        if self.usable_count < len(self.colours):  # a list of all pixels would be larger than the photos
+            numbers = room.array((self.usable_count,), np.int64)
+            ends = np.cumsum(usable_counts)
+            for photo, first, count, end in zip(photos, self.first_pixel.tolist(), usable_counts, ends, strict=True):
+                numbers[end - count : end] = first + np.flatnonzero(usable(photo))
+                room.relieve()
+            self.usable = torch.from_numpy(numbers).to(device)
 
     @property
     def has_alpha(self) -> bool:
@@ -197,6 +267,12 @@ def _emptied(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """RGBA: clear where the mask is black, or where the photo is clear itself."""
     alpha = mask if pixels.shape[-1] == 3 else np.minimum(mask, pixels[..., 3])
     return np.concatenate([pixels[..., :3], alpha[..., None]], axis=-1)
+
+
+def _one_after_another(photos: Sequence[Photo]) -> np.ndarray:
+    any_alpha = any(photo.pixels.shape[-1] == 4 for photo in photos)
+    pixels = [_with_alpha(photo.pixels) if any_alpha else photo.pixels for photo in photos]
+    return np.concatenate([part.reshape(-1, part.shape[-1]) for part in pixels])
 
 
 def _with_alpha(pixels: np.ndarray) -> np.ndarray:

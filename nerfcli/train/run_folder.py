@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import platform
 from collections.abc import Iterable, Sequence
@@ -28,6 +29,10 @@ FIELD = "field.safetensors"
 STATE = "state.safetensors"
 LOG = "log.jsonl"
 LOCK = ".train.lock"
+_SEAL = "blake2b"
+_MEND = f"train again with --overwrite, or restore the file; if you changed it yourself, take out its {_SEAL}"
+# What every line of the log has.
+_LOGGED = ("step", "seconds", "loss", "samples", "rays", "peak_memory_bytes")
 
 
 def describe_run(
@@ -94,7 +99,7 @@ def write_cameras(run: Path, train: Sequence[Frame], test: Sequence[Frame]) -> N
         "train": [_frame_to_json(f, run) for f in train],
         "test": [_frame_to_json(f, run) for f in test],
     }
-    write_json(run / CAMERAS, content)
+    write_sealed(run / CAMERAS, content)
 
 
 def read_cameras(run: Path) -> dict[str, tuple[Frame, ...]]:
@@ -105,14 +110,14 @@ def read_cameras(run: Path) -> dict[str, tuple[Frame, ...]]:
     """
     path = run / CAMERAS
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = _read_sealed(path)
         return {name: tuple(_frame_from_json(entry, run) for entry in content[name]) for name in ("train", "test")}
     except FileNotFoundError as error:
         raise UserError(
             f"{run} is not a run: it has no {CAMERAS}", "give the folder that nerfcli train wrote"
         ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} cannot be read: {error}", "train again with --overwrite") from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} cannot be read: {error}", _MEND) from error
 
 
 def read_config(run: Path) -> dict[str, Any]:
@@ -122,13 +127,36 @@ def read_config(run: Path) -> dict[str, Any]:
         UserError: it is missing or not JSON.
     """
     try:
-        return json.loads((run / CONFIG).read_text(encoding="utf-8"))
+        return _read_sealed(run / CONFIG)
     except FileNotFoundError as error:
         raise UserError(
             f"{run} is not a run: it has no {CONFIG}", "give the folder that nerfcli train wrote"
         ) from error
     except (OSError, ValueError) as error:
-        raise UserError(f"{run / CONFIG} cannot be read: {error}", "train again with --overwrite") from error
+        raise UserError(f"{run / CONFIG} cannot be read: {error}", _MEND) from error
+
+
+def write_sealed(path: Path, content: dict[str, Any]) -> None:
+    """A JSON file with a digest of its content: a digit that changes on a disk would be another camera."""
+    write_json(path, {**content, _SEAL: _digest(content)})
+
+
+def _read_sealed(path: Path) -> dict[str, Any]:
+    """What `write_sealed` wrote; a file without a digest is taken as it is.
+
+    Raises:
+        ValueError: it is no JSON object, or its content is not what was written.
+    """
+    content = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(content, dict):
+        raise ValueError("it is no JSON object")
+    if (seal := content.pop(_SEAL, None)) is not None and seal != _digest(content):
+        raise ValueError("its content is not what was written")
+    return content
+
+
+def _digest(content: dict[str, Any]) -> str:
+    return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def chosen_components(config: dict[str, Any]) -> Components:
@@ -147,18 +175,27 @@ def append_log(run: Path, entry: dict[str, Any]) -> None:
 
 
 def read_log(run: Path) -> list[dict[str, Any]]:
-    """The entries of RUN/log.jsonl; a last line that a kill cut short is left out."""
+    """The entries of RUN/log.jsonl up to the first line that is not whole: a kill may have cut the last one short."""
     try:
-        lines = (run / LOG).read_text(encoding="utf-8").splitlines()
+        lines = (run / LOG).read_text(encoding="utf-8", errors="replace").splitlines()
     except FileNotFoundError:
         return []
-    entries = []
+    except OSError as error:
+        raise UserError(f"{run / LOG} cannot be read: {error.strerror}", "train again with --overwrite") from error
+    entries: list[dict[str, Any]] = []
     for line in lines:
         try:
-            entries.append(json.loads(line))
+            entry = json.loads(line)
         except ValueError:
             break
+        if not isinstance(entry, dict) or not all(_is_number(entry.get(name)) for name in _LOGGED):
+            break
+        entries.append(entry)
     return entries
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def cut_log(run: Path, step: int) -> None:

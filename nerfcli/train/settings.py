@@ -81,7 +81,8 @@ class TrainSettings:
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
         """What `to_json` gave."""
-        return cls(**{**content, "components": Components(**content["components"])})
+        lists = {"components": Components(**content["components"]), "fixed": tuple(content["fixed"])}
+        return cls(**{**content, **lists})
 
 
 def automatic_downscale(width: int, height: int) -> int:

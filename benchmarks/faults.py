@@ -1,0 +1,421 @@
+"""What damage does: random corruptions of scene, run and image files, and random kills of poses, train and render.
+
+    python benchmarks/faults.py corruptions --count 500 -o corruptions.csv
+    python benchmarks/faults.py kills --count 20 -o kills.csv
+
+Every corruption damages one file of a small capture or of its run; one command is run on it, in a child process.
+Verdicts: `refused` (exit codes 3, 4 or 5, two lines), `same` (the result is that of the whole files), `other input`
+(the damage is in a file that has no checksum, a JPEG or a COLMAP model say, and reads as another picture or another
+number; what comes out belongs to it); bad ones: `traceback`, `crash`, `hang`, `wrong`, and `lost` where a file of the
+user's has changed.
+
+Kills: SIGKILL at random moments, the same command again (train with --resume where a state is there), until it is done;
+then every file that says something is compared with those of a command that nobody disturbed.
+"""
+
+import csv
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from PIL import Image
+
+SPHERES = Path(__file__).parent.parent / "sample_scenes" / "spheres"
+DESK = SPHERES.with_name("desk") / "images"
+TRAIN = ("--steps", "6", "--threads", "1", "--quiet")
+RENDER = ("--cameras", "test", "--max-size", "24", "--threads", "1", "--quiet", "--depth-format", "npy")
+SECONDS_PER_CASE = 90
+BAD = ("traceback", "crash", "hang", "wrong", "lost")
+# What other programs write, or have always written without a checksum: a changed number in them is another number.
+OURS = ("field.safetensors", "state.safetensors", "config.json", "cameras.json")
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One damage and what came of it."""
+
+    number: int
+    file: str
+    damage: str
+    command: str
+    exit_code: int
+    verdict: str
+    text: str
+
+
+def nerfcli(*arguments: object, timeout: float | None = None) -> subprocess.CompletedProcess[str]:
+    """The command in a process of its own."""
+    command = [sys.executable, "-m", "nerfcli", *map(str, arguments)]
+    environment = {**os.environ, "GOMP_SPINCOUNT": "1000"}
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=timeout)
+
+
+def make_capture(place: Path) -> None:
+    """`place`/photos with 8 JPEGs, `place`/blender, `place`/scene (scene.json and a COLMAP model), and `place`/run."""
+    blender, photos = place / "blender", place / "photos"
+    photos.mkdir(parents=True)
+    listed = json.loads((SPHERES / "transforms_train.json").read_text())
+    held = json.loads((SPHERES / "transforms_test.json").read_text())
+    for name, content, count in (("train", listed, 6), ("test", held, 2)):
+        content["frames"] = content["frames"][:count]
+        (blender / name).mkdir(parents=True)
+        (blender / f"transforms_{name}.json").write_text(json.dumps(content, indent=1))
+        for index in range(count):
+            shutil.copy(SPHERES / name / f"r_{index:03d}.png", blender / name)
+    frames = []
+    for frame in listed["frames"] + held["frames"]:
+        source = (SPHERES / frame["file_path"]).with_suffix(".png")
+        picture = Image.open(source).convert("RGBA")
+        on_white = Image.alpha_composite(Image.new("RGBA", picture.size, "white"), picture).convert("RGB")
+        name = f"{frame['file_path'].strip('./').replace('/', '_')}.jpg"
+        on_white.save(photos / name, quality=95)
+        frames.append({"file_path": f"photos/{name}", "transform_matrix": frame["transform_matrix"]})
+    width, height = Image.open(photos / name).size
+    focal = width / 2 / np.tan(listed["camera_angle_x"] / 2)
+    camera = {"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2}
+    (place / "transforms.json").write_text(json.dumps({**camera, "frames": frames}, indent=1))
+    for arguments in (
+        ("convert", place / "transforms.json", place / "scene", "--to", "nerfcli"),
+        ("train", place / "scene", "-o", place / "run", *TRAIN),
+        ("evaluate", place / "run", "--threads", "1", "--quiet"),
+    ):
+        done = nerfcli(*arguments)
+        if done.returncode != 0:
+            raise SystemExit(f"{arguments}: {done.stderr}")
+
+
+def damaged(data: bytes, others: list[bytes], draw: random.Random) -> tuple[str, bytes | None]:
+    """One of seven damages in words, and what is left of a file; None where the file is gone."""
+    kind = draw.choice(("bit", "bits", "cut", "zeros", "noise", "empty", "deleted", "swapped"))
+    if kind == "deleted":
+        return kind, None
+    if kind == "empty":
+        return kind, b""
+    if kind == "swapped":
+        return kind, draw.choice(others)
+    if kind == "cut":
+        return kind, data[: draw.randrange(len(data))]
+    content = bytearray(data)
+    # Half of the hits go to the beginning, where the structure of most files stands.
+    at = draw.randrange(min(200, len(content))) if draw.random() < 0.5 else draw.randrange(len(content))
+    if kind in ("bit", "bits"):
+        for place in [at, *(draw.randrange(len(content)) for _ in range(9))][: 1 if kind == "bit" else 10]:
+            content[place] ^= 1 << draw.randrange(8)
+        return kind, bytes(content)
+    length = min(draw.choice((4, 64, 512)), len(content) - at)
+    content[at : at + length] = bytes(length) if kind == "zeros" else draw.randbytes(length)
+    return kind, bytes(content)
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Of every file below a folder."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.blake2b(path.read_bytes()).hexdigest() for path in files}
+
+
+def commands_for(file: str, draw: random.Random) -> tuple[str, ...]:
+    """A command that reads a file of the capture, with its arguments below the capture's folder."""
+    if file.startswith("run/"):
+        return draw.choice(
+            (
+                ("info", "run", "--json"),
+                ("render", "run", "-o", "out", *RENDER),
+                ("evaluate", "run", "--overwrite", "--threads", "1", "--quiet"),
+                ("train", "scene", "-o", "run", "--resume", "--steps", "8", "--threads", "1", "--quiet"),
+            )
+        )
+    if file.startswith("blender/"):
+        return draw.choice((("info", "blender", "--json"), ("train", "blender", "-o", "out", *TRAIN)))
+    if file.startswith("photos/") and draw.random() < 0.5:
+        return draw.choice(
+            (
+                ("evaluate", "run", "--overwrite", "--threads", "1", "--quiet"),
+                ("poses", "photos", "-o", "out", "--quality", "fast", "--threads", "1", "--quiet"),
+            )
+        )
+    return draw.choice((("info", "scene", "--json"), ("train", "scene", "-o", "out", *TRAIN)))
+
+
+def outcome(folder: Path, command: tuple[str, ...], text: str) -> str:
+    """What a command that succeeded says: a hash of the numbers, without times and places."""
+    from nerfcli.field.checkpoint import load_tensors
+
+    name, content = command[0], hashlib.blake2b()
+    if name == "info":
+        facts = json.loads(text)
+        content.update(json.dumps({k: v for k, v in facts.items() if k not in ("path", "seconds")}).encode())
+    elif name == "train":
+        tensors, _ = load_tensors(folder / command[command.index("-o") + 1] / "field.safetensors", "cpu")
+        for key in sorted(tensors):
+            content.update(tensors[key].numpy().tobytes())
+    elif name == "evaluate":
+        metrics = json.loads((folder / "run" / "metrics.json").read_text())
+        images = [{"name": image["name"], "psnr": image["psnr"]} for image in metrics["images"]]
+        content.update(json.dumps([metrics["mean"]["psnr"], images]).encode())
+    elif name == "render":
+        for path in sorted((folder / "out").rglob("*")):
+            if path.suffix == ".npy" or path.parent.name == "rgb":
+                content.update(np.load(path).tobytes() if path.suffix == ".npy" else Image.open(path).tobytes())
+    else:
+        content.update(
+            json.dumps(json.loads((folder / "out" / "poses_report.json").read_text())["registered"]).encode()
+        )
+    return content.hexdigest()
+
+
+@app.command(hidden=True)
+def serve() -> None:
+    """Run commands that come as lines of JSON on stdin; answer each with a line."""
+    from typer.testing import CliRunner
+
+    from nerfcli.cli import app as program
+
+    channel = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    for line in sys.stdin:
+        asked = json.loads(line)
+        os.chdir(asked["folder"])
+        result = CliRunner().invoke(program, asked["command"])
+        raised = result.exception is not None and not isinstance(result.exception, SystemExit)
+        folder = Path(asked["folder"])
+        said = ""
+        if result.exit_code == 0:
+            try:
+                said = outcome(folder, tuple(asked["command"]), result.stdout)
+            except Exception as error:  # a result that cannot be read
+                said = f"unreadable: {error!r}"
+        text = f"{type(result.exception).__name__}: {result.exception}" if raised else result.stderr.strip()
+        answer = {"code": result.exit_code, "raised": raised, "text": text[-400:], "outcome": said}
+        channel.write(json.dumps(answer) + "\n")
+        channel.flush()
+
+
+class Child:
+    """A process that runs commands until one of them is its end."""
+
+    def __init__(self) -> None:
+        self.start()
+
+    def start(self) -> None:
+        command = [sys.executable, __file__, "serve"]
+        environment = {**os.environ, "GOMP_SPINCOUNT": "1000"}
+        self.process = subprocess.Popen(
+            command,
+            text=True,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def ask(self, folder: Path, command: tuple[str, ...]) -> dict[str, Any]:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(json.dumps({"folder": str(folder), "command": command}) + "\n")
+        self.process.stdin.flush()
+
+        def give_up(signum: int, frame: object) -> None:
+            raise TimeoutError
+
+        signal.signal(signal.SIGALRM, give_up)
+        signal.alarm(SECONDS_PER_CASE)
+        try:
+            line = self.process.stdout.readline()
+        except TimeoutError:
+            return self._again("hang")
+        finally:
+            signal.alarm(0)
+        return json.loads(line) if line else self._again("crash")
+
+    def _again(self, why: str) -> dict[str, Any]:
+        self.process.kill()
+        code = self.process.wait()
+        self.start()
+        return {"code": code, "raised": False, "text": why, "outcome": "", "verdict": why}
+
+
+def corruption_cases(count: int, seed: int, place: Path) -> Iterator[Case]:
+    """Damage one file at a time, run one command, look at what is left."""
+    whole, broken = place / "whole", place / "case"
+    make_capture(whole)
+    files = [path for path in sorted(digests(whole)) if not path.endswith((".lock", "poses_report.json"))]
+    kinds = sorted({kind_of(file) for file in files})
+    contents = [(whole / file).read_bytes() for file in files]
+    draw, child, expected = random.Random(seed), Child(), dict[tuple[str, ...], str]()
+
+    def fresh() -> None:
+        shutil.rmtree(broken, ignore_errors=True)
+        shutil.copytree(whole, broken)
+
+    for number in range(count):
+        kind = draw.choice(kinds)
+        file = draw.choice([name for name in files if kind_of(name) == kind])
+        command = commands_for(file, draw)
+        if command not in expected:
+            fresh()
+            answer = child.ask(broken, command)
+            expected[command] = answer["outcome"] or f"exit {answer['code']}"
+        fresh()
+        damage, content = damaged((whole / file).read_bytes(), contents, draw)
+        if content is None:
+            (broken / file).unlink()
+        else:
+            (broken / file).write_bytes(content)
+        before = {name: digest for name, digest in digests(broken).items() if is_kept(name, command)}
+        answer = child.ask(broken, command)
+        after = digests(broken)
+        verdict = verdict_of(answer, expected[command], file)
+        if changed := [name for name, digest in before.items() if after.get(name) != digest]:
+            verdict, answer["text"] = "lost", ", ".join(changed)
+        yield Case(number, file, damage, " ".join(command[:2]), answer["code"], verdict, answer["text"])
+    child.process.kill()
+
+
+def kind_of(file: str) -> str:
+    """Files of one kind are hit as often as those of another, however many there are."""
+    return file.rsplit("/", 1)[0] + "/*" + Path(file).suffix if file.endswith((".jpg", ".png")) else file
+
+
+def is_kept(name: str, command: tuple[str, ...]) -> bool:
+    """Whether a command has to leave a file as it is."""
+    if name.startswith("run/"):
+        return command[0] in ("info", "render") or (command[0] == "evaluate" and "metrics" not in name)
+    return True
+
+
+def verdict_of(answer: dict[str, Any], expected: str, file: str) -> str:
+    """What to think of an answer."""
+    if "verdict" in answer:
+        return answer["verdict"]
+    if answer["raised"] or answer["code"] == 1:
+        return "traceback"
+    if answer["code"] != 0:
+        good = answer["code"] in (3, 4, 5) and answer["text"].count("Error:") == 1
+        return "refused" if good else "same" if expected == f"exit {answer['code']}" else "wrong"
+    if answer["outcome"] == expected:
+        return "same"
+    return "wrong" if file.startswith("run/") and Path(file).name in OURS else "other input"
+
+
+@app.command()
+def corruptions(
+    count: Annotated[int, typer.Option(help="Files to damage.", min=1)] = 500,
+    seed: int = 0,
+    output: Annotated[Path, typer.Option("-o", help="CSV with a line per case.")] = Path("corruptions.csv"),
+) -> None:
+    """Damage files and see what the commands say."""
+    table: Counter[tuple[str, str]] = Counter()
+    with tempfile.TemporaryDirectory() as place, output.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(Case.__dataclass_fields__))
+        writer.writeheader()
+        for case in corruption_cases(count, seed, Path(place)):
+            writer.writerow(asdict(case))
+            file.flush()
+            table[case.command, case.verdict] += 1
+            if case.verdict in BAD:
+                typer.echo(f"{case.number}: {case.file} {case.damage}: {case.command}: {case.verdict}: {case.text}")
+    show(table)
+
+
+def show(table: Counter[tuple[str, str]]) -> None:
+    """Commands in rows, verdicts in columns."""
+    verdicts = sorted({verdict for _, verdict in table})
+    typer.echo(f"{'':20s}" + "".join(f"{verdict:>13s}" for verdict in verdicts))
+    for row in sorted({row for row, _ in table}):
+        typer.echo(f"{row:20s}" + "".join(f"{table[row, verdict]:13d}" for verdict in verdicts))
+
+
+@app.command()
+def kills(
+    count: Annotated[int, typer.Option(help="Kills of each command.", min=1)] = 20,
+    seed: int = 0,
+    only: Annotated[str, typer.Option(help="Some of poses,train,render.")] = "poses,train,render",
+    output: Annotated[Path, typer.Option("-o", help="CSV with a line per kill.")] = Path("kills.csv"),
+) -> None:
+    """Kill commands at random moments and go on."""
+    draw = random.Random(seed)
+    with tempfile.TemporaryDirectory() as name, output.open("w", newline="") as file:
+        place, writer = Path(name), csv.writer(file)
+        writer.writerow(("command", "kill", "after_seconds", "done_before"))
+        make_capture(place / "capture")
+        photos = place / "photos"
+        photos.mkdir()
+        for path in sorted(DESK.iterdir())[:10]:
+            with Image.open(path) as picture:
+                picture.reduce(3).save(photos / f"{path.stem}.jpg", quality=95)
+        capture = place / "capture"
+        given = {
+            "poses": ("poses", photos, "--quality", "fast", "--threads", "1", "--seed", "1"),
+            "train": ("train", capture / "scene", "--steps", "600", "--threads", "1"),
+            "render": ("render", capture / "run", "--cameras", "orbit", "--count", "20", "--threads", "1"),
+        }
+        for name in only.split(","):
+            whole, part = place / f"{name}-whole", place / f"{name}-killed"
+            before = digests(photos) | digests(capture)
+            began = time.monotonic()
+            done = nerfcli(*given[name], "-o", whole)
+            seconds = time.monotonic() - began
+            finished = 0
+            for number in range(count):
+                moment = draw.uniform(0, 1.1 * seconds)
+                resume = ("--resume",) if name == "train" and (part / "state.safetensors").exists() else ()
+                code = killed_after(moment, (*given[name], "-o", part, *resume))
+                finished += code == 0
+                writer.writerow((name, number, f"{moment:.2f}", code == 0))
+                file.flush()
+                if code == 0:  # start afresh, so that the next kill has something to hit
+                    same = compared(name, whole, part)
+                    typer.echo(f"{name}: done after {number + 1} kills: {same}")
+                    shutil.rmtree(part)
+            resume = ("--resume",) if name == "train" and (part / "state.safetensors").exists() else ()
+            last = nerfcli(*given[name], "-o", part, *resume)
+            unchanged = before == digests(photos) | digests(capture)
+            typer.echo(
+                f"{name}: {count} kills within {seconds:.1f} s (exit {done.returncode}); finished by itself {finished} "
+                f"times; then exit {last.returncode}, {compared(name, whole, part)}; "
+                f"inputs {'unchanged' if unchanged else 'CHANGED'}"
+            )
+
+
+def killed_after(seconds: float, arguments: tuple[object, ...]) -> int:
+    """Start a command, kill its process alone after a time; its exit status, negative where it was killed."""
+    command = [sys.executable, "-m", "nerfcli", *map(str, arguments)]
+    environment = {**os.environ, "GOMP_SPINCOUNT": "1000"}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        return process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def compared(name: str, whole: Path, part: Path) -> str:
+    """Whether two results are the same, and which files differ; times and places of runs aside."""
+    told: dict[str, tuple[str, ...]] = {
+        "poses": ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
+        "train": ("field.safetensors",),
+    }
+    one, other = digests(whole), digests(part)
+    names = told.get(name) or tuple(sorted(one.keys() | other.keys()))
+    differing = [file for file in names if one.get(file) != other.get(file) or file not in one]
+    return f"differing: {', '.join(differing)}" if differing else f"all of {len(names)} files the same"
+
+
+if __name__ == "__main__":
+    app()
