@@ -131,6 +131,18 @@ def test_tangential_terms_cost_little_of_the_domain(seed, strength):
     assert distortion.reach > 0.98 * first - 1e-3
 
 
+def test_what_only_points_beyond_the_reach_are_moved_to_is_not_found():
+    # A barrel that turns back at 1.0541, at a radius of 0.7027.
+    _, found = Distortion(radial=(-0.3,)).invert(np.array([[0.7026, 0.7028, 0.9, 30.0], [0.0] * 4]))
+    assert found.tolist() == [True, False, False, False]
+    # One that grows again farther out: Newton's method finds points out there too, for some of these targets.
+    distortion = Distortion(radial=(-0.3, 0.026), tangential=(1e-2, 0.0))
+    angles, radii = 37 * np.linspace(0, 6.28, 4000), np.linspace(0.0, 5.0, 4000)
+    points, found = distortion.invert(distortion.apply(radii * np.array([np.cos(angles), np.sin(angles)])))
+    assert found[radii < distortion.reach].all()
+    assert (np.hypot(*points)[found] < distortion.reach).all()
+
+
 def test_a_pixel_beyond_the_reach_is_invalid_with_tangential_terms_too():
     """Against a brute search: no direction within reach comes near the pixels called invalid, and vice versa."""
     camera = Camera("OPENCV", 1000, 800, (500.0, 500.0, 500.0, 400.0, -0.3, 0.02, 0.004, -0.003))
