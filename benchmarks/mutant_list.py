@@ -317,7 +317,11 @@ GROUPS: tuple[Group, ...] = (
                 "torch.minimum((right - 1).clamp_min(0), last)",
                 "(right - 1).clamp_min(0).clamp_max(weights.shape[-1] - 1)",
             ),
-            Mutant("- low, 1.0)).clamp(0.0, 1.0)", "- low, 1.0))"),
+            Mutant(
+                "- low, 1.0)).clamp(0.0, 1.0)",
+                "- low, 1.0))",
+                "the last cumulated share is 1 exactly, so that draws up to 1 give shares in [0, 1]",
+            ),
             Mutant("uniform.contiguous(), right=True)", "uniform.contiguous(), right=False)"),
             Mutant("weights / torch.where(largest > 0, largest, 1.0)", "weights"),
         ),
