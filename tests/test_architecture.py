@@ -37,13 +37,14 @@ MAY_IMPORT = {
     "train": {"render", "field", "kernels", "scene", "cameras", "media"},
     "evaluate": {"render", "field", "scene", "cameras", "media"},
     "export": {"render", "field", "scene", "cameras", "media"},
+    "bench": {"evaluate", "train", "render", "field", "kernels", "scene", "cameras", "media", "pages"},
     "selftest": {"render", "field", "kernels", "cameras"},
     "report": {"train", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},
     "viewer": {"render", "field", "scene", "cameras", "media"},
 }
 # Libraries that are heavy, or whose ways must not spread, and the parts that may use them.
 CONFINED = {
-    "torch": {"kernels", "field", "render", "train", "evaluate", "export", "selftest", "viewer", "cli"},
+    "torch": {"kernels", "field", "render", "train", "evaluate", "export", "selftest", "bench", "viewer", "cli"},
     "safetensors": {"field"},
     "numba": {"kernels"},
     "triton": {"kernels"},

@@ -38,7 +38,7 @@ from nerfcli.train.normalisation import training_frame
 from nerfcli.train.run_folder import append_log, describe_run, write_cameras
 from nerfcli.train.settings import TrainSettings
 
-COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert")
+COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench")
 WITHOUT_INPUT = ("selftest",)
 USAGE = 2
 README = Path(__file__).parent.parent / "README.md"

@@ -166,10 +166,10 @@ def _compared(photo: HeldOut, picture: Picture) -> Compared:
         raise UserError(
             f"no pixel of {photo.frame.name} is left to compare", "check that its mask is white where pixels count"
         )
-    return Compared(photo.frame, _as_exposed(picture.rgb, photo.log_gain), over_white(photo.pixels), used)
+    return Compared(photo.frame, as_exposed(picture.rgb, photo.log_gain), over_white(photo.pixels), used)
 
 
-def _as_exposed(rgb: np.ndarray, log_gain: float) -> np.ndarray:
+def as_exposed(rgb: np.ndarray, log_gain: float) -> np.ndarray:
     """A picture as a photo of another exposure shows it, clipped."""
     if log_gain == 0.0:
         return rgb
@@ -224,7 +224,7 @@ def _pose_aligned(
     again = render_picture(model, found.frame, background=background, on_tile=on_tile)
     return {
         **_close(to_8_bit(compared.rendered), truth, used=right, suffix="_right_half"),
-        **_close(to_8_bit(_as_exposed(again.rgb, log_gain)), truth, used=right, suffix="_pose_aligned"),
+        **_close(to_8_bit(as_exposed(again.rgb, log_gain)), truth, used=right, suffix="_pose_aligned"),
         "pose_alignment": found.to_json(),
     }
 

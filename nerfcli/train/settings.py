@@ -80,9 +80,12 @@ class TrainSettings:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
-        """What `to_json` gave."""
-        lists = {"components": Components(**content["components"]), "fixed": tuple(content["fixed"])}
-        return cls(**{**content, **lists})
+        """What `to_json` gave; what an earlier version did not know has its default."""
+        names = {entry.name for entry in dataclasses.fields(cls)}
+        known: dict[str, Any] = {name: value for name, value in content.items() if name in names}
+        known["components"] = Components(**content.get("components", {}))
+        known["fixed"] = tuple(content.get("fixed", ()))
+        return cls(**known)
 
 
 def automatic_downscale(width: int, height: int) -> int:

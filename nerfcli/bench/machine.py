@@ -1,0 +1,71 @@
+"""The machine that numbers are measured on, how busy it is, and how much memory a piece of work takes."""
+
+import os
+import platform
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+_CPU_INFO = Path("/proc/cpuinfo")
+_STATUS, _CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+# Others that take more than this share of the processors show in the times.
+BUSY_SHARE = 0.25
+
+
+def describe_machine(device: str, threads: int) -> dict[str, Any]:
+    """What a time depends on besides the settings."""
+    return {
+        "processor": processor_name(),
+        "processors": os.cpu_count(),
+        "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
+        "threads": threads,
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
+
+
+def processor_name() -> str:
+    """The CPU's model."""
+    if _CPU_INFO.exists():
+        for line in _CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return " ".join(line.split(":", 1)[1].split())
+    return platform.processor() or platform.machine()
+
+
+def load_average() -> float | None:
+    """Processes that wanted to run over the last minute, ours among them; None where the system does not say."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+def is_busy(load: float | None) -> bool:
+    """Whether a load average from before the work began means that others use the processors."""
+    return load is not None and load > BUSY_SHARE * (os.cpu_count() or 1)
+
+
+@dataclass(frozen=True)
+class PeakMemory:
+    """The largest memory in use since `begin`: of this process, or of the GPU where that does the work."""
+
+    device: str
+
+    def begin(self) -> None:
+        """Count from here."""
+        if self.device == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+        elif _CLEAR_REFS.exists():
+            _CLEAR_REFS.write_text("5")  # resets the peak of the resident size: Linux, proc(5)
+
+    def read(self) -> int | None:
+        """Bytes; None where the system has no such count."""
+        if self.device == "cuda":
+            return torch.cuda.max_memory_allocated()
+        if not (_CLEAR_REFS.exists() and _STATUS.exists()):
+            return None
+        for line in _STATUS.read_text(encoding="utf-8").splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
+        return None

@@ -1,0 +1,158 @@
+"""A bench from beginning to end: the budget over rendering and training, each going on with what is there."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerfcli import kernels
+from nerfcli.bench.machine import describe_machine, is_busy, load_average
+from nerfcli.bench.pictures import FOLDER, slug
+from nerfcli.bench.records import Records, opened
+from nerfcli.bench.rendering import WORK, measure_rendering
+from nerfcli.bench.session import Session
+from nerfcli.bench.subject import Subject
+from nerfcli.bench.sweep import RenderSetting, render_settings, train_settings
+from nerfcli.bench.training import KEPT_FIELD, Trainings, measure_trainings
+from nerfcli.bench.worker import measure_model
+from nerfcli.render.model import Model, load_model
+from nerfcli.train.run_folder import FIELD
+
+SWEEPS = ("both", "render", "train")
+# Of the budget where both are measured: renderings are short, trainings are not.
+_RENDERING_SHARE = 0.4
+# The last part of the budget writes the report.
+_KEPT_BACK = 0.03
+# What rendering gets of the budget even where training took longer than planned.
+_LEAST_SHARE = 0.1
+COMPLETE = "complete"
+THIS_RUN = "this run"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to measure.
+
+    Args:
+        budget_seconds: for everything.
+        sweep: one of `SWEEPS`.
+        seed: of the trainings.
+    """
+
+    budget_seconds: float
+    sweep: str
+    seed: int
+
+
+def open_bench(subject: Subject, folder: Path, wanted: Wanted) -> Records:
+    """The records of this bench in a folder, new or to go on with.
+
+    Raises:
+        UserError: the folder holds something else.
+    """
+    plan: dict[str, Any] = {
+        "source": _title(subject.path.resolve()),
+        "measured": subject.identity,
+        "machine": describe_machine(subject.base.device, subject.base.threads),
+        "budget_seconds": wanted.budget_seconds,
+        "sweep": wanted.sweep,
+        "seed": wanted.seed,
+    }
+    return opened(folder, plan)
+
+
+def measure(
+    subject: Subject,
+    records: Records,
+    wanted: Wanted,
+    *,
+    tell: Callable[[float, str], None],
+    notify: Callable[[str], None],
+) -> None:
+    """Measure what is not measured yet; what is measured is in the records when this ends, however it ends.
+
+    Args:
+        subject: a run or a scene.
+        records: of `open_bench`.
+        wanted: what to measure.
+        tell: called with (share of the budget used, what is done now).
+        notify: takes lines for the user.
+
+    Raises:
+        UserError: a photo cannot be read, or the results not be written.
+    """
+    if records.last(COMPLETE) is not None:
+        return
+    load = load_average()
+    kernels.prepare(notify)
+    session = Session(records, wanted.budget_seconds, tell, notify)
+    session.record("begun", load_average=load, busy=is_busy(load))
+    if is_busy(load):
+        notify(f"other programs use the processors (load average {load:.1f}): times will be too long, and uneven")
+    torch.set_num_threads(subject.base.threads)
+    (records.folder / FOLDER).mkdir(exist_ok=True)
+    if subject.run is not None:
+        _measure_run(subject, subject.run, wanted, session)
+    else:
+        _measure_scene(subject, wanted, session)
+    session.record(COMPLETE, load_average=load_average())
+    shutil.rmtree(records.folder / WORK, ignore_errors=True)
+
+
+def _measure_run(subject: Subject, run: Path, wanted: Wanted, session: Session) -> None:
+    """Render the run's field, then train its scene again in other ways."""
+    ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
+    model = load_model(run / FIELD, subject.base.device)
+    if wanted.sweep != "train":
+        share = _RENDERING_SHARE if wanted.sweep == "both" and subject.scene is not None else 1.0
+        _render(subject, model, session, ends=share * ends)
+    if wanted.sweep == "render":
+        return
+    if subject.scene is None:
+        session.notify(f"training settings are left out: {subject.why_no_scene}")
+        return
+    if not any(entry["point"] == THIS_RUN for entry in session.records.of_kind("training")):
+        session.say("comparing this run with held-out photos")
+        torch.set_num_threads(subject.base.threads)
+        photos, pictures = subject.held_out(model), session.folder / FOLDER
+        measured = measure_model(
+            model, photos, seed=0, folder=pictures, prefix=slug(f"training {THIS_RUN}"), shown=subject.shown
+        )
+        described = {"group": "run", "options": None, "settings": subject.base.to_json()}
+        session.record("training", point=THIS_RUN, **described, **subject.trained, **measured)
+    trainings = Trainings(subject.scene, subject.base, subject.shown, kept=None)
+    measure_trainings(trainings, train_settings(), session=session, seconds=ends - session.spent)
+
+
+def _measure_scene(subject: Subject, wanted: Wanted, session: Session) -> None:
+    """Train the scene, then render the field of the default training."""
+    assert subject.scene is not None
+    ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
+    settings = train_settings()
+    share = {"both": 1.0 - _RENDERING_SHARE, "train": 1.0, "render": _RENDERING_SHARE}[wanted.sweep]
+    if wanted.sweep == "render":
+        settings = settings[:1]  # there must be a field to look at
+    trainings = Trainings(subject.scene, subject.base, subject.shown, kept=settings[0].name)
+    measure_trainings(trainings, settings, session=session, seconds=share * ends - session.spent)
+    field = session.folder / KEPT_FIELD
+    if wanted.sweep != "train" and field.exists():
+        _render(subject, load_model(field, subject.base.device), session, ends=ends)
+
+
+def _render(subject: Subject, model: Model, session: Session, *, ends: float) -> None:
+    seconds = max(ends - session.spent, _LEAST_SHARE * session.budget_seconds)
+    measure_rendering(model, subject.held_out(model), _ways_to_render(subject), session=session, seconds=seconds)
+
+
+def _title(path: Path) -> str:
+    """The folder's name, with that of its parent where it says little."""
+    return f"{path.parent.name}/{path.name}" if path.name in ("run", "scene") else path.name
+
+
+def _ways_to_render(subject: Subject) -> list[RenderSetting]:
+    """All that make a difference on this device: the number of CPU threads is none to a GPU."""
+    base = subject.base
+    return [way for way in render_settings(base.threads) if base.device == "cpu" or way.threads == base.threads]

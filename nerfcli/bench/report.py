@@ -1,0 +1,56 @@
+"""The files of a bench: numbers as JSON and CSV, and the page."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+from nerfcli.atomic import write_json
+from nerfcli.bench.page import bench_page
+from nerfcli.bench.pictures import FOLDER
+from nerfcli.bench.records import PLAN, Records, emptied
+from nerfcli.bench.rendering import WORK
+from nerfcli.bench.summary import summarised
+from nerfcli.bench.tables import write_csv
+from nerfcli.bench.training import KEPT_FIELD
+from nerfcli.pages.page import write_page
+from nerfcli.pages.pictures import data_uri
+
+JSON, CSV, PAGE = "bench.json", "bench.csv", "bench.html"
+
+
+def write_report(records: Records) -> tuple[Path, dict[str, Any]]:
+    """Write bench.json, bench.csv and bench.html of what was measured so far.
+
+    Returns:
+        The page's path, and the content of bench.json.
+
+    Raises:
+        UserError: they cannot be written.
+    """
+    plan = json.loads((records.folder / PLAN).read_text(encoding="utf-8"))
+    content = summarised(records, plan)
+    write_json(records.folder / JSON, content)
+    write_csv(content, records.folder / CSV)
+    page = records.folder / PAGE
+    write_page(bench_page(content, _embedded(content, records.folder / FOLDER), records.folder), page)
+    return page, content
+
+
+def discard(folder: Path) -> None:
+    """Remove what a bench measured in a folder, and nothing else; a folder that is no bench stays as it is."""
+    if not (folder / PLAN).exists():
+        return
+    emptied(folder)
+    for name in (JSON, CSV, PAGE, KEPT_FIELD):
+        (folder / name).unlink(missing_ok=True)
+    for name in (FOLDER, WORK):
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
+def _embedded(content: dict[str, Any], folder: Path) -> dict[str, str]:
+    """The pictures that the points name, as data."""
+    parts = [content[part] for part in ("rendering", "training") if content[part]]
+    names = {name for part in parts for point in part["points"] for name in point["pictures"].values()}
+    names |= {part["truth"] for part in parts if "truth" in part}
+    return {name: data_uri((folder / name).read_bytes(), "jpeg") for name in sorted(names) if (folder / name).exists()}

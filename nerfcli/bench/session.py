@@ -1,0 +1,58 @@
+"""One bench: its time, its records, and whom it tells how far it is."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from nerfcli.bench.records import Records
+
+
+@dataclass
+class Session:
+    """Time is what was spent on measurements in all calls, not only in this one.
+
+    Args:
+        records: what was measured, earlier calls included.
+        budget_seconds: for everything.
+        tell: called with (share of the budget used, what is done now).
+        notify: takes lines for the user.
+    """
+
+    records: Records
+    budget_seconds: float
+    tell: Callable[[float, str], None]
+    notify: Callable[[str], None]
+    _spent: float = 0.0
+    _lap: float = field(default_factory=time.monotonic)
+
+    def __post_init__(self) -> None:
+        self._spent = sum(entry.get("took", 0.0) for entry in self.records.all())
+
+    @property
+    def folder(self) -> Path:
+        return self.records.folder
+
+    @property
+    def spent(self) -> float:
+        """Seconds used so far."""
+        return self._spent + time.monotonic() - self._lap
+
+    @property
+    def left(self) -> float:
+        """Seconds of the budget that are left; negative where it was overdrawn."""
+        return self.budget_seconds - self.spent
+
+    def record(self, kind: str, **content: Any) -> None:
+        """Keep a measurement, with the time since the one before it."""
+        now = time.monotonic()
+        self.records.append(kind, took=round(now - self._lap, 3), **content)
+        self._spent += now - self._lap
+        self._lap = now
+
+    def say(self, doing: str) -> None:
+        """Tell what is done now and for how long all of it will go on."""
+        left = max(0.0, self.left)
+        told = f"{left / 60:.0f} min" if left >= 90 else f"{left:.0f} s"
+        self.tell(min(1.0, self.spent / self.budget_seconds), f"{doing}, about {told} left")

@@ -1,0 +1,194 @@
+"""From measurements to what they say: points with their spread, the Pareto sets, what to recommend."""
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from nerfcli import __version__
+from nerfcli.bench.measure import COMPLETE
+from nerfcli.bench.pareto import Measured, Spread, at_most, dominators, least_difference, near_best
+from nerfcli.bench.pictures import slug
+from nerfcli.bench.records import Records
+
+LEVELS = 255.0
+# Renderings whose distance to the converged one differs by less than this share are as good as each other.
+SAME_QUADRATURE = 0.02
+
+
+def summarised(records: Records, plan: dict[str, Any]) -> dict[str, Any]:
+    """All numbers of a bench as plain values, complete or not.
+
+    Args:
+        records: the measurements.
+        plan: what the bench is of; the content of plan.json.
+    """
+    begun = list(records.of_kind("begun"))
+    rendering, training = _rendering(records), _training(records)
+    return {
+        "nerfcli": __version__,
+        **{name: plan[name] for name in ("source", "measured", "machine", "budget_seconds", "sweep", "seed")},
+        "complete": records.last(COMPLETE) is not None,
+        "spent_seconds": round(sum(entry.get("took", 0.0) for entry in records.all()), 1),
+        "load_average": [entry["load_average"] for entry in begun],
+        "busy": any(entry["busy"] for entry in begun),
+        "rendering": rendering,
+        "training": training,
+        "recommendations": [
+            *(_rendering_advice(rendering["points"]) if rendering else []),
+            *(_training_advice(training) if training else []),
+        ],
+    }
+
+
+def _by_psnr(point: dict[str, Any]) -> Measured:
+    return Measured(point["name"], Spread(**point["seconds"]), -point["psnr"])
+
+
+def _by_quadrature(point: dict[str, Any]) -> Measured:
+    """Its logarithm, so that differences are shares."""
+    return Measured(point["name"], Spread(**point["seconds"]), math.log(max(point["quadrature_levels"], 1e-6)))
+
+
+def _rendering(records: Records) -> dict[str, Any] | None:
+    times: dict[str, list[dict[str, Any]]] = {}
+    for entry in records.of_kind("time"):
+        times.setdefault(entry["point"], []).append(entry)
+    pictures = {entry["point"]: entry for entry in records.of_kind("picture") if entry["point"] in times}
+    plan, float64 = records.last("rendering plan"), records.last("float64")
+    if plan is None or not pictures:
+        return None
+    points = [_rendering_point(entry, times[name]) for name, entry in pictures.items()]
+    found = dominators([_by_quadrature(point) for point in points], noise=math.log(1.0 + SAME_QUADRATURE))
+    for point in points:
+        point |= {"pareto": found[point["name"]] is None, "dominated_by": found[point["name"]]}
+    converged = list(records.of_kind("converged"))
+    return {
+        "photos": plan["photos"],
+        "factor": plan["factor"],
+        "truth": f"{slug(converged[0]['photo'])}-truth.jpg",
+        "rounds": min(len(entries) for entries in times.values()),
+        "converged_psnr": statistics.fmean(entry["psnr"] for entry in converged),
+        "float64_levels": None if float64 is None else LEVELS * float64["error"],
+        "points": points,
+    }
+
+
+def _rendering_point(entry: dict[str, Any], times: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    memory = [time["peak_memory_bytes"] for time in times if time["peak_memory_bytes"] is not None]
+    return {
+        "name": entry["point"],
+        "options": entry["options"],
+        "settings": entry["settings"],
+        "seconds": asdict(Spread.of([time["seconds"] for time in times])),
+        "peak_memory_bytes": max(memory, default=None),
+        "field_bytes": entry["field_bytes"],
+        "psnr": entry["psnr"],
+        "quadrature_levels": LEVELS * entry["quadrature"],
+        "truncation_bound_levels": LEVELS * entry["truncation_bound"],
+        "pictures": {name: f"{slug(entry['point'])}-{name}.jpg" for name in ("render", "error", "quadrature")},
+    }
+
+
+def _training(records: Records) -> dict[str, Any] | None:
+    entries = {entry["point"]: entry for entry in records.of_kind("training")}
+    plan = records.last("training plan")
+    if not entries or plan is None:
+        return None
+    points = [_training_point(entry) for entry in entries.values()]
+    repeats = [point["psnr"] for point in points if point["group"] in ("default", "seed")]
+    noise = least_difference(repeats)
+    found = dominators([_by_psnr(point) for point in points if point["group"] != "seed"], noise=noise or 0.0)
+    for point in points:
+        seed = point["group"] == "seed"
+        point["pareto"] = None if seed else found[point["name"]] is None
+        point["dominated_by"] = None if seed else found[point["name"]]
+    return {
+        "unit_seconds": plan["unit_seconds"],
+        "noise_db": noise,
+        "seeds": len(repeats),
+        "seed_psnr": repeats,
+        "points": points,
+        "failed": [{"name": entry["point"], "reason": entry["reason"]} for entry in records.of_kind("failed")],
+    }
+
+
+def _training_point(entry: dict[str, Any]) -> dict[str, Any]:
+    prefix = slug(f"training {entry['point']}")
+    return {
+        "name": entry["point"],
+        "group": entry["group"],
+        "options": entry["options"],
+        "settings": entry["settings"],
+        "seconds": asdict(Spread.of([entry["seconds"]])),
+        "steps": entry["steps"],
+        "samples_per_second": entry["samples_per_second"],
+        "peak_memory_bytes": entry["peak_memory_bytes"],
+        "field_bytes": entry["field_bytes"],
+        "psnr": entry["psnr"],
+        "quadrature_levels": LEVELS * entry["quadrature"],
+        "render_seconds": asdict(Spread.of(entry["render_seconds"])),
+        "render_size": entry["render_size"],
+        "compiled": entry.get("compiled"),
+        "shown_psnr": entry["shown_psnr"],
+        "pictures": {name: f"{prefix}-{name}.jpg" for name in ("render", "error", "truth")},
+    }
+
+
+def _rendering_advice(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    can_be_asked_for = [_by_psnr(point) for point in points if point["options"] is not None]
+    by_name = {point["name"]: point for point in points}
+    default = next((point for point in can_be_asked_for if point.name == "default"), None)
+    if default is None:
+        return []
+    near = near_best(can_be_asked_for)
+    half = at_most(can_be_asked_for, default.seconds.median / 2)
+    return [
+        _advice("rendering", "within 0.1 dB of the best", near, by_name, default),
+        _advice("rendering", "half the time", half, by_name, default),
+    ]
+
+
+def _training_advice(training: dict[str, Any]) -> list[dict[str, Any]]:
+    points = [point for point in training["points"] if point["group"] not in ("seed", "run")]
+    by_name = {point["name"]: point for point in points}
+    measured = [_by_psnr(point) for point in points]
+    default = next((point for point in measured if point.name == "default"), None)
+    if default is None:
+        return []
+    best, noise = min(measured, key=lambda point: point.error), training["noise_db"] or 0.0
+    near = _default_unless_better(near_best(measured), default, noise)
+    half = at_most(measured, best.seconds.median / 2)
+    if half is not None:
+        half = _default_unless_better(half, default, noise)
+    return [
+        _advice("training", "within 0.1 dB of the best", near, by_name, best),
+        _advice("training", "half the time", half, by_name, best),
+    ]
+
+
+def _default_unless_better(chosen: Measured, default: Measured, noise: float) -> Measured:
+    """The default where the chosen one takes as long and is not better by more than chance."""
+    same_time = not chosen.seconds.clearly_below(default.seconds) and not default.seconds.clearly_below(chosen.seconds)
+    return default if same_time and default.error - chosen.error <= noise else chosen
+
+
+def _advice(
+    part: str, question: str, chosen: Measured | None, by_name: dict[str, dict[str, Any]], against: Measured
+) -> dict[str, Any]:
+    """One recommendation; its "point" is None where no setting is fast enough."""
+    if chosen is None:
+        return {"part": part, "question": question, "point": None}
+    point = by_name[chosen.name]
+    return {
+        "part": part,
+        "question": question,
+        "point": chosen.name,
+        "options": point["options"],
+        "seconds": chosen.seconds.median,
+        "psnr": point["psnr"],
+        "against": against.name,
+        "against_seconds": against.seconds.median,
+        "against_psnr": by_name[against.name]["psnr"],
+    }

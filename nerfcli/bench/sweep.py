@@ -1,0 +1,205 @@
+"""The settings that are tried, the most telling first: how many of them are is a matter of time."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
+from itertools import accumulate
+from typing import Any
+
+from nerfcli.render.pictures import RAYS_PER_TILE
+from nerfcli.render.tracing import TOLERANCE
+from nerfcli.train.settings import TrainSettings
+
+# Steps and tolerances far beyond the defaults, on both sides: a curve shows where it bends only with its ends.
+_STEPS = (2.0, 4.0, 0.5, 8.0, 0.25)
+_TOLERANCES = (1 / 255, 1 / 64, 1 / 16, 1 / 4080, 1 / 4)
+_TILES = (1024, 65536)
+# Precisions of the numbers that the field is stored in; it is always rendered in float32.
+STORED_IN = ("float32", "float16", "bfloat16")
+# A training shorter than this learns too little to tell settings apart.
+SHORTEST_TRAINING_SECONDS = 8.0
+
+
+@dataclass(frozen=True)
+class RenderSetting:
+    """One way to render a trained field.
+
+    Args:
+        threads: CPU threads.
+        step: length of the steps along rays, in those of the training.
+        tolerance: see `render.pictures.Quality`.
+        rays_per_tile: rendered at a time.
+        stored_in: one of `STORED_IN`.
+    """
+
+    threads: int
+    step: float = 1.0
+    tolerance: float = TOLERANCE
+    rays_per_tile: int = RAYS_PER_TILE
+    stored_in: str = "float32"
+
+    @property
+    def name(self) -> str:
+        """What differs from the defaults, threads apart where they are all of them."""
+        return ", ".join(self._parts()) or "default"
+
+    def _parts(self) -> list[str]:
+        parts = []
+        if self.step != 1.0:
+            parts.append(f"step {self.step:g}")
+        if self.tolerance != TOLERANCE:
+            parts.append(f"tolerance {fraction(self.tolerance)}")
+        if self.rays_per_tile != RAYS_PER_TILE:
+            parts.append(f"{self.rays_per_tile} rays a tile")
+        if self.stored_in != "float32":
+            parts.append(f"stored in {self.stored_in}")
+        return parts
+
+    @property
+    def options(self) -> str | None:
+        """The options of `nerfcli render` that choose this; None where there are none."""
+        if self.rays_per_tile != RAYS_PER_TILE or self.stored_in != "float32":
+            return None
+        step = [f"--step {self.step:g}"] if self.step != 1.0 else []
+        tolerance = [f"--tolerance {fraction(self.tolerance)}"] if self.tolerance != TOLERANCE else []
+        return " ".join([*step, *tolerance])
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class ThreadSetting(RenderSetting):
+    """Fewer threads than there are."""
+
+    def _parts(self) -> list[str]:
+        return [*super()._parts(), f"{self.threads} {'thread' if self.threads == 1 else 'threads'}"]
+
+    @property
+    def options(self) -> str | None:
+        own = super().options
+        return None if own is None else f"{own} --threads {self.threads}".strip()
+
+
+@dataclass(frozen=True)
+class TrainSetting:
+    """One training.
+
+    Args:
+        group: what is varied: "default", "seed", "time", "rows", "levels", "width" or "batch".
+        share: of the planned training time of one point.
+        changed: what is not as in the defaults of `TrainSettings`, by name.
+    """
+
+    group: str
+    share: float = 1.0
+    seed: int = 0
+    changed: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What is varied."""
+        values = dict(self.changed)
+        match self.group:
+            case "seed":
+                return f"default, seed {self.seed}"
+            case "time":
+                return f"{self.share:g} x time"
+            case "rows":
+                return f"2^{values['log2_rows']} rows"
+            case "levels" | "width":
+                return f"{self.group} {values[self.group]}"
+            case "batch":
+                return f"batch {values['samples_per_step']}"
+        return "default"
+
+    def settings(self, base: TrainSettings, unit_seconds: float) -> TrainSettings:
+        """What to train with."""
+        values = dict(self.changed)
+        if "samples_per_step" in values:
+            values["first_samples_per_step"] = min(base.first_samples_per_step, values["samples_per_step"])
+        seconds = self.share * unit_seconds
+        return replace(base, budget_seconds=seconds, steps=None, seed=base.seed + self.seed, **values)  # type: ignore[arg-type]
+
+    def to_json(self) -> dict[str, Any]:
+        """What is not as in the defaults of `TrainSettings`."""
+        return {**dict(self.changed), "seed": self.seed}
+
+    @property
+    def options(self) -> str:
+        """The options of `nerfcli train` that choose this, besides the budget."""
+        names = {"log2_rows": "--log2-rows", "levels": "--levels", "width": "--width", "samples_per_step": "--batch"}
+        seed = [f"--seed {self.seed}"] if self.seed else []
+        return " ".join([*(f"{names[name]} {value}" for name, value in self.changed), *seed])
+
+
+def render_settings(threads: int) -> list[RenderSetting]:
+    """Ways to render, the most telling first: the default, one thing changed, then two."""
+    default = RenderSetting(threads)
+    return [
+        default,
+        *(replace(default, step=step) for step in _STEPS[:3]),
+        *(replace(default, tolerance=tolerance) for tolerance in _TOLERANCES[:3]),
+        *(ThreadSetting(count) for count in _fewer(threads)),
+        *(replace(default, step=step, tolerance=t) for step in (2.0, 4.0) for t in _TOLERANCES[:2]),
+        *(replace(default, rays_per_tile=rays) for rays in _TILES),
+        *(replace(default, stored_in=precision) for precision in STORED_IN[1:]),
+        *(replace(default, step=step) for step in _STEPS[3:]),
+        *(replace(default, tolerance=tolerance) for tolerance in _TOLERANCES[3:]),
+        *(replace(default, step=step, tolerance=1 / 16) for step in (2.0, 4.0)),
+        replace(default, step=0.5, tolerance=1 / 4080),
+        replace(default, step=0.5, tolerance=1 / 64),
+    ]
+
+
+def train_settings() -> list[TrainSetting]:
+    """Trainings, the most telling first. Two more seeds of the default tell what of all differences is chance."""
+    return [
+        TrainSetting("default"),
+        TrainSetting("seed", seed=1),
+        TrainSetting("time", 2.0),
+        TrainSetting("rows", changed=(("log2_rows", 15),)),
+        TrainSetting("rows", changed=(("log2_rows", 17),)),
+        TrainSetting("seed", seed=2),
+        TrainSetting("batch", changed=(("samples_per_step", 2**15),)),
+        TrainSetting("batch", changed=(("samples_per_step", 2**17),)),
+        TrainSetting("time", 0.5),
+        TrainSetting("levels", changed=(("levels", 4),)),
+        TrainSetting("width", changed=(("width", 64),)),
+        TrainSetting("rows", changed=(("log2_rows", 14),)),
+        TrainSetting("rows", changed=(("log2_rows", 18),)),
+        TrainSetting("time", 4.0),
+        TrainSetting("batch", changed=(("samples_per_step", 2**14),)),
+        TrainSetting("levels", changed=(("levels", 12),)),
+        TrainSetting("width", changed=(("width", 16),)),
+    ]
+
+
+def affordable(
+    settings: Sequence[TrainSetting], seconds: float, *, overhead: float
+) -> tuple[list[TrainSetting], float]:
+    """As many of the first settings as there is time for, and the time that one share of training gets.
+
+    Args:
+        settings: the most telling first; at least one.
+        seconds: for all.
+        overhead: of each besides its training, in seconds.
+
+    Returns:
+        The settings, and seconds per share: at least `SHORTEST_TRAINING_SECONDS` where there are two or more of them.
+    """
+    shares = accumulate(setting.share for setting in settings)
+    units = [(seconds - overhead * count) / total for count, total in enumerate(shares, start=1)]
+    count = max((n for n, unit in enumerate(units, start=1) if unit >= SHORTEST_TRAINING_SECONDS), default=1)
+    return list(settings[:count]), max(units[count - 1], 1.0)
+
+
+def fraction(value: float) -> str:
+    """1/255 where a number is one over a whole one, else plain."""
+    share = Fraction(value).limit_denominator(10**6)
+    return str(share) if share.numerator == 1 and value < 1 else f"{value:g}"
+
+
+def _fewer(threads: int) -> list[int]:
+    """Powers of two below a number of threads."""
+    return [2**power for power in range(threads.bit_length()) if 2**power < threads][::-1]

