@@ -157,6 +157,42 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert low < high < highest
 
 
+def test_the_page_tells_what_saw_the_photos_what_was_chosen_and_how_new_the_views_are(seen):
+    look, _ = seen
+    run = facts()
+    assert run.metrics is not None
+    view = {"nearest": "b.png", "distance_relative": 0.1234, "angle_deg": 5.67, "kind": "extrapolation"}
+    metrics = {
+        **run.metrics,
+        "images": [{"name": "a.png", "psnr": 20.0, "ssim": None, "view": view}],
+        "ledger": [{"stage": "poses", "saw_held_out": True, "how": "all photos were matched"}],
+        "kinds": {"extrapolation": {"images": 3, "psnr": 19.5}},
+    }
+    decision = {
+        "component": "view",
+        "value": 0,
+        "gain_db": 0.5,
+        "error_db": 0.1,
+        "cost": -0.02,
+        "kept": True,
+        "why": "so",
+    }
+    chosen = replace(run, metrics=metrics, config={**run.config, "selection": {"decisions": [decision]}})
+    text = page_html([chosen], [look], depth=_meta())
+    for told in (
+        "0.123",
+        "5.7",
+        "extrapolation",
+        "all photos were matched",
+        "19.50 dB (3)",
+        "view=0",
+        "+0.50 +- 0.10",
+        "-2%",
+    ):
+        assert told in text
+    assert "view=0" not in page_html([run], [look], depth=_meta())
+
+
 def test_numbers_that_must_not_be_compared_are_named():
     one = facts()
     assert list(mismatches_of([one, facts("b")])) == []

@@ -8,7 +8,7 @@ import typer
 
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.evaluation import predictions_are_there, saved_predictions, tell_numbers, tell_spread
+from nerfcli.cli.evaluation import held_out_photos, predictions_are_there, saved_predictions, tell_numbers, tell_spread
 from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, device_name, thread_count
 from nerfcli.errors import GATE_NOT_MET, UserError
 
@@ -142,10 +142,8 @@ def evaluate_run(
     from nerfcli.atomic import write_json
     from nerfcli.evaluate.ledger import leak_ledger, told
     from nerfcli.evaluate.perceptual import find_perceptual
-    from nerfcli.evaluate.protocol import METRICS, PROTOCOL, Extras, HeldOut, evaluate_model
+    from nerfcli.evaluate.protocol import METRICS, PROTOCOL, Extras, evaluate_model
     from nerfcli.render.model import load_model
-    from nerfcli.train.exif_exposure import relative_log_exposures
-    from nerfcli.train.photos import load_photos
     from nerfcli.train.run_folder import FIELD, LOG, check_split, read_cameras, read_config, read_log
 
     torch.set_num_threads(threads)
@@ -171,14 +169,7 @@ def evaluate_run(
         "rays_per_second": log[-1]["rays"] / log[-1]["seconds"],
         "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
     }
-    settings = config["settings"]
-    masks = settings.get("components", {}).get("masks", "ignore")
-    photos = load_photos(cameras["test"], factor=settings["downscale"], threads=threads, masks=masks)
-    gains = relative_log_exposures(cameras["test"], model.log_exposure)
-    held_out = [
-        HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))
-        for photo, gain in zip(photos, gains, strict=True)
-    ]
+    held_out = held_out_photos(config, cameras["test"], log_exposure=model.log_exposure, threads=threads)
     perceptual = find_perceptual(console.note)
     with (
         saved_predictions(run, cameras["test"], wanted.predictions, checkpoint=checkpoint) as keep,

@@ -10,7 +10,7 @@ from nerfcli.cli.console import Console
 
 if TYPE_CHECKING:
     from nerfcli.cameras.frame import Frame
-    from nerfcli.evaluate.protocol import Compared
+    from nerfcli.evaluate.protocol import Compared, HeldOut
 
 _COLUMNS = {
     "as rendered": "",
@@ -19,6 +19,34 @@ _COLUMNS = {
     "right half": "_right_half",
     "right half, pose aligned": "_pose_aligned",
 }
+
+
+def held_out_photos(
+    config: dict[str, Any], frames: "Sequence[Frame]", *, log_exposure: float | None, threads: int
+) -> "list[HeldOut]":
+    """Held-out photos as the run was trained on: their size, what their masks mean, and how EXIF says they are exposed.
+
+    Args:
+        config: RUN/config.json.
+        frames: the photos.
+        log_exposure: see `Model`.
+        threads: to read with.
+
+    Raises:
+        UserError: a photo cannot be read.
+    """
+    from nerfcli.evaluate.protocol import HeldOut
+    from nerfcli.train.exif_exposure import relative_log_exposures
+    from nerfcli.train.photos import load_photos
+    from nerfcli.train.run_folder import chosen_components
+
+    factor, masks = config["settings"]["downscale"], chosen_components(config).masks
+    photos = load_photos(frames, factor=factor, threads=threads, masks=masks)
+    gains = relative_log_exposures(frames, log_exposure)
+    return [
+        HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))
+        for photo, gain in zip(photos, gains, strict=True)
+    ]
 
 
 def tell_numbers(run: Path, metrics: dict[str, Any], console: Console) -> None:

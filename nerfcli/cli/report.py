@@ -7,6 +7,7 @@ import typer
 
 from nerfcli.cli.batch import STDIN, stdin_paths
 from nerfcli.cli.console import Console, command
+from nerfcli.cli.evaluation import held_out_photos
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
 from nerfcli.errors import UserError
 
@@ -80,7 +81,7 @@ def report_page(
     from nerfcli.render.model import load_model
     from nerfcli.report.facts import labels_of, read_facts
     from nerfcli.report.page import page_html
-    from nerfcli.report.views import common_names, held_out_of, look_at
+    from nerfcli.report.views import common_names, look_at
     from nerfcli.train.run_folder import FIELD, read_config
 
     torch.set_num_threads(threads)
@@ -97,8 +98,10 @@ def report_page(
                 update((index + share) / len(paths), label)
 
             model = load_model(run.path / FIELD, device)
-            held_out = held_out_of(run, names, threads=threads)
-            looks.append(look_at(model, held_out, depth=depth, on_share=on_share))
+            frames = [frame for frame in run.frames["test"] if frame.name in names]
+            held_out = held_out_photos(run.config, frames, log_exposure=model.log_exposure, threads=threads)
+            compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
+            looks.append(look_at(model, compared, depth=depth, on_share=on_share))
             meanings.append(depth_meta(model, depth))
     return page_html(facts, looks, depth=meanings[0])
 

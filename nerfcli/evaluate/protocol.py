@@ -118,7 +118,7 @@ def evaluate_model(
         began = time.perf_counter()
         picture = render_picture(model, photo.frame, background=background, on_tile=on_tile)
         seconds.append(time.perf_counter() - began)
-        compared = _compared(photo, picture)
+        compared = compare(photo, picture)
         extras.keep(compared)
         entry = {
             "name": photo.frame.name,
@@ -160,7 +160,7 @@ def over_white(pixels: np.ndarray) -> np.ndarray:
     return to_8_bit(pixels[..., :3] / 255.0 * alpha + 1.0 - alpha)
 
 
-def _compared(photo: HeldOut, picture: Picture) -> Compared:
+def compare(photo: HeldOut, picture: Picture) -> Compared:
     used = picture.valid if photo.used is None else picture.valid & photo.used
     if not used.any():
         raise UserError(

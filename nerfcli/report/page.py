@@ -1,10 +1,9 @@
 """The page: what was captured, how it was posed and trained, what it shows of photos it has not seen, and how fast."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
 
@@ -13,9 +12,16 @@ from nerfcli.media.depth import DepthMeta
 from nerfcli.media.preview import coloured
 from nerfcli.pages import page
 from nerfcli.pages.pictures import data_uri, jpeg_bytes
-from nerfcli.pages.tables import table
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.facts import RunFacts, mismatches_of, warnings_of
+from nerfcli.report.tables import (
+    capture_html,
+    ledger_html,
+    numbers_html,
+    photos_html,
+    selection_html,
+    settings_html,
+)
 from nerfcli.report.views import ERROR_COLOURS, ERROR_RANGE, Seen, depth_range
 
 # Curves of more runs than these share colours.
@@ -44,14 +50,16 @@ def page_html(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, dept
         title=escape(title),
         count="a run" if len(runs) == 1 else f"{len(runs)} runs",
         warnings=_warnings_html(runs),
-        numbers=_columns(runs, _NUMBERS) + _protocols_html(runs),
+        numbers=numbers_html(runs),
         views=_views_html(runs, looks, ranges),
         legends=_legends_html(runs, ranges, depth),
         curves=_curves_html(runs),
-        photos=_photos_html(runs),
-        capture=_columns(runs, _CAPTURE),
+        photos=photos_html(runs),
+        capture=capture_html(runs),
         cameras=_cameras_html(runs),
-        settings=_settings_html(runs),
+        selection=selection_html(runs),
+        ledger=ledger_html(runs),
+        settings=settings_html(runs),
     )
     style = page.asset("compare.css") + _STYLE
     script = page.asset("compare.js")
@@ -67,97 +75,8 @@ def _warnings_html(runs: Sequence[RunFacts]) -> str:
     return f'<ul class="warned">{items}</ul>' if rows else "<p>Nothing was warned about.</p>"
 
 
-def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> str:
-    """A table with a column for each run; rows that no run has anything for are left out."""
-    cells = [(name, *(read(run) for run in runs)) for name, read in rows]
-    kept = [row for row in cells if any(row[1:])]
-    return table(("", *(run.label for run in runs)), kept, numbers=range(1, len(runs) + 1))
-
-
-def _protocols_html(runs: Sequence[RunFacts]) -> str:
-    """How the numbers were made, each way once."""
-    protocols = dict.fromkeys(str(run.metrics["protocol"]) for run in runs if run.metrics)
-    return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
-
-
-def _metric(key: str, form: str) -> Callable[[RunFacts], str]:
-    def read(run: RunFacts) -> str:
-        value = (run.metrics or {}).get("mean", {}).get(key)
-        return form.format(value) if isinstance(value, int | float) else ""
-
-    return read
-
-
-def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
-    def read(run: RunFacts) -> str:
-        content: dict[str, Any] = (run.metrics if part in ("training", "render") else run.poses) or {}
-        value = content.get(part, content).get(key) if part else content.get(key)
-        return form.format(value / scale) if isinstance(value, int | float) else ""
-
-    return read
-
-
 def _structure(view: Seen) -> str:
     return "not known" if view.ssim is None else f"{view.ssim:.3f}"
-
-
-def _last(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
-    return lambda run: form.format(run.log[-1][key] / scale) if run.log and key in run.log[-1] else ""
-
-
-_NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
-    ("PSNR of held-out photos", _metric("psnr", "{:.2f} dB")),
-    ("SSIM", _metric("ssim", "{:.4f}")),
-    ("LPIPS", _metric("lpips", "{:.4f}")),
-    ("training", _last("seconds", "{:.1f} s")),
-    ("steps", _last("step", "{:,}")),
-    ("samples a second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),
-    ("peak memory", _last("peak_memory_bytes", "{:.0f} MB", _MEGA)),
-    ("checkpoint", lambda run: f"{run.field_bytes / _MEGA:.1f} MB"),
-    ("a picture takes", _of("render", "seconds_per_image", "{:.2f} s")),
-    ("measured on", lambda run: str((run.metrics or {}).get("device", ""))),
-)
-
-
-def _size(run: RunFacts) -> str:
-    cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames["train"], *run.frames["test"])}
-    return ", ".join(f"{width} x {height}" for width, height in sorted(cameras)[:4])
-
-
-def _unit(run: RunFacts) -> str:
-    source = run.config.get("unit_source")
-    return str(run.config.get("unit", "")) + (f" ({source})" if source else "")
-
-
-def _registered(run: RunFacts) -> str:
-    return f"{run.poses['registered']} of {run.poses['total']}" if run.poses and "registered" in run.poses else ""
-
-
-def _lenses(run: RunFacts) -> str:
-    return ", ".join(f"{lens['model']} ({lens['images']} photos)" for lens in (run.poses or {}).get("cameras", []))
-
-
-def _verdict(run: RunFacts) -> str:
-    verdict = (run.poses or {}).get("verdict")
-    return ("accepted on evidence" if verdict.get("accepted") else "not accepted") if verdict else ""
-
-
-_CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
-    ("scene", lambda run: Path(str(run.config.get("scene", ""))).name),
-    ("format", lambda run: str(run.config.get("scene_kind", ""))),
-    ("photos to train on", lambda run: str(len(run.frames["train"]))),
-    ("photos held out", lambda run: str(len(run.frames["test"]))),
-    ("size", _size),
-    ("unit of length", _unit),
-    ("poses found", _registered),
-    ("the result was", _verdict),
-    ("lenses", _lenses),
-    ("points", _of("", "points", "{:,}")),
-    ("mean reprojection error", _of("", "mean_reprojection_error_px", "{:.2f} px")),
-    ("blur by uncertain poses, median", _of("pose_blur_px", "median", "{:.2f} px")),
-    ("blur by uncertain poses, largest", _of("pose_blur_px", "largest", "{:.2f} px")),
-    ("structure from motion took", _of("seconds", "total", "{:.0f} s")),
-)
 
 
 def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> list[tuple[float, float]]:
@@ -263,29 +182,6 @@ def _curves_html(runs: Sequence[RunFacts]) -> str:
     return (f'<p class="key">{key}</p>' if len(runs) > 1 else "") + f'<div class="charts pairs">{sections}</div>'
 
 
-def _photos_html(runs: Sequence[RunFacts]) -> str:
-    """PSNR and SSIM of every held-out photo by every run."""
-    by_run = [{image["name"]: image for image in (run.metrics or {}).get("images", [])} for run in runs]
-    names = sorted({name for images in by_run for name in images})
-    if not names:
-        return "<p>Not measured.</p>"
-    columns = ["photo"]
-    for run in runs:
-        of = f"{run.label}: " if len(runs) > 1 else ""
-        columns += [f"{of}PSNR, dB", f"{of}SSIM"]
-    rows = []
-    for name in names:
-        row = [name]
-        for images in by_run:
-            image = images.get(name, {})
-            row += [
-                f"{image['psnr']:.2f}" if "psnr" in image else "",
-                f"{image['ssim']:.4f}" if image.get("ssim") is not None else "",
-            ]
-        rows.append(row)
-    return table(columns, rows, numbers=range(1, len(columns)))
-
-
 def _cameras_html(runs: Sequence[RunFacts]) -> str:
     """The cameras of every scene, once."""
     drawn: dict[str, str] = {}
@@ -293,30 +189,6 @@ def _cameras_html(runs: Sequence[RunFacts]) -> str:
         scene = str(run.config.get("scene_fingerprint", run.path))
         drawn.setdefault(scene, from_above(run.frames["train"], run.frames["test"]))
     return "".join(f'<section class="chart">{drawing}</section>' for drawing in drawn.values() if drawing)
-
-
-def _settings_html(runs: Sequence[RunFacts]) -> str:
-    """Every setting and version; where runs differ, the row is marked and comes first."""
-    per_run = [
-        _flat({"settings": run.config.get("settings", {}), "versions": run.config.get("versions", {})}) for run in runs
-    ]
-    keys = list(dict.fromkeys(key for settings in per_run for key in settings))
-    rows = [(key, *(settings.get(key, "") for settings in per_run)) for key in keys]
-    differing = [row for row in rows if len(set(row[1:])) > 1]
-    same = [row for row in rows if len(set(row[1:])) == 1]
-    marked = [(f"differs: {row[0]}", *row[1:]) for row in differing]
-    return table(("", *(run.label for run in runs)), [*marked, *same], numbers=range(1, len(runs) + 1))
-
-
-def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
-    flat: dict[str, str] = {}
-    for key, value in content.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{name}.")
-        else:
-            flat[name] = "-" if value is None else str(value)
-    return flat
 
 
 _STYLE = """\
@@ -346,6 +218,9 @@ $legends
 $curves
 <h2>Every held-out photo</h2>
 $photos
+<h2>What has seen the held-out photos</h2>
+$ledger
+$selection
 <h2>Capture and poses</h2>
 $capture
 <h2>Cameras</h2>

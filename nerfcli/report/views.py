@@ -6,20 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
-from nerfcli.evaluate.protocol import HeldOut, over_white
+from nerfcli.evaluate.protocol import WHITE, HeldOut, compare
 from nerfcli.media.colour_maps import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
 from nerfcli.report.facts import RunFacts
-from nerfcli.train.photos import load_photos
 
 # Mean absolute difference of the channels that has the last colour of error maps, sRGB in [0, 1].
 ERROR_RANGE = 0.2
 ERROR_COLOURS = "viridis"
 # Of all depths, those at the ends of the range of colours.
 _RANGE_PERCENT = (1, 99)
-_WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -58,19 +56,6 @@ def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
     return spread_evenly(names, count, quality=quality)
 
 
-def held_out_of(run: RunFacts, names: Sequence[str], *, threads: int) -> list[HeldOut]:
-    """Held-out photos of a run as it was trained on; without those whose mask leaves nothing to compare.
-
-    Raises:
-        UserError: a photo cannot be read.
-    """
-    frames = [frame for frame in run.frames["test"] if frame.name in names]
-    photos = load_photos(frames, factor=run.config["settings"]["downscale"], threads=threads)
-    return [
-        HeldOut(photo.frame, photo.pixels, photo.used) for photo in photos if photo.used is None or photo.used.any()
-    ]
-
-
 def look_at(
     model: Model, held_out: Sequence[HeldOut], *, depth: DepthRequest, on_share: Callable[[float], None]
 ) -> list[Seen]:
@@ -84,20 +69,20 @@ def look_at(
     """
     views = []
     for photo in held_out:
-        background = _WHITE if photo.pixels.shape[-1] == 4 else model.background
+        background = WHITE if photo.pixels.shape[-1] == 4 else model.background
         picture = render_picture(model, photo.frame, background=background, depth=depth)
         assert picture.depth is not None
-        used = picture.valid if photo.used is None else picture.valid & photo.used
-        truth, rendered = over_white(photo.pixels), to_8_bit(picture.rgb)
+        compared = compare(photo, picture)
+        rendered, used = to_8_bit(compared.rendered), compared.used
         views.append(
             Seen(
                 name=photo.frame.name,
-                photo=truth,
+                photo=compared.photo,
                 picture=rendered,
-                error=error_map(rendered, truth, used=used),
+                error=error_map(rendered, compared.photo, used=used),
                 depth=picture.depth,
-                psnr=psnr(rendered, truth, used=used),
-                ssim=ssim(rendered, truth, used=used),
+                psnr=psnr(rendered, compared.photo, used=used),
+                ssim=ssim(rendered, compared.photo, used=used),
             )
         )
         on_share(len(views) / len(held_out))

@@ -16,6 +16,7 @@ from nerfcli import __version__
 from nerfcli.atomic import atomic_path, cannot_write, write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.orientation import rescaling_told
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.scene import Scene, fingerprint
@@ -56,6 +57,7 @@ def describe_run(
         "holdout": scene.holdout,
         "history": dict(scene.history),
         "missing_photos": list(scene.missing),
+        "warnings": list(rescaling_told(scene.rescaled)),
         "settings": {**settings.to_json(), "downscale": factor},
         "selection": None if selection is None else selection.to_json(),
         "versions": {

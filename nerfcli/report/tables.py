@@ -1,0 +1,215 @@
+"""The tables of a report: a column for each run, or a row for each photo, stage, component or setting."""
+
+from collections.abc import Callable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from nerfcli.pages.tables import table
+from nerfcli.report.facts import RunFacts
+
+_MEGA = 1e6
+
+
+def numbers_html(runs: Sequence[RunFacts]) -> str:
+    """What was measured, and by which protocols."""
+    return _columns(runs, _NUMBERS) + _protocols_html(runs)
+
+
+def capture_html(runs: Sequence[RunFacts]) -> str:
+    """What the runs were trained on, and how its poses were found."""
+    return _columns(runs, _CAPTURE)
+
+
+def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> str:
+    """A table with a column for each run; rows that no run has anything for are left out."""
+    cells = [(name, *(read(run) for run in runs)) for name, read in rows]
+    kept = [row for row in cells if any(row[1:])]
+    return table(("", *(run.label for run in runs)), kept, numbers=range(1, len(runs) + 1))
+
+
+def _protocols_html(runs: Sequence[RunFacts]) -> str:
+    """How the numbers were made, each way once."""
+    protocols = dict.fromkeys(str(run.metrics["protocol"]) for run in runs if run.metrics)
+    return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
+
+
+def _metric(key: str, form: str) -> Callable[[RunFacts], str]:
+    def read(run: RunFacts) -> str:
+        value = (run.metrics or {}).get("mean", {}).get(key)
+        return form.format(value) if isinstance(value, int | float) else ""
+
+    return read
+
+
+def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+    def read(run: RunFacts) -> str:
+        content: dict[str, Any] = (run.metrics if part in ("training", "render") else run.poses) or {}
+        value = content.get(part, content).get(key) if part else content.get(key)
+        return form.format(value / scale) if isinstance(value, int | float) else ""
+
+    return read
+
+
+def _of_kind(kind: str) -> Callable[[RunFacts], str]:
+    def read(run: RunFacts) -> str:
+        group = (run.metrics or {}).get("kinds", {}).get(kind)
+        return f"{group['psnr']:.2f} dB ({group['images']})" if group else ""
+
+    return read
+
+
+def number(value: float | None, digits: int) -> str:
+    """With so many digits; "" where there is none."""
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _last(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+    return lambda run: form.format(run.log[-1][key] / scale) if run.log and key in run.log[-1] else ""
+
+
+def _size(run: RunFacts) -> str:
+    cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames["train"], *run.frames["test"])}
+    return ", ".join(f"{width} x {height}" for width, height in sorted(cameras)[:4])
+
+
+def _unit(run: RunFacts) -> str:
+    source = run.config.get("unit_source")
+    return str(run.config.get("unit", "")) + (f" ({source})" if source else "")
+
+
+def _registered(run: RunFacts) -> str:
+    return f"{run.poses['registered']} of {run.poses['total']}" if run.poses and "registered" in run.poses else ""
+
+
+def _lenses(run: RunFacts) -> str:
+    return ", ".join(f"{lens['model']} ({lens['images']} photos)" for lens in (run.poses or {}).get("cameras", []))
+
+
+def _verdict(run: RunFacts) -> str:
+    verdict = (run.poses or {}).get("verdict")
+    return ("accepted on evidence" if verdict.get("accepted") else "not accepted") if verdict else ""
+
+
+def photos_html(runs: Sequence[RunFacts]) -> str:
+    """PSNR and SSIM of every held-out photo by every run."""
+    by_run = [{image["name"]: image for image in (run.metrics or {}).get("images", [])} for run in runs]
+    names = sorted({name for images in by_run for name in images})
+    if not names:
+        return "<p>Not measured.</p>"
+    columns = ["photo"]
+    for run in runs:
+        of = f"{run.label}: " if len(runs) > 1 else ""
+        columns += [f"{of}PSNR, dB", f"{of}SSIM"]
+    rows = []
+    for name in names:
+        row = [name]
+        for images in by_run:
+            image = images.get(name, {})
+            row += [number(image.get("psnr"), 2), number(image.get("ssim"), 4)]
+        view = next((images[name]["view"] for images in by_run if "view" in images.get(name, {})), None)
+        rows.append([*row, *_novelty(view)])
+    columns += ["nearest training view", "distance / radius", "degrees between", "kind of view"]
+    return table(columns, rows, numbers=range(1, len(columns)))
+
+
+def _novelty(view: dict[str, Any] | None) -> list[str]:
+    """How far a held-out view is from the nearest that was trained on."""
+    if view is None:
+        return ["", "", "", ""]
+    distance, angle = number(view.get("distance_relative"), 3), number(view.get("angle_deg"), 1)
+    return [str(view.get("nearest") or ""), distance, angle, str(view.get("kind") or "")]
+
+
+def ledger_html(runs: Sequence[RunFacts]) -> str:
+    """Which stages have seen the held-out photos."""
+    words = {True: "yes", False: "no", None: "not known"}
+    rows = [
+        (run.label, entry["stage"], words[entry["saw_held_out"]], entry["how"])
+        for run in runs
+        for entry in (run.metrics or {}).get("ledger", [])
+    ]
+    if not rows:
+        return "<p>Not known: the run was not evaluated.</p>"
+    return table(("run", "stage", "saw held-out photos", "how"), rows)
+
+
+def selection_html(runs: Sequence[RunFacts]) -> str:
+    """How the scene decided on the components of the model; "" where nobody asked it."""
+    rows = [
+        (
+            run.label,
+            f"{decision['component']}={str(decision['value']).lower()}",
+            f"{decision['gain_db']:+.2f} +- {decision['error_db']:.2f}",
+            f"{decision['cost']:+.0%}",
+            "yes" if decision["kept"] else "no",
+            decision["why"],
+        )
+        for run in runs
+        for decision in (run.config.get("selection") or {}).get("decisions", [])
+    ]
+    if not rows:
+        return ""
+    columns = ("run", "component", "gain, dB", "time", "kept", "why")
+    return f"<h2>What the scene needs</h2>{table(columns, rows, numbers=(2, 3))}"
+
+
+def settings_html(runs: Sequence[RunFacts]) -> str:
+    """Every setting and version; where runs differ, the row is marked and comes first."""
+    per_run = [
+        _flat({"settings": run.config.get("settings", {}), "versions": run.config.get("versions", {})}) for run in runs
+    ]
+    keys = list(dict.fromkeys(key for settings in per_run for key in settings))
+    rows = [(key, *(settings.get(key, "") for settings in per_run)) for key in keys]
+    differing = [row for row in rows if len(set(row[1:])) > 1]
+    same = [row for row in rows if len(set(row[1:])) == 1]
+    marked = [(f"differs: {row[0]}", *row[1:]) for row in differing]
+    return table(("", *(run.label for run in runs)), [*marked, *same], numbers=range(1, len(runs) + 1))
+
+
+def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    flat: dict[str, str] = {}
+    for key, value in content.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{name}.")
+        else:
+            flat[name] = "-" if value is None else str(value)
+    return flat
+
+
+_NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
+    ("PSNR of held-out photos", _metric("psnr", "{:.2f} dB")),
+    ("SSIM", _metric("ssim", "{:.4f}")),
+    ("LPIPS", _metric("lpips", "{:.4f}")),
+    ("PSNR, colours aligned", _metric("psnr_colour_aligned", "{:.2f} dB")),
+    ("PSNR of the right halves", _metric("psnr_right_half", "{:.2f} dB")),
+    ("the same, poses aligned on the left halves", _metric("psnr_pose_aligned", "{:.2f} dB")),
+    ("PSNR of views between training views", _of_kind("interpolation")),
+    ("PSNR of views beyond them", _of_kind("extrapolation")),
+    ("training", _last("seconds", "{:.1f} s")),
+    ("steps", _last("step", "{:,}")),
+    ("samples a second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),
+    ("peak memory", _last("peak_memory_bytes", "{:.0f} MB", _MEGA)),
+    ("checkpoint", lambda run: f"{run.field_bytes / _MEGA:.1f} MB"),
+    ("a picture takes", _of("render", "seconds_per_image", "{:.2f} s")),
+    ("measured on", lambda run: str((run.metrics or {}).get("device", ""))),
+)
+
+
+_CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
+    ("scene", lambda run: Path(str(run.config.get("scene", ""))).name),
+    ("format", lambda run: str(run.config.get("scene_kind", ""))),
+    ("photos to train on", lambda run: str(len(run.frames["train"]))),
+    ("photos held out", lambda run: str(len(run.frames["test"]))),
+    ("size", _size),
+    ("unit of length", _unit),
+    ("poses found", _registered),
+    ("the result was", _verdict),
+    ("lenses", _lenses),
+    ("points", _of("", "points", "{:,}")),
+    ("mean reprojection error", _of("", "mean_reprojection_error_px", "{:.2f} px")),
+    ("blur by uncertain poses, median", _of("pose_blur_px", "median", "{:.2f} px")),
+    ("blur by uncertain poses, largest", _of("pose_blur_px", "largest", "{:.2f} px")),
+    ("structure from motion took", _of("seconds", "total", "{:.0f} s")),
+)
