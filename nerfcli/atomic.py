@@ -81,6 +81,26 @@ def write_json(path: Path, content: Any) -> None:
         partial.write_text(text + "\n", encoding="utf-8")
 
 
+def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, Any]:
+    """What `write_json` wrote, where that was an object.
+
+    Args:
+        path: the file.
+        needed: keys without which it is damaged.
+        hint: what to do if it is.
+
+    Raises:
+        UserError: it cannot be read, is no JSON, or lacks a key.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}", hint) from error
+    if not isinstance(content, dict) or any(key not in content for key in needed):
+        raise UserError(f"{path} cannot be read: it lacks {', '.join(needed)}", hint)
+    return content
+
+
 def cannot_write(path: Path, error: OSError) -> UserError:
     """The two-line error for a result that could not be written."""
     reason = error.strerror or str(error)

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from nerfcli.atomic import atomic_folder, atomic_path, write_json
+from nerfcli.atomic import atomic_folder, atomic_path, read_json, write_json
 from nerfcli.errors import BAD_INPUT, UserError
 
 
@@ -110,3 +110,15 @@ def test_json_is_written_whole_and_without_nan(tmp_path):
             write_json(path, {"value": number})
     assert json.loads(path.read_text(encoding="utf-8"))["values"] == [1, 0.1, None]
     assert names(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"[]", b"{}", b'{"mean": 1', b"\xff\xfe", b'{"mean": "a\x00"}', b'{"nean": 1}']
+)
+def test_json_of_ours_that_is_damaged_is_told(content, tmp_path):
+    path = tmp_path / "metrics.json"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"metrics\.json cannot be read"):
+        read_json(path, needed=("mean",), hint="measure again")
+    write_json(path, {"mean": 1})
+    assert read_json(path, needed=("mean",), hint="measure again") == {"mean": 1}

@@ -196,11 +196,10 @@ def evaluate_run(
 
 def _kept(path: Path, checkpoint: str, wanted: Wanted) -> dict[str, Any]:
     """The metrics that are there, if they are of this checkpoint and have all that is wanted."""
-    import json as json_module
-
+    from nerfcli.atomic import read_json
     from nerfcli.evaluate.predictions import PREDICTIONS
 
-    metrics = json_module.loads(path.read_text(encoding="utf-8"))
+    metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to measure again")
     if metrics.get("checkpoint_sha256") != checkpoint:
         raise UserError(f"{path} belongs to an earlier state of this run", "add --overwrite to replace it")
     lacks = []

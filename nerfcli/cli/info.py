@@ -97,6 +97,7 @@ def _describe_scene(folder: Path) -> dict[str, Any]:
 
 
 def _describe_run(folder: Path) -> dict[str, Any]:
+    from nerfcli.atomic import read_json
     from nerfcli.evaluate.protocol import METRICS
     from nerfcli.field.cost import field_bytes
     from nerfcli.render.model import load_model
@@ -128,7 +129,9 @@ def _describe_run(folder: Path) -> dict[str, Any]:
             "cost": costs_of_run(model, cameras["train"], config.get("settings", {}), log),
         }
     if (folder / METRICS).exists():
-        content["metrics"] = json_module.loads((folder / METRICS).read_text(encoding="utf-8"))["mean"]
+        content["metrics"] = read_json(
+            folder / METRICS, needed=("mean",), hint="measure again: nerfcli evaluate RUN --overwrite"
+        )["mean"]
     return content
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli import __version__
+from nerfcli.atomic import read_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.export.names import describe_frames, file_names
@@ -85,7 +86,8 @@ class Order:
         """
         if not (folder / DESCRIPTION).exists():
             return False
-        made = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+        hint = "add --overwrite to render again, or choose another place with -o"
+        made = read_json(folder / DESCRIPTION, needed=("settings",), hint=hint)
         wanted = self.of_pictures() | self.settings.of_presentation()
         del wanted["nerfcli"]
         depth, there = wanted["settings"]["depth"], made.get("settings", {}).get("depth")
