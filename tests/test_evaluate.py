@@ -146,6 +146,9 @@ def test_evaluation_of_an_empty_model_is_the_distance_to_its_background():
     assert metrics["mean"]["ssim"] == pytest.approx((first["ssim"] + 1) / 2)
     assert calls[-1] == (2 * 12 * 16, 2 * 12 * 16)
     assert metrics["render"]["seconds_per_image"] > 0
+    # White is saturated: the colour correction says nothing of photos on white.
+    assert second["psnr_colour_aligned"] is None
+    assert first["psnr_colour_aligned"] is not None
 
 
 def test_evaluation_of_fog_in_closed_form():
@@ -168,7 +171,7 @@ def test_masked_pixels_do_not_count():
     metrics = evaluate_model(model, [HeldOut(frame("a"), pixels, used)], on_image=lambda done, total: None)
     assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(0.2))
     assert (metrics["images"][0]["pixels"], metrics["images"][0]["masked_pixels"]) == (1, 12 * 16 - 1)
-    assert metrics["images"][0]["ssim_windows"] == 0
+    assert metrics["images"][0]["whole_windows"] == 0
     assert metrics["mean"]["ssim"] is None
 
 

@@ -60,7 +60,7 @@ def tell_numbers(run: Path, metrics: dict[str, Any], console: Console) -> None:
     rows = [
         (name, *(_number(mean.get(f"{measure}{key}"), digits) for measure, digits in _MEASURES))
         for name, key in _COLUMNS.items()
-        if f"psnr{key}" in mean
+        if mean.get(f"psnr{key}") is not None
     ]
     console.table(("", "PSNR", "SSIM", "LPIPS"), rows, styles={})
     if kinds:

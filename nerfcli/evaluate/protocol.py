@@ -47,12 +47,17 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Compared:
-    """What was compared: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and which pixels count (H, W)."""
+    """What was compared: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and which pixels count (H, W).
+
+    on_white: whether the photo has alpha and stands on white. The colour correction leaves saturated pixels out and
+    would carry white anywhere, so there is none.
+    """
 
     frame: Frame
     rendered: np.ndarray
     photo: np.ndarray
     used: np.ndarray
+    on_white: bool
 
 
 @dataclass(frozen=True)
@@ -166,7 +171,13 @@ def compare(photo: HeldOut, picture: Picture) -> Compared:
         raise UserError(
             f"no pixel of {photo.frame.name} is left to compare", "check that its mask is white where pixels count"
         )
-    return Compared(photo.frame, as_exposed(picture.rgb, photo.log_gain), over_white(photo.pixels), used)
+    return Compared(
+        photo.frame,
+        as_exposed(picture.rgb, photo.log_gain),
+        over_white(photo.pixels),
+        used,
+        photo.pixels.shape[-1] == 4,
+    )
 
 
 def as_exposed(rgb: np.ndarray, log_gain: float) -> np.ndarray:
@@ -179,11 +190,16 @@ def as_exposed(rgb: np.ndarray, log_gain: float) -> np.ndarray:
 def _measured(compared: Compared, perceptual: Perceptual | None) -> dict[str, float | None]:
     truth, used = compared.photo, compared.used
     rounded = to_8_bit(compared.rendered)
-    corrected = to_8_bit(colour_aligned(as_float(compared.rendered), as_float(truth), used=used))
-    return {
+    raw = {
         **_close(rounded, truth, used=used, suffix=""),
         "lpips": _lpips(rounded, truth, used=used, perceptual=perceptual),
         **_close(compared.rendered, truth, used=used, suffix="_float"),
+    }
+    if compared.on_white:
+        return {**raw, "psnr_colour_aligned": None, "ssim_colour_aligned": None, "lpips_colour_aligned": None}
+    corrected = to_8_bit(colour_aligned(as_float(compared.rendered), as_float(truth), used=used))
+    return {
+        **raw,
         **_close(corrected, truth, used=used, suffix="_colour_aligned"),
         "lpips_colour_aligned": _lpips(corrected, truth, used=used, perceptual=perceptual),
     }
@@ -208,7 +224,7 @@ def _counted(photo: HeldOut, picture: Picture, compared: Compared) -> dict[str, 
         "pixels": int(compared.used.sum()),
         "masked_pixels": 0 if photo.used is None else int((~photo.used).sum()),
         "pixels_without_ray": int((~picture.valid).sum()),
-        "ssim_windows": int(whole_windows(compared.used).sum()),
+        "whole_windows": int(whole_windows(compared.used).sum()),
     }
 
 
