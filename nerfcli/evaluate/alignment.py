@@ -22,11 +22,12 @@ PIXELS = 2048
 SEED = 1
 # Fewer pixels do not hold six unknowns against noise.
 LEAST_PIXELS = 64
-# How far, in pixels, the camera is moved to see what changes: wide at first, to look across the field's own noise.
-STEPS_PX = (2.0, 2.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.5)
-ENOUGH_PX = 0.01
+# How far, in pixels, the camera is moved to see what changes: wide at first, to look across the field's own noise. At
+# first it is only turned: on half of a picture a move looks much like a turn, and a wrong one spoils the other half.
+TURNS_PX = (2.0, 2.0, 1.0, 1.0, 0.5)
+STEPS_PX = (1.0, 1.0, 0.5, 0.5, 0.5, 0.5)
 _FIRST_DAMPING = 1e-3
-_TRIES = 4
+_TRIES = 5
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ def align_pose(
 
     Levenberg-Marquardt on the squared error of 2048 random pixels, with derivatives by differences of renders. The six
     unknowns are counted in pixels: turns by one over the focal length, and moves that shift what is as far away as the
-    scene's radius by one pixel. A step is taken only where it brings the error down.
+    scene's radius by one pixel. A step is taken only where it brings the error down. It finds the way back from about a
+    pixel of the picture that is measured; from three it ends in the nearest valley.
 
     Args:
         model: the trained model.
@@ -102,25 +104,24 @@ def align_pose(
         return (rgb.clamp(0.0, 1.0).cpu().numpy().astype(np.float64) - wanted).ravel()
 
     pose, current = frame.world_from_cam, residuals(frame.world_from_cam)
-    before, damping = float(np.square(current).mean()), _FIRST_DAMPING
-    for step_px in STEPS_PX:
-        moves = np.eye(6) * step_px * unit
+    before = float(np.square(current).mean())
+    turns = [(step_px, slice(3, 6)) for step_px in TURNS_PX]
+    for step_px, free in [*turns, *((step_px, slice(0, 6)) for step_px in STEPS_PX)]:
+        moves = (np.eye(6) * step_px * unit)[free]
         columns = [(residuals(pose @ transform_from_twist(move)) - current) / step_px for move in moves]
         jacobian = np.stack(columns, axis=1)
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ current
-        moved_px = 0.0
+        damping = _FIRST_DAMPING  # anew: where wide differences led nowhere, narrow ones may
         for _ in range(_TRIES):
-            damped = normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6)
-            step = -np.linalg.solve(damped, gradient)
+            damped = normal + damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(len(moves))
+            step = np.zeros(6)
+            step[free] = -np.linalg.solve(damped, gradient)
             trial = pose @ transform_from_twist(step * unit)
             found = residuals(trial)
             if np.square(found).sum() < np.square(current).sum():
-                pose, current, moved_px = trial, found, float(np.linalg.norm(step))
-                damping /= 10
+                pose, current = trial, found
                 break
             damping *= 10
-        if moved_px < ENOUGH_PX and step_px == STEPS_PX[-1]:
-            break
     turn = frame.world_from_cam[:3, :3].T @ pose[:3, :3]
     return Alignment(
         frame=replace(frame, world_from_cam=pose),
