@@ -203,7 +203,7 @@ def train(
 
         def after_step(progress: Progress) -> None:
             on_progress(progress)
-            room.after_step(progress.step)
+            room.relieve()
             interrupts.answer()
 
         try:

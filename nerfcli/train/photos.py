@@ -19,6 +19,9 @@ from nerfcli.media.masks import read_mask
 from nerfcli.train.footprint import pixel_footprint
 from nerfcli.train.room import IN_MEMORY, Room
 
+# In float64, the bearings of a large photo would take more than the photo.
+PIXELS_AT_A_TIME = 2**18
+
 
 @dataclass(frozen=True)
 class Photo:
@@ -204,9 +207,7 @@ class PixelPool:
         bearings = room.array((sum(sizes), 3), np.float32)
         good_rays: dict[Camera, np.ndarray] = {}
         for camera, first in first_bearing.items():
-            rays, good_rays[camera] = camera.pixel_bearings()
-            bearings[first : first + len(rays)] = rays
-            room.relieve()
+            good_rays[camera] = _fill_bearings(camera, bearings[first : first + camera.width * camera.height], room)
         self.bearings = torch.from_numpy(bearings).to(device)
         self.first_bearing = torch.tensor([first_bearing[photo.frame.camera] for photo in photos], device=device)
         self.without_ray = sum(int((~good_rays[photo.frame.camera]).sum()) for photo in photos)
@@ -261,6 +262,18 @@ class PixelPool:
         name, width = self.names_and_widths[photo]
         row, column = divmod(number - int(self.first_pixel[photo]), width)
         return name, column, row
+
+
+def _fill_bearings(camera: Camera, bearings: np.ndarray, room: Room) -> np.ndarray:
+    """Write the camera's bearings, a part at a time, and return which pixels (N,) have one."""
+    valid = np.empty(len(bearings), dtype=bool)
+    for begin in range(0, len(bearings), PIXELS_AT_A_TIME):
+        part = slice(begin, min(begin + PIXELS_AT_A_TIME, len(bearings)))
+        numbers = np.arange(part.start, part.stop)
+        centres = np.stack([numbers % camera.width, numbers // camera.width], axis=-1) + 0.5
+        bearings[part], valid[part] = camera.bearings(centres)
+        room.relieve()
+    return valid
 
 
 def _emptied(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -28,7 +28,6 @@ _COPIES_OF_FIELD = 7
 _LARGEST_FIELD_BYTES = 64 * 2**20
 # A photo that is being decoded: Pillow's picture, the array, and what is made on the way to the smaller one.
 _BYTES_PER_DECODED_PIXEL = 12
-_LOOK_EVERY_STEPS = 64
 
 
 @dataclass(frozen=True)
@@ -69,9 +68,6 @@ class InMemory:
         return np.empty(shape, dtype)
 
     def relieve(self) -> None:
-        """Give nothing back."""
-
-    def after_step(self, step: int) -> None:
         """Give nothing back."""
 
 
@@ -116,11 +112,6 @@ class InFiles:
                 with suppress(AttributeError, ValueError):  # not on every system
                     pages.madvise(mmap.MADV_DONTNEED)
 
-    def after_step(self, step: int) -> None:
-        """Look now and then."""
-        if step % _LOOK_EVERY_STEPS == 0:
-            self.relieve()
-
 
 Room = InMemory | InFiles
 IN_MEMORY = InMemory()
@@ -151,8 +142,8 @@ def room_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[Room, st
         f"memory: about {_gigabytes(total)} would be needed, {_gigabytes(limit)} are allowed: the photos "
         f"({_gigabytes(needs.photos)}) stand in files without a name in {folder}"
     )
-    # Room for the pages that come back between two looks.
-    return InFiles(folder, limit - (limit - needs.rest) // 4), told
+    # Room for the pages that a step brings back: the system maps 16 of them around each pixel that is looked at.
+    return InFiles(folder, limit - (limit - needs.rest) // 2), told
 
 
 def _gigabytes(count: int) -> str:
