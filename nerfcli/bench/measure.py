@@ -114,7 +114,7 @@ def _measure_run(subject: Subject, run: Path, wanted: Wanted, session: Session) 
     if subject.scene is None:
         session.notify(f"training settings are left out: {subject.why_no_scene}")
         return
-    if not any(entry["point"] == THIS_RUN for entry in session.records.of_kind("training")):
+    if subject.trained and not any(entry["point"] == THIS_RUN for entry in session.records.of_kind("training")):
         session.say("comparing this run with held-out photos")
         torch.set_num_threads(subject.base.threads)
         photos, pictures = subject.held_out(model), session.folder / FOLDER

@@ -27,7 +27,7 @@ class Subject:
         test_frames: the held-out ones.
         base: settings of trainings where they are not varied, the resolution among them.
         identity: changes when what is measured changes.
-        trained: what the run says of its training; keys as in the records.
+        trained: what the run says of its training, keys as in the records; empty where it says nothing.
         why_no_scene: where the scene cannot be found, in words.
     """
 
@@ -73,7 +73,7 @@ def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Subject
 
 def _run_at(run: Path, *, device: str, threads: int, seed: int) -> Subject:
     config, log = read_config(run), read_log(run)
-    if not (run / FIELD).exists() or not log:
+    if not (run / FIELD).exists():
         raise UserError(f"{run} is not trained yet", "train it first (nerfcli train SCENE), or give a scene")
     trained = TrainSettings.from_json(config["settings"])
     base = TrainSettings(
@@ -93,14 +93,21 @@ def _run_at(run: Path, *, device: str, threads: int, seed: int) -> Subject:
         test_frames=read_cameras(run)["test"],
         base=base,
         identity=hashlib.sha256((run / FIELD).read_bytes()).hexdigest(),
-        trained={
-            "seconds": log[-1]["seconds"],
-            "steps": log[-1]["step"],
-            "samples_per_second": log[-1]["samples"] / log[-1]["seconds"],
-            "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
-        },
+        trained=_told_by(log),
         why_no_scene=why,
     )
+
+
+def _told_by(log: list[dict[str, Any]]) -> dict[str, Any]:
+    """What a run's log says of its training; nothing where an earlier version wrote it, or nobody."""
+    if not log:
+        return {}
+    return {
+        "seconds": log[-1]["seconds"],
+        "steps": log[-1]["step"],
+        "samples_per_second": log[-1]["samples"] / log[-1]["seconds"],
+        "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
+    }
 
 
 def _scene_at(path: Path, *, device: str, threads: int, seed: int) -> Subject:
