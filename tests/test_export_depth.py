@@ -16,12 +16,14 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import UserError
-from nerfcli.export.depth_files import map_path, read_map, write_maps
+from nerfcli.export.depth_files import Levels, map_path, read_map, write_levels, write_maps
 from nerfcli.export.frames import export_frames
 from nerfcli.export.order import Order
 from nerfcli.export.settings import MEASURED, ExportSettings, depth_meta, floor_of
+from nerfcli.media.depth import DepthMeta
 from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import linear_light
+from nerfcli.media.float_tiff import write_tiff
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, Picture, render_picture
 
@@ -119,7 +121,38 @@ def test_levels_of_a_clip_in_metres_are_millimetres(model, tmp_path):
         # The floats that they were made of stay.
         np.testing.assert_array_equal(tifffile.imread(tmp_path / "views/depth" / f"{name}.tiff"), depth)
     description = json.loads((tmp_path / "views/render.json").read_text())
-    assert description["depth16"] == {"units_per_level": 1e-3}
+    assert description["depth16"] == {"units_per_level": 1e-3, "pixels_beyond": 0}
+
+
+def test_a_few_far_pixels_do_not_make_levels_coarse(tmp_path):
+    """3 of 5000 pixels at 1000 m among others between 2 and 3 m: millimetres hold 65.535 m."""
+    rng = np.random.default_rng(0)
+    meaning = DepthMeta("conditional", "z", "metre", opacity_floor=0.5)
+    depths = rng.uniform(2, 3, (2, 50, 50)).astype(np.float32)
+    depths[0, :3, 0] = 1000.0
+    depths[1, 0, 0] = np.nan
+    for name, depth in zip("ab", depths, strict=True):
+        path = map_path(tmp_path, "depth", name, "tiff")
+        path.parent.mkdir(exist_ok=True)
+        write_tiff(path, depth, meaning)
+    settings = ExportSettings(OUTPUTS, DEPTH, formats=("png16",))
+    written = write_levels(tmp_path, ["a", "b"], settings=settings, meaning=meaning)
+    assert written == Levels(units_per_level=1e-3, pixels_beyond=3)
+    for name, depth in zip("ab", depths, strict=True):
+        levels = np.asarray(Image.open(tmp_path / "depth16" / f"{name}.png"))
+        near = np.where(np.isnan(depth) | (depth > 65.5), 0, depth.astype(np.float64) * 1000)
+        np.testing.assert_array_equal(levels, np.rint(near))
+    told = depth_meta_of(tmp_path / "depth16" / "a.png")
+    assert told is not None
+    assert told.error_bounds["pixels_beyond_levels"] == 3
+    # A length that is asked for holds all or is refused.
+    with pytest.raises(UserError, match="one is 1000"):
+        write_levels(tmp_path, ["a"], settings=replace(settings, depth_scale=1e-3), meaning=meaning)
+    # Where all of it is within twice what most needs, all of it is held.
+    depths[0, :3, 0] = 5.0
+    write_tiff(map_path(tmp_path, "depth", "a", "tiff"), depths[0], replace(meaning, unit="arbitrary"))
+    written = write_levels(tmp_path, ["a"], settings=settings, meaning=replace(meaning, unit="arbitrary"))
+    assert written == Levels(units_per_level=1e-4, pixels_beyond=0)
 
 
 def test_levels_that_are_too_short_leave_the_earlier_export_alone(model, tmp_path):

@@ -230,6 +230,61 @@ def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monk
     assert "renders it again" in told[0]
 
 
+# What is made of pictures that are there
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"video": replace(VIDEO, fps=30, direction="reverse")},
+        {"colour_map": "grey"},
+        {"colour_range": (1.0, 2.0)},
+        {"formats": ("tiff", "png16")},
+    ],
+    ids=["video", "colours", "range", "levels"],
+)
+def test_other_videos_and_colours_of_a_finished_folder_are_made_without_rendering(model, tmp_path, changes, in_one_go):
+    """The files are those of an order that was rendered from the start."""
+    changed = replace(order(), settings=replace(order().settings, **changes))
+    export(model, changed, tmp_path / "other")
+    export(model, order(), tmp_path / "views")
+    assert contents(tmp_path / "views") == in_one_go
+    done: list[int] = []
+    export(model, changed, tmp_path / "views", on_rays=done.append)
+    assert done == [4 * PIXELS]  # all of them at once: they are there
+    assert contents(tmp_path / "views") == contents(tmp_path / "other")
+    assert not list(tmp_path.glob(".views*"))
+
+
+def test_what_would_be_replaced_is_asked_for_and_what_is_added_is_not(model, tmp_path):
+    folder = tmp_path / "views"
+    export(model, order(video=None), folder)
+    assert not order().is_held_by(folder)  # a video is added
+    assert order(video=None).is_held_by(folder)
+    export(model, order(), folder)
+    assert order().is_held_by(folder)
+    with pytest.raises(UserError, match="holds the same pictures with other videos") as caught:
+        order(video=replace(VIDEO, fps=30)).is_held_by(folder)
+    assert "--overwrite" in caught.value.hint
+
+
+def test_a_picture_that_is_damaged_is_rendered_again(model, tmp_path, in_one_go):
+    export(model, order(video=None), tmp_path / "views")
+    halve(tmp_path / "views/rgb/f1/v.png")
+    done: list[int] = []
+    export(model, order(), tmp_path / "views", on_rays=done.append)
+    assert done == [3 * PIXELS, PIXELS]
+    assert contents(tmp_path / "views") == in_one_go
+
+
+def test_the_same_order_renders_again(model, tmp_path):
+    """As --overwrite says."""
+    export(model, order(), tmp_path / "views")
+    done: list[int] = []
+    export(model, order(), tmp_path / "views", on_rays=done.append)
+    assert done == [PIXELS] * 4
+
+
 # Videos of an export
 
 

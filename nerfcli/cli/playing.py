@@ -1,5 +1,6 @@
 """What the options of `nerfcli render` about videos, frames and processes say."""
 
+import math
 import re
 from collections.abc import Collection
 from typing import TYPE_CHECKING
@@ -38,6 +39,26 @@ def video_settings(
     if loop == 0 and chosen != ("gif",):
         raise typer.BadParameter("0; a gif alone can be told to play for ever", param_hint="--loop")
     return VideoSettings(formats=chosen, layout=layout, direction=direction, fps=fps, crf=crf, plays=loop)
+
+
+def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[float, float] | None:
+    """LOW:HIGH; None where nothing is said.
+
+    Raises:
+        typer.BadParameter: anything else, or no depth is asked for.
+    """
+    if text is None:
+        return None
+    if "depth" not in outputs:
+        raise typer.BadParameter("it is of depth, which is not among the --outputs", param_hint="--colour-range")
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        low = high = math.nan
+    if not -math.inf < low < high < math.inf:
+        message = f"{text!r}; write LOW:HIGH in scene units, for example 0.5:4"
+        raise typer.BadParameter(message, param_hint="--colour-range")
+    return low, high
 
 
 def frame_range(text: str) -> slice:

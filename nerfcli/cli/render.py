@@ -9,7 +9,7 @@ from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.depth_options import DepthFormat, DepthScale, depth_formats, finite, level_scale
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
-from nerfcli.cli.playing import frame_range, one_of, video_settings
+from nerfcli.cli.playing import colour_range_of, frame_range, one_of, video_settings
 from nerfcli.cli.rendering import Rgba, SamplesPerPixel, Step, Tolerance, tolerance_of
 from nerfcli.cli.views import Views, chosen_frames, file_fps, look_of, refuse_z_all_around, write_frames
 from nerfcli.errors import UserError
@@ -55,6 +55,10 @@ def render(
     samples_per_pixel: SamplesPerPixel = 1,
     rgba: Rgba = False,
     colour_map: Annotated[str, typer.Option(help="Of depth to look at: turbo, viridis or grey.")] = "turbo",
+    colour_range: Annotated[
+        str | None,
+        typer.Option(help="LOW:HIGH, the depths of the first and last colour.  [default: 1 % to 99 % of all pixels]"),
+    ] = None,
     video: Annotated[bool, typer.Option("--video", help="A video of each output: --video-format mp4.")] = False,
     video_format: Annotated[
         str | None, typer.Option(help="Some of mp4 (H.264), h265 (in mp4), webm (VP9), gif; implies --video.")
@@ -120,6 +124,7 @@ def render(
     spread is the standard deviation of where light ends, disagreement |median - conditional|: both are large where no
     single depth is right (edges, glass, fog). Every file says what its numbers mean: nerfcli info FILE.
     Writes RUN/renders/CAMERAS/. A command that was interrupted goes on with the missing views when it is given again.
+    Other videos and colours of views that are there are made without rendering (--overwrite where they replace some).
     A cluster renders --frames 0:100, --frames 100:200, ... at a time; without --frames the same command then assembles.
 
     \b
@@ -178,6 +183,7 @@ def render(
         formats=formats,
         depth_scale=scale,
         colour_map=colour_map,
+        colour_range=colour_range_of(colour_range, outputs=chosen),
         video=videos,
         quality=Quality(tolerance_of(tolerance), samples_per_pixel),
         rgba=rgba,

@@ -5,7 +5,7 @@ TIFF, NPY and 16-bit PNG hold one map each; OpenEXR and NPZ hold all that was as
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,12 @@ from nerfcli.media.depth import DepthMeta, difference_of, mixed
 from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import CHANNELS, read_exr, write_exr
 from nerfcli.media.float_tiff import read_tiff, write_tiff
-from nerfcli.media.levels import chosen_scale, write_png16
+from nerfcli.media.levels import LARGEST_LEVEL, chosen_scale, write_png16
+from nerfcli.media.quantiles import quantiles
 from nerfcli.render.pictures import Picture
 
+# Of the depths of a clip, the share by which levels are chosen, and how much farther than these they reach.
+_TYPICAL, _HEADROOM = 0.999, 2.0
 _AXES_OF_VIEW = "OpenCV: +x right, +y down, +z forward; the top-left pixel's centre is (0.5, 0.5)"
 
 
@@ -115,35 +118,52 @@ def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
     return read_tiff(path)[0]
 
 
-def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings, meaning: DepthMeta) -> float:
+@dataclass(frozen=True)
+class Levels:
+    """What `write_levels` did: the length of a level, and how many pixels of all frames lie beyond the last one."""
+
+    units_per_level: float
+    pixels_beyond: int
+
+
+def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings, meaning: DepthMeta) -> Levels:
     """Write the depth of all frames as 16-bit levels of one length, from the floats that are there.
+
+    A length that is chosen here holds twice as far as 99.9 % of all depths reach, or all of them if that is nearer:
+    a few rays that end far out would make levels coarse for everything else. What lies beyond has no depth in these
+    files.
 
     Args:
         folder: of the export.
         names: of the frames, all of which `write_maps` has written.
-        settings: the length of a level, or None to choose it so that all frames fit.
+        settings: the length of a level, or None to choose it for all frames.
         meaning: of the depth, as all frames have it.
 
     Returns:
-        The length of a level in scene units.
+        The length of a level in scene units, and what did not fit.
 
     Raises:
-        UserError: a depth does not fit, or a file cannot be written.
+        UserError: a depth does not fit into levels of a length that is given, or a file cannot be written.
     """
 
     def depths() -> Iterator[np.ndarray]:
         for name in names:
             yield read_map(folder, name, meaning)
 
-    scale = settings.depth_scale
+    scale, reach, pixels_beyond = settings.depth_scale, np.inf, 0
     if scale is None:
-        largest = max((float(depth[np.isfinite(depth)].max(initial=0.0)) for depth in depths()), default=0.0)
-        scale = chosen_scale(largest, meaning.unit)
+        typical, largest = quantiles(depths, (_TYPICAL, 1.0)) or (0.0, 0.0)
+        scale = chosen_scale(min(_HEADROOM * typical, largest), meaning.unit)
+        reach = LARGEST_LEVEL * scale * (1 + 1e-9)
     for name, depth in zip(names, depths(), strict=True):
+        beyond = depth > reach
+        pixels_beyond += int(beyond.sum())
         meta = depth_meta_of(_floats_of(folder, name, "depth")) or meaning
+        bounds = {**meta.error_bounds, "pixels_beyond_levels": int(beyond.sum())}
         path = map_path(folder, "depth", name, "png16")
-        write_png16(path, depth, replace(meta, layers={}), units_per_level=scale)
-    return scale
+        held = np.where(beyond, np.float32(np.nan), depth)
+        write_png16(path, held, replace(meta, layers={}, error_bounds=bounds), units_per_level=scale)
+    return Levels(scale, pixels_beyond)
 
 
 def _floats_of(folder: Path, name: str, output: str) -> Path:

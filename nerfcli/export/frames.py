@@ -1,7 +1,7 @@
 """The walk over all frames of an order: what is missing is rendered, then what needs all of them is made."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from nerfcli.atomic import write_json
@@ -12,7 +12,7 @@ from nerfcli.export.order import DESCRIPTION, Order
 from nerfcli.export.presentation import write_previews, write_videos
 from nerfcli.export.processes import render_in_processes
 from nerfcli.export.settings import depth_meta
-from nerfcli.export.unfinished import Unfinished, unfinished_of
+from nerfcli.export.unfinished import Unfinished, take_over, unfinished_of
 from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.model import Model
@@ -66,8 +66,9 @@ def export_frames(
     Layout: rgb/NAME.png, depth/NAME.tiff with depth/NAME.png to look at, opacity/NAME.png; exr/NAME.exr, npz/NAME.npz,
     depth16/NAME.png; rgb.mp4, depth.mp4, opacity.mp4 or rgb+depth+opacity.mp4; render.json. The colours of all depth
     previews share one range, so that a video does not flicker. Until then everything gathers in a hidden folder beside
-    it, which stays when the command ends early: the same order then renders the missing frames alone. Memory does not
-    grow with the number of frames.
+    it, which stays when the command ends early: the same order then renders the missing frames alone. Of a
+    finished folder that differs in previews and videos alone, the frames are taken. Memory does not grow with the
+    number of frames.
 
     Args:
         model: the trained model.
@@ -86,6 +87,8 @@ def export_frames(
     order.check()
     unfinished = unfinished_of(order, folder)
     with exclusive(unfinished.lock, f"nerfcli render is at work on {folder}"):
+        if order.shares_pictures_with(folder):
+            take_over(unfinished, order, folder)
         everything = range(len(order.frames))
         _render_missing(
             model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers
@@ -94,9 +97,11 @@ def export_frames(
         ranges = write_previews(unfinished.folder, order, meta)
         levels = {}
         if order.settings.in_levels:
-            scale = write_levels(unfinished.folder, order.names, settings=order.settings, meaning=meta)
-            levels = {"depth16": {"units_per_level": scale}}
-            notify(f"16-bit files: {scale_in_words(replace(meta, units_per_level=scale))}")
+            written = write_levels(unfinished.folder, order.names, settings=order.settings, meaning=meta)
+            levels = {"depth16": asdict(written)}
+            notify(f"16-bit files: {scale_in_words(replace(meta, units_per_level=written.units_per_level))}")
+            if written.pixels_beyond:
+                notify(f"{written.pixels_beyond} pixels are too far for 16-bit files and have no depth in them")
         write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
         description = {
             **order.of_pictures(),
@@ -106,6 +111,7 @@ def export_frames(
             "ranges": ranges,
             "error_meaning": ERROR_IN_WORDS,
             "facts": {name: unfinished.facts(name) for name in order.names},
+            "files": {name: unfinished.files(name) for name in order.names},
         }
         write_json(unfinished.folder / DESCRIPTION, description)
         unfinished.finish(folder)

@@ -16,6 +16,7 @@ from nerfcli.export.settings import ExportSettings
 from nerfcli.media.video import FORMATS, check_encoders
 
 DESCRIPTION = "render.json"
+_IN_WORDS = {"colour_map": "colours", "colour_range": "range of colours", "levels": "16-bit levels", "video": "videos"}
 
 
 @dataclass(frozen=True)
@@ -81,14 +82,15 @@ class Order:
     def is_held_by(self, folder: Path) -> bool:
         """Whether the finished folder holds this order, pictures and presentation.
 
+        False, too, where it holds the same pictures and nothing that would be replaced: videos are added.
+
         Raises:
             UserError: it holds another one.
         """
-        if not (folder / DESCRIPTION).exists():
+        made = _made(folder)
+        if made is None:
             return False
-        hint = "add --overwrite to render again, or choose another place with -o"
-        made = read_json(folder / DESCRIPTION, needed=("settings",), hint=hint)
-        wanted = self.of_pictures() | self.settings.of_presentation()
+        wanted = self.of_pictures()
         del wanted["nerfcli"]
         depth, there = wanted["settings"]["depth"], made.get("settings", {}).get("depth")
         if self.settings.measured and depth != there and isinstance(there, dict):
@@ -100,7 +102,41 @@ class Order:
             )
         if any(made.get(key) != value for key, value in wanted.items()):
             raise UserError(f"{folder} exists", "add --overwrite to replace it, or choose another place with -o")
-        return True
+        presentation = self.settings.of_presentation()
+        differing = [key for key, value in presentation.items() if made.get(key) != value]
+        if not differing:
+            return True
+        if self.shares_pictures_with(folder) and all(made.get(key) is None for key in differing):
+            return False
+        raise UserError(
+            f"{folder} holds the same pictures with other {' and '.join(_IN_WORDS[key] for key in differing)}",
+            "add --overwrite to make previews and videos anew from the pictures, which are kept; or choose another -o",
+        )
+
+    def shares_pictures_with(self, folder: Path) -> bool:
+        """Whether a finished folder holds the same pictures, and only previews, 16-bit files or videos differ."""
+        try:
+            made = _made(folder)
+        except UserError:  # a description that is damaged says nothing; all is rendered again
+            return False
+        if made is None or "files" not in made:
+            return False
+        presentation = self.settings.of_presentation()
+        return all(made.get(key) == value for key, value in self.of_pictures().items()) and any(
+            made.get(key) != value for key, value in presentation.items()
+        )
+
+
+def _made(folder: Path) -> dict[str, Any] | None:
+    """What a finished folder says of itself; None where there is none.
+
+    Raises:
+        UserError: that is damaged.
+    """
+    if not (folder / DESCRIPTION).exists():
+        return None
+    hint = "add --overwrite to render again, or choose another place with -o"
+    return read_json(folder / DESCRIPTION, needed=("settings",), hint=hint)
 
 
 def refuse_foreign(folder: Path) -> None:

@@ -23,7 +23,7 @@ RANGE_SHARES = (0.01, 0.99)
 
 
 def write_previews(folder: Path, order: Order, meta: DepthMeta) -> dict[str, tuple[float, float]]:
-    """A coloured PNG beside each file that is measured; all of an output on one range.
+    """A coloured PNG beside each file that is measured; all of an output on one range, or depth on the range given.
 
     Args:
         folder: holds the complete files of every frame.
@@ -44,7 +44,8 @@ def write_previews(folder: Path, order: Order, meta: DepthMeta) -> dict[str, tup
             for name in order.names:
                 yield read_map(folder, name, meaning)
 
-        lo, hi = ranges[output] = value_range(maps, output)
+        given = order.settings.colour_range if output == "depth" else None
+        lo, hi = ranges[output] = given or value_range(maps, output)
         metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": order.settings.colour_map}
         for name, values in zip(order.names, maps(), strict=True):
             picture = preview(values, meaning, lo=lo, hi=hi, colour_map=order.settings.colour_map)

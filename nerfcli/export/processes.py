@@ -124,6 +124,7 @@ class _Failure:
 def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, threads: int) -> None:
     """The life of a process: render the frames whose numbers come, until the other end closes."""
     torch.set_num_threads(threads)
+    signal.signal(signal.SIGTERM, _leave)
     while True:
         try:
             index = connection.recv()
@@ -140,6 +141,11 @@ def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, 
             connection.send(report)
         except ConnectionError:  # nobody is there any more
             return
+
+
+def _leave(number: int, _: object) -> None:
+    """End the process as an exception does, so that what is being written is removed first."""
+    raise SystemExit(128 + number)
 
 
 def _tell_death(worker: _Worker, order: Order, notify: Callable[[str], None], *, last: bool) -> None:

@@ -51,6 +51,7 @@ class ExportSettings:
         formats: some of `FORMATS`, for what is measured. 16-bit levels are made from floats, which stay beside them.
         depth_scale: scene units per level of 16-bit files; None chooses the same for all frames.
         colour_map: of what is measured, one of `media.colour_maps.COLOUR_MAPS`.
+        colour_range: the depths with the first and the last colour, in scene units; None chooses by the views.
         video: which videos; None for none.
         quality: how much work goes into a picture.
         rgba: colours without the background, the opacity as straight alpha.
@@ -61,6 +62,7 @@ class ExportSettings:
     formats: tuple[str, ...] = ("tiff",)
     depth_scale: float | None = None
     colour_map: str = "turbo"
+    colour_range: tuple[float, float] | None = None
     video: VideoSettings | None = None
     quality: Quality = field(default_factory=Quality)
     rgba: bool = False
@@ -91,14 +93,16 @@ class ExportSettings:
     def of_pictures(self) -> dict[str, Any]:
         """Plain values of what decides over the rendered numbers and their files."""
         settings = asdict(self)
-        del settings["colour_map"], settings["video"], settings["depth_scale"]
+        for name in ("colour_map", "colour_range", "video", "depth_scale"):
+            del settings[name]
         return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
 
     def of_presentation(self) -> dict[str, Any]:
         """Plain values of what decides over the previews and videos that are made of these files."""
         video = None if self.video is None else asdict(self.video) | {"formats": list(self.video.formats)}
         levels = {"scale": self.depth_scale or "auto"} if self.in_levels else None
-        return {"colour_map": self.colour_map, "levels": levels, "video": video}
+        colour_range = None if self.colour_range is None else list(self.colour_range)
+        return {"colour_map": self.colour_map, "colour_range": colour_range, "levels": levels, "video": video}
 
 
 def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:

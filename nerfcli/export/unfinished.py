@@ -12,14 +12,15 @@ folder, on one machine or on many that share a disk; one at a time finishes it.
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerfcli.atomic import cannot_write, replace_folder, write_json
-from nerfcli.export.order import Order
+from nerfcli.atomic import atomic_path, cannot_write, replace_folder, write_json
+from nerfcli.export.order import DESCRIPTION, Order
 
 _NOTES = ".frames"
 
@@ -55,6 +56,10 @@ class Unfinished:
         """What `note` was told about a frame."""
         return json.loads(self._path(name).read_text(encoding="utf-8"))["facts"]
 
+    def files(self, name: str) -> dict[str, str]:
+        """The files of a frame, relative to the folder, with digests of what is in them."""
+        return json.loads(self._path(name).read_text(encoding="utf-8"))["files"]
+
     @property
     def lock(self) -> Path:
         """The file that one command at a time holds while it makes the folder complete."""
@@ -81,6 +86,34 @@ def _digest(content: bytes) -> str:
 
 def _digest_of_note(files: dict[str, str], facts: dict[str, Any]) -> str:
     return _digest(json.dumps([files, facts], sort_keys=True).encode())
+
+
+def take_over(unfinished: Unfinished, order: Order, finished: Path) -> None:
+    """Give an unfinished folder the frames of a finished one that `Order.shares_pictures_with`, without copying them.
+
+    A frame with a file that is not as it was written is left out. Files are linked, so that the finished folder stays
+    whole whatever happens; previews and videos are not among them.
+
+    Raises:
+        UserError: the files cannot be linked or copied.
+    """
+    made = json.loads((finished / DESCRIPTION).read_text(encoding="utf-8"))
+    for name in order.names:
+        digests: dict[str, str] = made["files"][name]
+        if unfinished.has(name) or not all(_has_digest(finished / file, digest) for file, digest in digests.items()):
+            continue
+        paths = [unfinished.folder / file for file in digests]
+        for file, path in zip(digests, paths, strict=True):
+            with atomic_path(path) as partial:
+                try:
+                    os.link(finished / file, partial)
+                except OSError:  # a file system without links
+                    shutil.copyfile(finished / file, partial)
+        unfinished.note(name, paths, facts=made["facts"][name])
+
+
+def _has_digest(path: Path, digest: str) -> bool:
+    return path.is_file() and _digest(path.read_bytes()) == digest
 
 
 def unfinished_of(order: Order, folder: Path) -> Unfinished:
