@@ -4,16 +4,16 @@
     python benchmarks/depth.py redkitchen path/to/redkitchen -o kitchen-depth
 
 desk: sample_scenes/desk with its true cameras, against the true z of its held-out photos. redkitchen: a hand-held RGB-D
-video with poses (7-Scenes; images/, depth/ in millimetres with 0 for none, pose/ camera to world), against its sensor.
-Both are in metres. A folder OUT gets the scene, the run, OUT.csv and one picture per held-out view: photo, true z,
-conditional z, error. `--run RUN` takes a run that is there already.
+video with poses (7-Scenes; images/, depth/ in millimetres with 0 for none, pose/ camera to world), against its sensor,
+seen by its depth camera. Both are in metres. A folder OUT gets the scene, the run, OUT.csv and one picture per held-out
+view: photo, true z, conditional z, error. `--run RUN` takes a run that is there already.
 """
 
 import csv
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.depth import CONVENTIONS, DepthRequest, requested
 from nerfcli.render.model import Model, load_model
@@ -38,6 +39,9 @@ SHARES = (0.5, 0.05, 0.95)
 # Every second pixel of every second row is looked at: neighbours tell the same.
 STRIDE = 2
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk"
+# Of a Kinect: the focal length of its colour camera, and where it stands in the axes of its depth camera, in metres.
+COLOUR_FOCAL_PX = 525.0
+DEPTH_FROM_COLOUR = np.array([[1.0, 0, 0, 0.025], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 # From the axes of OpenCV to those of OpenGL, which transforms.json has.
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -65,10 +69,19 @@ def desk_scene(folder: Path) -> None:
 
 
 def kitchen_scene(folder: Path, capture: Path) -> None:
-    """transforms.json of the video's poses, with its nominal lens."""
-    matrix = np.loadtxt(capture / "camera-intrinsics.txt")
-    lens = {"fl_x": matrix[0, 0], "fl_y": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
-    poses = {path: np.loadtxt(capture / "pose" / f"{path.stem}.txt") for path in sorted((capture / "images").glob("*"))}
+    """transforms.json of the video's colour camera.
+
+    The capture's poses and its lens (585 px) are those of the depth camera, and the pictures are not registered: with
+    them, matches between colour pictures lie 1.9 px (median) off their epipolar lines, with `COLOUR_FOCAL_PX` 1.1 px.
+    Points triangulated from these matches are 21 cm (median) off the sensor's depth with the former, 12 cm with the
+    latter, too near by 4 cm: no field that is trained on these poses can be expected to do better by much.
+    """
+    cx, cy = np.loadtxt(capture / "camera-intrinsics.txt")[:2, 2]
+    lens = {"fl_x": COLOUR_FOCAL_PX, "fl_y": COLOUR_FOCAL_PX, "cx": cx, "cy": cy}
+    poses = {
+        path: np.loadtxt(capture / "pose" / f"{path.stem}.txt") @ DEPTH_FROM_COLOUR
+        for path in sorted((capture / "images").glob("*"))
+    }
     _write_scene(folder, lens | {"camera_model": "PINHOLE", "w": 640, "h": 480}, poses)
 
 
@@ -83,6 +96,13 @@ def _write_scene(folder: Path, lens: dict[str, object], poses: dict[Path, np.nda
 def desk_truth(frame: Frame) -> np.ndarray:
     """True z (600, 800) in metres."""
     return tifffile.imread(DESK / "truth" / "depth" / f"{Path(frame.name).stem}.tiff").astype(np.float64)
+
+
+def kitchen_depth_view(frame: Frame, capture: Path) -> Frame:
+    """What the depth camera sees when the colour camera takes a photo."""
+    matrix = np.loadtxt(capture / "camera-intrinsics.txt")
+    camera = Camera("PINHOLE", 640, 480, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+    return replace(frame, camera=camera, world_from_cam=frame.world_from_cam @ np.linalg.inv(DEPTH_FROM_COLOUR))
 
 
 def kitchen_truth(frame: Frame, capture: Path) -> np.ndarray:
@@ -188,7 +208,8 @@ def main(
     chosen = [test[index] for index in np.unique(np.linspace(0, len(test) - 1, views).round().astype(int))]
     whole = [desk_truth(frame) if folder is None else kitchen_truth(frame, folder) for frame in chosen]
     truths = [truth[::STRIDE, ::STRIDE] for truth in whole]
-    maps = [depths(model, frame, min_opacity=min_opacity) for frame in chosen]
+    looks = chosen if folder is None else [kitchen_depth_view(frame, folder) for frame in chosen]
+    maps = [depths(model, look, min_opacity=min_opacity) for look in looks]
     rows = measure(maps, truths)
     for frame, one, truth in zip(chosen, maps, truths, strict=True):
         assert frame.image is not None
