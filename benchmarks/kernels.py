@@ -74,7 +74,7 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
     begin, finish = torch.rand(2, rays, 1, 3, generator=generator)
     along = ((torch.arange(SAMPLES_PER_RAY) + 0.5) / SAMPLES_PER_RAY)[None, :, None]
     points = (begin + (finish - begin) * along).reshape(-1, 3)[:samples].contiguous()
-    field = HashField(HashFieldSettings(unbounded=False, log2_rows=log2_rows))
+    field = HashField(HashFieldSettings(contraction="none", log2_rows=log2_rows))
     table = torch.randn(field.table.shape, generator=generator) * 0.1
     resolutions = field.settings.resolutions
     yield Operation(
@@ -106,7 +106,7 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
     axis = torch.tensor([0.0, 0.0, 1.0]).expand(rays, 3)
     marching = {
         "occupied": torch.ones(64, 64, 64, dtype=torch.bool),
-        "unbounded": False,
+        "contraction": "none",
         "resolutions": resolutions,
         "deepest": 1e9,
     }

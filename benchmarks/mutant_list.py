@@ -242,7 +242,7 @@ GROUPS: tuple[Group, ...] = (
         "visible",
         (),
         (
-            Mutant("(8.0 if unbounded else 4.0)", "(80.0 if unbounded else 40.0)"),
+            Mutant("(4.0 if contraction == 0 else 7.8)", "(40.0 if contraction == 0 else 78.0)"),
             Mutant("if lane_depth[lane] < deepest:", "if lane_depth[lane] < 2 * deepest:"),
             Mutant("near[max(z - 1, 0) : z + 2, ", "near[z : z + 1, "),
             Mutant("past = i + 1", "past = i"),

@@ -24,9 +24,9 @@ from nerfcli import kernels, scene
 from nerfcli.field.cost import optimiser_bytes, parameter_bytes, work
 from nerfcli.field.kinds import KINDS
 from nerfcli.render.model import Model
+from nerfcli.train.extent import choose_extent
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.heldout import HeldoutPixels
-from nerfcli.train.normalisation import training_frame
 from nerfcli.train.photos import PixelPool, load_photos
 from nerfcli.train.settings import TrainSettings, automatic_downscale
 
@@ -64,8 +64,10 @@ class Capture:
         first = capture.train_frames[0].camera
         factor = automatic_downscale(first.width, first.height)
         photos = load_photos(capture.train_frames, factor=factor, threads=threads)
-        self.unbounded = not all(photo.pixels.shape[-1] == 4 for photo in photos)
-        self.similarity, self.marching = training_frame(capture, unbounded=self.unbounded)
+        fills_frame = any(photo.pixels.shape[-1] == 3 for photo in photos)
+        settings = TrainSettings(threads=threads)
+        self.extent = choose_extent(capture, photos, settings, fills_frame=fills_frame, notify=print)
+        self.similarity = self.extent.training_from_scene
         self.pool = PixelPool(photos, self.similarity, torch.device("cpu"))
         test_photos = load_photos(capture.test_frames, factor=factor, threads=threads)
         self.heldout = HeldoutPixels(
@@ -88,14 +90,14 @@ def measure(capture: Capture, kind: str, *, megabytes: float, seconds: float, th
         first_samples_per_step=min(samples, TrainSettings.first_samples_per_step),
         samples_per_step=samples,
     )
-    fitting = Fitting(capture.pool, capture.marching, unbounded=capture.unbounded, settings=settings)
+    fitting = Fitting(capture.pool, capture.extent.marching, contraction=capture.extent.contraction, settings=settings)
     budget, taken = seconds * threads, 0
     clock, began = time.perf_counter(), time.process_time()
     while (used := time.process_time() - began) < budget:
         taken += fitting.advance(used / budget).samples
     clock = time.perf_counter() - clock
     model = Model(
-        fitting.field, fitting.occupied, capture.marching, capture.background, capture.similarity, "arbitrary"
+        fitting.field, fitting.occupied, capture.extent.marching, capture.background, capture.similarity, "arbitrary"
     )
     rendering = time.process_time()
     psnr = capture.heldout.psnr(model)

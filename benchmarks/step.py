@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels, scene
+from nerfcli.train.extent import choose_extent
 from nerfcli.train.fitting import Fitting
-from nerfcli.train.normalisation import training_frame
 from nerfcli.train.photos import PixelPool, load_photos
 from nerfcli.train.settings import TrainSettings, automatic_downscale
 
@@ -32,11 +32,11 @@ def trained(folder: Path, seconds: float, threads: int) -> Fitting:
     first = capture.train_frames[0].camera
     factor = automatic_downscale(first.width, first.height)
     photos = load_photos(capture.train_frames, factor=factor, threads=threads)
-    unbounded = not all(photo.pixels.shape[-1] == 4 for photo in photos)
-    similarity, marching = training_frame(capture, unbounded=unbounded)
     settings = TrainSettings(budget_seconds=seconds, threads=threads)
-    pool = PixelPool(photos, similarity, torch.device("cpu"))
-    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings)
+    fills_frame = any(photo.pixels.shape[-1] == 3 for photo in photos)
+    extent = choose_extent(capture, photos, settings, fills_frame=fills_frame, notify=print)
+    pool = PixelPool(photos, extent.training_from_scene, torch.device("cpu"))
+    fitting = Fitting(pool, extent.marching, contraction=extent.contraction, settings=settings)
     began = time.perf_counter()
     while (share := (time.perf_counter() - began) / seconds) < 1.0:
         fitting.advance(share)

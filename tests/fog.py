@@ -14,7 +14,7 @@ from nerfcli.render.model import Marching, Model
 # Rays are cut into steps of this length; a border of the fog is seen at most half a step off.
 STEP = 1 / 256
 SIDE = 16
-TINY = HashFieldSettings(unbounded=False, levels=2, log2_rows=8, coarsest=4, finest=16, width=16)
+TINY = HashFieldSettings(contraction="none", levels=2, log2_rows=8, coarsest=4, finest=16, width=16)
 
 
 def foggy_cells(low: tuple[float, float, float], high: tuple[float, float, float]) -> Tensor:

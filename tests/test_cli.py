@@ -34,7 +34,7 @@ from nerfcli.media.images import read_image
 from nerfcli.render.model import save_model
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
-from nerfcli.train.normalisation import training_frame
+from nerfcli.train.normalisation import object_frame
 from nerfcli.train.run_folder import append_log, describe_run, write_cameras
 from nerfcli.train.settings import TrainSettings
 
@@ -95,9 +95,9 @@ def finished(capture: Path) -> Path:
     run = capture.with_name("spheres-run")
     loaded = scene.load(capture)
     settings = TrainSettings(budget_seconds=None, steps=7)
-    similarity, _ = training_frame(loaded, unbounded=False)
+    similarity, _ = object_frame(loaded)
     run.mkdir()
-    write_json(run / "config.json", describe_run(loaded, settings, 8))
+    write_json(run / "config.json", describe_run(loaded, settings, factor=8, contraction="none"))
     write_cameras(run, loaded.train_frames, loaded.test_frames)
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     save_model(run / "field.safetensors", fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32))
@@ -764,6 +764,42 @@ def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(capture):
     assert f"go on with: nerfcli train {shlex.quote(str(capture))} -o {shlex.quote(str(run))} --resume" in stderr
     assert {path.name for path in run.iterdir()} >= {"config.json", "field.safetensors", "state.safetensors"}
     assert not list(run.rglob("*partial*"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="a terminal is made with the pty module")
+def test_ctrl_c_on_a_terminal_leaves_no_process_and_no_half_file(finished, tmp_path):
+    """All processes of --jobs get the signal from the terminal, not the command alone."""
+    ours, theirs = os.openpty()
+    program = "import os; os.open(os.ttyname(0), os.O_RDWR); from nerfcli.cli import main; main()"  # takes the terminal
+    words = ("render", finished, "--cameras", "orbit", "--count", "2000", "--max-size", "64", "--jobs", "2", "--quiet")
+    command = [sys.executable, "-c", program, *map(str, words), "-o", str(tmp_path / "out")]
+    process = subprocess.Popen(
+        command, stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    os.close(theirs)
+    deadline = time.monotonic() + 240
+    while not list(tmp_path.glob(".out.*/.frames/done/*.json")) and time.monotonic() < deadline:
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.write(ours, b"\x03")
+    stdout, stderr = process.communicate(timeout=120)
+    assert (process.returncode, stdout) == (INTERRUPTED, ""), stderr
+    assert "Traceback" not in stderr
+    while _group_lives(process.pid) and time.monotonic() < deadline:  # multiprocessing's own process ends by itself
+        time.sleep(0.05)
+    assert not _group_lives(process.pid)
+    assert not list(tmp_path.rglob("*partial*"))
+    assert not (tmp_path / "out").exists()
+    os.close(ours)
+
+
+def _group_lives(leader: int) -> bool:
+    try:
+        os.killpg(leader, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 def test_errors_and_results_go_to_their_own_streams(tmp_path):

@@ -73,11 +73,11 @@ def test_a_field_of_low_degree_sees_only_its_harmonics(degree):
 
 
 def test_without_view_dependence_a_colour_is_the_same_from_everywhere():
-    field = HashField(HashFieldSettings(unbounded=False, log2_rows=4, view_degree=0))
+    field = HashField(HashFieldSettings(contraction="none", log2_rows=4, view_degree=0))
     points, directions = torch.rand(5, 3), torch.nn.functional.normalize(torch.randn(2, 3), dim=-1)
     first, second = (field.radiance(points, directions, torch.full((5,), ray))[1] for ray in (0, 1))
     assert torch.equal(first, second)
-    seen = HashField(HashFieldSettings(unbounded=False, log2_rows=4))
+    seen = HashField(HashFieldSettings(contraction="none", log2_rows=4))
     first, second = (seen.radiance(points, directions, torch.full((5,), ray))[1] for ray in (0, 1))
     assert (first != second).any()
 

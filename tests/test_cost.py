@@ -18,13 +18,13 @@ from nerfcli.field.sizes import chosen_size
 from nerfcli.field.voxel_field import VoxelFieldSettings
 from nerfcli.train.optimiser import FieldOptimiser
 
-HASH = HashFieldSettings(unbounded=False)
+HASH = HashFieldSettings(contraction="none")
 SEVERAL: list[FieldSettings] = [
     replace(HASH, log2_rows=8),
     replace(HASH, log2_rows=6, levels=3, width=16),
-    VoxelFieldSettings(unbounded=True, view_degree=2, log2_vertices=9),
-    VoxelFieldSettings(unbounded=True, view_degree=0, log2_vertices=9),
-    FourierFieldSettings(unbounded=False, octaves=4, width=24, layers=3),
+    VoxelFieldSettings(contraction="l2", view_degree=2, log2_vertices=9),
+    VoxelFieldSettings(contraction="l2", view_degree=0, log2_vertices=9),
+    FourierFieldSettings(contraction="none", octaves=4, width=24, layers=3),
 ]
 MIB = 2**20
 
@@ -43,7 +43,7 @@ def test_bytes_are_those_of_the_module_and_of_its_optimiser(settings):
 
 
 def test_operations_of_the_network_are_those_that_torch_counts():
-    settings = FourierFieldSettings(unbounded=False, octaves=4, width=24, layers=3)
+    settings = FourierFieldSettings(contraction="none", octaves=4, width=24, layers=3)
     field, samples = FourierField(settings), 100
     with FlopCounterMode(display=False) as density:
         field.density(torch.rand(samples, 3))
@@ -73,7 +73,7 @@ def test_the_default_hash_grid_by_hand():
 
 def test_dense_grids_by_the_worked_example():
     """A 128^3 grid: 8 MiB for one number, 32 MiB for density and colour; twice the side is eight times as much."""
-    grey = VoxelFieldSettings(unbounded=False, view_degree=0, log2_vertices=21)
+    grey = VoxelFieldSettings(contraction="none", view_degree=0, log2_vertices=21)
     assert grey.resolution == 127  # between 128^3 vertices
     assert parameter_bytes(work(grey).parameters) == dense_grid_bytes(128, 4) == 32 * MIB
     assert work(replace(grey, log2_vertices=24)).parameters == 8 * work(grey).parameters
@@ -112,11 +112,11 @@ def test_the_chosen_size_is_the_largest_that_fits(kind, megabytes):
     assert parameter_bytes(work(larger).parameters) > 1.07 * memory
 
 
-@pytest.mark.parametrize("unbounded", [False, True])
-def test_nothing_is_finer_than_a_pixel(unbounded):
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
+def test_nothing_is_finer_than_a_pixel(contraction):
     """A pixel covers 1/100 of the training frame's unit: 200 cells across [-1, 1], 400 across the contracted ball."""
-    cells = 400 if unbounded else 200
-    template = replace(HASH, unbounded=unbounded)
+    cells = 200 if contraction == "none" else 400
+    template = replace(HASH, contraction=contraction)
     sizes = {kind: chosen_size(kind, hash_grid=template, footprint=0.01, memory_bytes=2**34) for kind in KINDS[1:]}
     assert isinstance(sizes["voxels"], VoxelFieldSettings)
     assert cells / 2 ** (1 / 3) < sizes["voxels"].resolution + 1 <= cells + 1
@@ -130,11 +130,11 @@ def test_memory_that_holds_no_field_is_told():
 
 
 def test_others_of_equal_storage_are_not_larger():
-    for settings in (HASH, VoxelFieldSettings(unbounded=True, view_degree=2), FourierFieldSettings(unbounded=True)):
+    for settings in (HASH, VoxelFieldSettings(contraction="l2", view_degree=2), FourierFieldSettings(contraction="l2")):
         others = others_of_equal_storage(settings, 1 / 300)
         assert set(others) == set(KINDS) - {settings.kind}
         for other in others.values():
             assert work(other).parameters <= 1.07 * work(settings).parameters
     # Nothing else is as small as this network.
-    tiny = FourierFieldSettings(unbounded=False, octaves=4, width=16, layers=1)
+    tiny = FourierFieldSettings(contraction="none", octaves=4, width=16, layers=1)
     assert set(others_of_equal_storage(tiny, 1 / 300)) == set()

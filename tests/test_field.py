@@ -1,6 +1,7 @@
 """Encodings, activations and the field: closed forms, SciPy, quadrature; what stands on disk comes back bit for bit."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,14 +13,14 @@ from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity, rotation_from_quaternion
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.field.contraction import training_points, uncontract
+from nerfcli.field.contraction import training_points, uncontract, uncontract_from_cube
 from nerfcli.field.cost import field_bytes
 from nerfcli.field.encodings import fourier_features, spherical_harmonics
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log
 from nerfcli.render.model import Marching, Model, load_model, save_model
 
-TINY = HashFieldSettings(unbounded=False, levels=3, log2_rows=8, coarsest=4, finest=32, width=16)
+TINY = HashFieldSettings(contraction="none", levels=3, log2_rows=8, coarsest=4, finest=32, width=16)
 
 
 def directions_of(polar: np.ndarray, azimuth: np.ndarray) -> torch.Tensor:
@@ -99,20 +100,55 @@ def test_uncontract_is_the_inverse_of_contract_across_magnitudes():
     assert uncontract(torch.tensor([[2.0, 2.0, 2.0]])).norm().item() == pytest.approx(1e6, rel=1e-6)
 
 
-@pytest.mark.parametrize("unbounded", [False, True])
-def test_grid_coordinates_and_back(unbounded):
+def test_contraction_to_a_cube_keeps_the_inside_and_brings_infinity_to_its_faces():
+    """Against a loop over single numbers, from 1e-12 to 1e30, and back."""
+    g = torch.Generator().manual_seed(0)
+    directions = torch.rand(400, 3, generator=g, dtype=torch.float64) * 2 - 1
+    points = directions * torch.logspace(-12, 5, 400, dtype=torch.float64)[:, None]
+    contracted = kernels.contract_to_cube(points)
+    for point, actual in zip(points.tolist(), contracted.tolist(), strict=True):
+        largest = max(map(abs, point))
+        expected = point if largest <= 1 else [(2 - 1 / largest) * x / largest for x in point]
+        assert actual == pytest.approx(expected, rel=1e-14)
+    torch.testing.assert_close(uncontract_from_cube(contracted), points, rtol=1e-9, atol=0)
+    assert torch.equal(kernels.contract_to_cube(torch.tensor([[1e38, 0.0, -1e37]])), torch.tensor([[2.0, 0.0, -0.2]]))
+    assert uncontract_from_cube(torch.tensor([[2.0, 1.0, -2.0]])).tolist() == [[1e6, 5e5, -1e6]]
+
+
+def test_contraction_to_a_cube_has_the_gradient_of_its_formula():
+    g = torch.Generator().manual_seed(0)
+    points = (
+        torch.randn(60, 3, generator=g, dtype=torch.float64) * torch.logspace(-2, 2, 60, dtype=torch.float64)[:, None]
+    )
+    assert torch.autograd.gradcheck(kernels.contract_to_cube, points.requires_grad_())
+    # Coordinates move by no more than the kernel that steps over empty space counts on.
+    for contraction, most in (("l2", 0.25), ("linf", 0.25 * 1.025)):
+        near = points.detach() + 1e-6 * torch.randn(60, 3, generator=g, dtype=torch.float64)
+        moved = kernels.grid_coordinates(near, contraction) - kernels.grid_coordinates(points.detach(), contraction)
+        assert (moved.abs().amax(-1) <= most * (near - points.detach()).norm(dim=-1) * (1 + 1e-6)).all()
+
+
+def test_an_unknown_contraction_is_refused():
+    with pytest.raises(ValueError, match="contraction must be one of"):
+        kernels.grid_coordinates(torch.zeros(1, 3), "l1")
+
+
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
+def test_grid_coordinates_and_back(contraction):
     g = torch.Generator().manual_seed(0)
     points = torch.rand(100, 3, generator=g, dtype=torch.float64) * 2 - 1
-    there = kernels.grid_coordinates(points, unbounded)
+    there = kernels.grid_coordinates(points, contraction)
     assert (there >= 0).all()
     assert (there <= 1).all()
-    torch.testing.assert_close(training_points(there, unbounded), points, rtol=0, atol=1e-14)
+    torch.testing.assert_close(training_points(there, contraction), points, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 @pytest.mark.parametrize("count", [0, 1, 123])
-def test_field_shapes_and_ranges(unbounded, count):
-    field = HashField(HashFieldSettings(unbounded=unbounded, levels=3, log2_rows=8, coarsest=4, finest=32, width=16))
+def test_field_shapes_and_ranges(contraction, count):
+    field = HashField(
+        HashFieldSettings(contraction=contraction, levels=3, log2_rows=8, coarsest=4, finest=32, width=16)
+    )
     g = torch.Generator().manual_seed(0)
     coordinates = torch.rand(count, 3, generator=g)
     directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=g), dim=-1)
@@ -126,7 +162,7 @@ def test_field_shapes_and_ranges(unbounded, count):
 
 def test_a_fresh_field_is_a_thin_grey_fog():
     torch.manual_seed(0)
-    field = HashField(HashFieldSettings(unbounded=True, log2_rows=12))
+    field = HashField(HashFieldSettings(contraction="l2", log2_rows=12))
     g = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=g), dim=-1)
     density, rgb = field.radiance(torch.rand(1000, 3, generator=g), directions, torch.arange(1000))
@@ -136,9 +172,9 @@ def test_a_fresh_field_is_a_thin_grey_fog():
 
 
 def test_resolutions_run_from_coarsest_to_finest_in_geometric_progression():
-    sides = HashFieldSettings(unbounded=False, levels=5, coarsest=16, finest=256).resolutions
+    sides = HashFieldSettings(contraction="none", levels=5, coarsest=16, finest=256).resolutions
     assert sides == (16, 32, 64, 128, 256)
-    assert HashFieldSettings(unbounded=False, levels=1, coarsest=16).resolutions == (16,)
+    assert HashFieldSettings(contraction="none", levels=1, coarsest=16).resolutions == (16,)
 
 
 def test_field_bytes_are_those_of_the_checkpoint():
@@ -223,10 +259,26 @@ def test_model_round_trip_is_bit_exact(tmp_path):
     np.testing.assert_array_equal(loaded.training_from_scene.translation, model.training_from_scene.translation)
 
 
+@pytest.mark.parametrize(("unbounded", "contraction"), [(True, "l2"), (False, "none")])
+def test_fields_of_the_format_before_contractions_are_read(tmp_path, unbounded, contraction):
+    path = tmp_path / "field.safetensors"
+    similarity = Similarity.identity()
+    field = HashField(replace(TINY, contraction=contraction))
+    model = Model(field, torch.ones(2, 2, 2, dtype=torch.bool), Marching(0.1, 2.0, 0.1, 0.0), (0, 0, 0), similarity, "")
+    save_model(path, model)
+    tensors, description = load_tensors(path, "cpu")
+    del description["field"]["contraction"]
+    description["field"]["unbounded"] = unbounded
+    save_tensors(path, tensors, {**description, "format": "nerfcli field 1"})
+    loaded = load_model(path, "cpu")
+    assert loaded.contraction == contraction
+    assert torch.equal(loaded.field.state_dict()["table"], field.table)
+
+
 def test_model_of_another_format_is_named(tmp_path):
     path = tmp_path / "state.safetensors"
     save_tensors(path, {"a": torch.zeros(1)}, {"format": "another field 9"})
-    with pytest.raises(UserError, match="holds 'another field 9', expected 'nerfcli field 1'"):
+    with pytest.raises(UserError, match="holds 'another field 9', expected 'nerfcli field 2'"):
         load_model(path, "cpu")
 
 

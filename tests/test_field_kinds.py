@@ -23,9 +23,9 @@ from nerfcli.render.model import Marching, Model, load_model, save_model
 from nerfcli.train.optimiser import FieldOptimiser
 
 SMALL: dict[str, FieldSettings] = {
-    "hash": HashFieldSettings(unbounded=False, log2_rows=8, coarsest=4, finest=32),
-    "voxels": VoxelFieldSettings(unbounded=False, view_degree=2, log2_vertices=9),
-    "mlp": FourierFieldSettings(unbounded=False, octaves=4, width=16, layers=2),
+    "hash": HashFieldSettings(contraction="none", log2_rows=8, coarsest=4, finest=32),
+    "voxels": VoxelFieldSettings(contraction="none", view_degree=2, log2_vertices=9),
+    "mlp": FourierFieldSettings(contraction="none", octaves=4, width=16, layers=2),
 }
 
 
@@ -58,7 +58,7 @@ def test_every_kind_is_made_here():
 def test_the_dense_grid_interpolates_as_scipy_does(dtype):
     """Log density and harmonics, by scipy.ndimage.map_coordinates of order 1, borders included."""
     torch.manual_seed(0)
-    settings = VoxelFieldSettings(unbounded=False, view_degree=1, log2_vertices=10)
+    settings = VoxelFieldSettings(contraction="none", view_degree=1, log2_vertices=10)
     field = VoxelField(settings).to(dtype)
     with torch.no_grad():
         field.table.normal_()
@@ -87,7 +87,7 @@ def test_the_dense_grid_interpolates_as_scipy_does(dtype):
 def test_the_dense_grid_has_as_many_cells_as_fit():
     # The cube of vertices fits into the power of two, and the next larger one does not.
     for log2_vertices in range(6, 28):
-        side = VoxelFieldSettings(unbounded=False, log2_vertices=log2_vertices).resolution + 1
+        side = VoxelFieldSettings(contraction="none", log2_vertices=log2_vertices).resolution + 1
         assert side**3 <= 2**log2_vertices < (side + 1) ** 3
 
 
@@ -104,7 +104,7 @@ def test_fourier_features_of_a_line_have_one_frequency_each():
 
 def test_the_network_field_is_its_formula():
     torch.manual_seed(0)
-    field = FourierField(FourierFieldSettings(unbounded=False, octaves=3, width=8, layers=2)).double()
+    field = FourierField(FourierFieldSettings(contraction="none", octaves=3, width=8, layers=2)).double()
     coordinates, directions = places(20, torch.float64), looks(4, torch.float64)
     rays = torch.arange(20) // 5
     numbers = {name: value.detach().numpy() for name, value in field.named_parameters()}
@@ -148,12 +148,12 @@ class _Radiance(torch.nn.Module):
         return self.field.radiance(*asked)
 
 
-@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_visible_samples_are_the_definition(kind, unbounded):
+def test_visible_samples_are_the_definition(kind, contraction):
     """Marched by the reference, with the field's own density, and cut where the optical depth reaches the limit."""
     torch.manual_seed(0)
-    field = fresh_field(replace(SMALL[kind], unbounded=unbounded))
+    field = fresh_field(replace(SMALL[kind], contraction=contraction))
     rows = field.rows()
     if rows is not None:
         with torch.no_grad():
@@ -169,7 +169,7 @@ def test_visible_samples_are_the_definition(kind, unbounded):
         deepest = 0.3 * float(kernels.sum_along_rays(depths, everything.offsets).median())
         samples = field.visible_samples(origins, directions, edges, jitter=jitter, occupied=occupied, deepest=deepest)
         starts, ends, offsets = kernels.reference.march(
-            origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded
+            origins, directions, edges, jitter=jitter, occupied=occupied, contraction=contraction
         )
         kept = []
         for ray in range(17):
@@ -178,7 +178,7 @@ def test_visible_samples_are_the_definition(kind, unbounded):
                 if depth >= deepest:
                     break
                 point = origins[ray] + directions[ray] * (starts[i] + ends[i]) / 2
-                at = kernels.grid_coordinates(point[None], unbounded)
+                at = kernels.grid_coordinates(point[None], contraction)
                 density = float(field.density(at))
                 kept.append((ray, float(starts[i]), float(ends[i]), density))
                 depth += density * float(ends[i] - starts[i])
@@ -192,14 +192,14 @@ def test_visible_samples_are_the_definition(kind, unbounded):
 
 
 @pytest.mark.parametrize("sizes", [(0, 9), (1, 9), (5, 3), (123, 40)])
-@pytest.mark.parametrize("unbounded", [False, True])
-def test_compiled_marching_is_the_reference(sizes, unbounded):
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
+def test_compiled_marching_is_the_reference(sizes, contraction):
     rays, intervals = sizes
     g = torch.Generator().manual_seed(rays)
     directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=g), dim=-1)
     origins, jitter = torch.randn(rays, 3, generator=g), torch.rand(rays, generator=g)
     edges, occupied = torch.linspace(0.1, 5.0, intervals + 2), torch.rand(6, 6, 6, generator=g) > 0.5
-    arguments = {"jitter": jitter, "occupied": occupied, "unbounded": unbounded}
+    arguments = {"jitter": jitter, "occupied": occupied, "contraction": contraction}
     fast = kernels.occupied_samples(origins, directions, edges, **arguments)
     slow = kernels.marching.occupied_samples(origins, directions, edges, **arguments)
     assert torch.equal(fast[3], slow[3])
@@ -294,5 +294,5 @@ def test_a_field_from_before_there_were_kinds_is_a_hash_grid(tmp_path):
 
 def test_a_kind_of_a_later_version_is_told():
     with pytest.raises(UserError, match="fields of the kind 'gaussians' are not known here") as caught:
-        settings_from_json({"kind": "gaussians", "unbounded": True})
+        settings_from_json({"kind": "gaussians", "contraction": "l2"})
     assert caught.value.exit_code == BAD_INPUT

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from nerfcli import kernels
 from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
@@ -198,10 +199,10 @@ def test_ray_indices(samples, generator):
 
 
 @pytest.mark.parametrize("rays", [0, 1, 5, 123, 700])
-@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 # Thin fog lets every ray through; at 8 the densities reach e^15, and some rays end in their first sample.
 @pytest.mark.parametrize("contrast", [0.0, 1.0, 8.0])
-def test_visible_samples(rays, unbounded, contrast, generator):
+def test_visible_samples(rays, contraction, contrast, generator):
     origins = torch.randn(rays, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
     edges = torch.rand(60, generator=generator).cumsum(0) * 0.2
@@ -210,7 +211,7 @@ def test_visible_samples(rays, unbounded, contrast, generator):
     settings = {
         "jitter": torch.rand(rays, generator=generator),
         "occupied": occupied,
-        "unbounded": unbounded,
+        "contraction": contraction,
         "table": torch.randn(8, 256, 4, generator=generator) * contrast,
         "resolutions": (4, 5, 6, 7, 9, 11, 13, 16),
         "weights": weights,
@@ -230,9 +231,9 @@ def test_visible_samples(rays, unbounded, contrast, generator):
 
 
 @pytest.mark.parametrize("side", [30, 64])
-@pytest.mark.parametrize("unbounded", [False, True])
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 @pytest.mark.parametrize("steps", [2000, 150, 20])
-def test_visible_samples_misses_no_lonely_cell(side, unbounded, steps, generator):
+def test_visible_samples_misses_no_lonely_cell(side, contraction, steps, generator):
     # Nearly all blocks of cells are empty and stepped over as a whole; steps from within a block to many blocks long.
     # A side of 30 leaves a narrow last block. Against the reference, which looks at every step.
     rays = 300 if steps > 20 else 3000
@@ -241,7 +242,7 @@ def test_visible_samples_misses_no_lonely_cell(side, unbounded, steps, generator
     settings = {
         "jitter": torch.rand(rays, generator=generator),
         "occupied": torch.rand(side, side, side, generator=generator) < 0.002,
-        "unbounded": unbounded,
+        "contraction": contraction,
         "table": torch.zeros(8, 16, 4),
         "resolutions": (2,) * 8,
         "weights": tuple(torch.zeros(shape) for shape in WEIGHTS),
@@ -267,7 +268,7 @@ def test_visible_samples_holds_many_rays_of_many_samples(generator):
         edges,
         jitter=torch.zeros(rays),
         occupied=torch.ones(2, 2, 2, dtype=torch.bool),
-        unbounded=False,
+        contraction="none",
         table=torch.zeros(8, 16, 4),
         resolutions=(2,) * 8,
         weights=tuple(torch.zeros(shape) for shape in WEIGHTS),

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles import march_through_slabs, trilinear_hash
 
+from nerfcli import kernels
 from nerfcli.field.contraction import training_points, uncontract
 from nerfcli.kernels import reference
 
@@ -206,10 +207,10 @@ def test_hash_encode_says_what_is_wrong():
 def test_contraction_leaves_the_unit_ball_and_bounds_the_rest():
     g = torch.Generator().manual_seed(0)
     inside = torch.nn.functional.normalize(torch.randn(50, 3, generator=g, dtype=torch.float64), dim=-1) * 0.999
-    assert torch.equal(reference.contract(inside), inside)
+    assert torch.equal(kernels.contract(inside), inside)
     directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=g, dtype=torch.float64), dim=-1)
     for radius in (1.0, 2.0, 1e3, 1e10):
-        contracted = reference.contract(directions * radius)
+        contracted = kernels.contract(directions * radius)
         torch.testing.assert_close(contracted, directions * (2 - 1 / radius), rtol=1e-12, atol=0)
 
 
@@ -218,17 +219,17 @@ def test_contraction_round_trip(seed, log_radius):
     g = torch.Generator().manual_seed(seed)
     point = torch.nn.functional.normalize(torch.randn(1, 3, generator=g, dtype=torch.float64), dim=-1)
     point = point * 10**log_radius
-    back = uncontract(reference.contract(point))
+    back = uncontract(kernels.contract(point))
     torch.testing.assert_close(back, point, rtol=1e-12 * max(1.0, 10**log_radius), atol=0)
-    for unbounded in (False, True):
-        again = training_points(reference.grid_coordinates(point, unbounded), unbounded)
+    for contraction in kernels.CONTRACTIONS:
+        again = training_points(kernels.grid_coordinates(point, contraction), contraction)
         torch.testing.assert_close(again, point, rtol=1e-11 * max(1.0, 10**log_radius), atol=1e-15)
 
 
 @pytest.mark.parametrize("radius", [0.0, 1e-20, 1.0, 1e10])
 def test_contraction_gradient_is_finite(radius):
     point = torch.tensor([[radius, 0.0, 0.0]], requires_grad=True)
-    (gradient,) = torch.autograd.grad(reference.contract(point).sum(), point)
+    (gradient,) = torch.autograd.grad(kernels.contract(point).sum(), point)
     assert torch.isfinite(gradient).all()
     assert gradient.abs().max() <= 1.0
 
@@ -244,7 +245,7 @@ def test_march_keeps_what_is_occupied():
         edges,
         jitter=torch.tensor([0.25, 0.25], dtype=torch.float64),
         occupied=occupied,
-        unbounded=False,
+        contraction="none",
     )
     middles = (starts + ends) / 2 - 1.5
     assert offsets.tolist() == [0, len(starts), len(starts)]  # the second ray misses the cube
@@ -264,7 +265,7 @@ def test_march_with_everything_occupied_covers_the_ray():
         edges,
         jitter=torch.zeros(1, dtype=torch.float64),
         occupied=torch.ones(2, 2, 2, dtype=torch.bool),
-        unbounded=True,
+        contraction="l2",
     )
     assert offsets.tolist() == [0, 4]
     torch.testing.assert_close(starts, edges[:4])

@@ -322,7 +322,7 @@ def test_photos_without_alpha_train_an_unbounded_scene(spheres, tmp_path):
     scene = replace(spheres, frames=tuple(frames), test_names=frozenset())
     fit(scene, tmp_path / "run", replace(FEW, steps=2))
     model = load_model(tmp_path / "run" / "field.safetensors", "cpu")
-    assert model.field.settings.unbounded
+    assert model.contraction == "l2"
     assert model.marching.far > 100
     picture = render_picture(model, frames[0], background=model.background)
     assert np.isfinite(picture.rgb).all()

@@ -18,7 +18,7 @@ from nerfcli.memory import resident_bytes
 from nerfcli.render.rays import frame_rays
 from nerfcli.scene import Scene
 from nerfcli.train.losses import colour_loss, over_background
-from nerfcli.train.normalisation import training_frame
+from nerfcli.train.normalisation import box_frame, contracted_frame, object_frame
 from nerfcli.train.photos import Album, Photo, PixelPool, downscaled_camera, load_album, load_photos
 from nerfcli.train.room import IN_MEMORY, InFiles, Needs, Room, room_for
 
@@ -56,7 +56,7 @@ def training_centres(scene: Scene, similarity: Similarity) -> np.ndarray:
 
 def test_unbounded_scenes_are_centred_where_cameras_look_and_reach_to_the_median_camera():
     scene = scene_of(ring())
-    similarity, marching = training_frame(scene, unbounded=True)
+    similarity, marching = contracted_frame(scene)
     np.testing.assert_allclose(similarity.apply(np.array([1.0, 2.0, 3.0])), 0, atol=1e-9)
     distances = np.linalg.norm(training_centres(scene, similarity), axis=1)
     assert np.median(distances) == pytest.approx(1, abs=1e-9)
@@ -66,7 +66,7 @@ def test_unbounded_scenes_are_centred_where_cameras_look_and_reach_to_the_median
 
 def test_bounded_scenes_are_as_wide_as_the_widest_picture():
     scene = scene_of(ring())
-    similarity, marching = training_frame(scene, unbounded=False)
+    similarity, marching = object_frame(scene)
     centres = training_centres(scene, similarity)
     distances = np.linalg.norm(centres, axis=1)
     half_width = distances * math.tan(math.radians(max(CAMERA.fov_deg)) / 2)
@@ -78,12 +78,12 @@ def test_bounded_scenes_are_as_wide_as_the_widest_picture():
     assert marching.near <= to_corners.min()
 
 
-@pytest.mark.parametrize("unbounded", [True, False])
-def test_the_training_frame_can_be_undone_and_does_not_depend_on_where_the_capture_lies(unbounded):
+@pytest.mark.parametrize("frame_of", [contracted_frame, object_frame])
+def test_the_training_frame_can_be_undone_and_does_not_depend_on_where_the_capture_lies(frame_of):
     points = np.random.default_rng(0).normal((1, 2, 3), size=(50, 3))
     here, there = scene_of(ring(), points), scene_of(ring(moved=MOVED), MOVED.apply(points))
-    first, marching = training_frame(here, unbounded=unbounded)
-    second, marching_there = training_frame(there, unbounded=unbounded)
+    first, marching = frame_of(here)
+    second, marching_there = frame_of(there)
     np.testing.assert_allclose(first.inverse().apply(first.apply(points)), points, atol=1e-12)
     np.testing.assert_allclose(second.inverse().apply(second.apply(there.points)), there.points, rtol=1e-12)
     # Up to a rotation, which the normalisation leaves alone, the two training frames are the same.
@@ -93,12 +93,48 @@ def test_the_training_frame_can_be_undone_and_does_not_depend_on_where_the_captu
         assert getattr(marching_there, name) == pytest.approx(getattr(marching, name), rel=1e-8)
 
 
+def test_the_unit_ball_reaches_what_cameras_see_where_it_is_behind_them():
+    """Walls at 10 about cameras at 3 and 6 from the middle: their median depths are about 13 and 16."""
+    directions = np.random.default_rng(0).normal(size=(20000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    middle = np.array([1.0, 2.0, 3.0])
+    walls = middle + 10 * directions
+    radius = 1 / contracted_frame(scene_of(ring(), walls))[0].scale
+    assert radius == pytest.approx(0.75 * 14.5, rel=0.05)
+    # A few wrong points far away change little, too few tell nothing.
+    stray = np.concatenate([walls, middle + 1e6 * directions[:500]])
+    assert 1 / contracted_frame(scene_of(ring(), stray))[0].scale == pytest.approx(radius, rel=0.02)
+    assert 1 / contracted_frame(scene_of(ring(), walls[:20]))[0].scale == pytest.approx(4.5, rel=1e-9)
+    # What the cameras stand around is before them and changes nothing.
+    assert 1 / contracted_frame(scene_of(ring(), middle + directions))[0].scale == pytest.approx(4.5, rel=1e-9)
+
+
+def test_a_box_holds_the_points_but_for_stray_ones():
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-1, 0, 5), (5, 2, 8), (5000, 3))
+    scene = scene_of(ring(), np.concatenate([points, rng.normal(0, 1e4, (20, 3))]))
+    similarity, marching = box_frame(scene)
+    inside = np.abs(similarity.apply(points))
+    assert inside.max() < 1
+    assert inside[:, 0].max() > 0.88  # the longest side fills the cube
+    for frame in scene.frames:
+        distances = np.linalg.norm(similarity.apply(points) - similarity.apply(frame.centre), axis=1)
+        assert (distances < marching.far).all()
+        assert (distances > marching.near).all()
+
+
+def test_a_box_needs_points():
+    with pytest.raises(UserError, match="3 points, which do not tell where the scene ends") as caught:
+        box_frame(scene_of(ring(), np.zeros((3, 3))))
+    assert "--contraction l2" in caught.value.hint
+
+
 def test_near_is_before_what_the_cameras_see():
     # Points on a ball of radius 2 about the focus; the nearest of what each camera sees is 1 or more away.
     normals = np.random.default_rng(0).normal(size=(4000, 3))
     points = np.array([1.0, 2.0, 3.0]) + 2 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
     scene = scene_of(ring(), points)
-    similarity, marching = training_frame(scene, unbounded=True)
+    similarity, marching = contracted_frame(scene)
     nearest = min(np.linalg.norm(points - frame.centre, axis=1).min() for frame in scene.frames)
     assert marching.near < nearest * similarity.scale
 
@@ -109,7 +145,7 @@ def test_depth_bounds_of_forward_facing_captures_set_the_focus():
     for index, frame in enumerate(frames):
         frame.world_from_cam[:3, 3] = (index - 2, 0, 0)
     scene = replace(scene_of(frames), depth_bounds=np.tile([1.0, 4.0], (5, 1)))
-    similarity, marching = training_frame(scene, unbounded=True)
+    similarity, marching = contracted_frame(scene)
     np.testing.assert_allclose(similarity.inverse().apply(np.zeros(3)), [0, 0, 1.6], atol=1e-6)
     assert marching.near == pytest.approx(0.5 * similarity.scale, rel=1e-6)
 

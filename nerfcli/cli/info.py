@@ -125,7 +125,7 @@ def _describe_run(folder: Path) -> dict[str, Any]:
             "field": model.field.settings.to_json(),
             "field_bytes": field_bytes(model.field),
             "occupied_share": round(model.occupied.float().mean().item(), 4),
-            "unbounded": model.field.settings.unbounded,
+            "contraction": model.contraction,
             "cost": costs_of_run(model, cameras["train"], config.get("settings", {}), log),
         }
     if (folder / METRICS).exists():

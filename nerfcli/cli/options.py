@@ -47,6 +47,12 @@ FieldMemory = Annotated[
     str | None,
     typer.Option(help="About what its numbers may take: 4MB, 64MB.  [default: hash 8MiB, voxels 64MiB, mlp 256KiB]"),
 ]
+Contraction = Annotated[
+    str,
+    typer.Option(
+        help="What is far away is drawn near into a ball (l2) or a cube (linf), or not (none); auto: none with alpha."
+    ),
+]
 Memory = Annotated[str | None, typer.Option(help="Memory it may use: 4GB, 500MB.  [default: 4/5 of the machine's]")]
 Json = Annotated[bool, typer.Option("--json", help="Results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
@@ -90,6 +96,17 @@ def field_kind(kind: str) -> str:
     if kind not in KINDS:
         raise typer.BadParameter(f"{kind!r}; choose {', '.join(KINDS)}", param_hint="--field")
     return kind
+
+
+def contraction_name(contraction: str) -> str | None:
+    """none, l2 or linf; None for auto.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    if contraction not in ("auto", "none", "l2", "linf"):
+        raise typer.BadParameter(f"{contraction!r}; choose auto, none, l2 or linf", param_hint="--contraction")
+    return None if contraction == "auto" else contraction
 
 
 def bytes_from_text(text: str) -> int:

@@ -9,6 +9,7 @@ import typer
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
+    Contraction,
     Device,
     Downscale,
     Exclude,
@@ -24,6 +25,7 @@ from nerfcli.cli.options import (
     Seed,
     Threads,
     bytes_from_text,
+    contraction_name,
     device_name,
     downscale_factor,
     field_kind,
@@ -58,6 +60,7 @@ def train(
         str, typer.Option(help="default: the components most scenes need; auto: the scene decides, in short trainings.")
     ] = "default",
     downscale: Downscale = "auto",
+    contraction: Contraction = "auto",
     log2_rows: Annotated[
         int, typer.Option(help="Rows of each table of a hash grid, as a power of two.", min=4, max=24)
     ] = 16,
@@ -115,6 +118,7 @@ def train(
         budget_seconds=None if budget is None else seconds_from_text(budget),
         steps=steps,
         downscale=downscale_factor(downscale),
+        contraction=contraction_name(contraction),
         seed=seed,
         device=device_name(device),
         threads=thread_count(threads),

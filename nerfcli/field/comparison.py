@@ -52,7 +52,7 @@ def described_cost(
 def others_of_equal_storage(settings: FieldSettings, footprint: float) -> dict[str, FieldSettings]:
     """By kind, the fields of the other kinds that come nearest to the bytes of this one; none where all are larger."""
     memory = parameter_bytes(work(settings).parameters)
-    template = HashFieldSettings(unbounded=settings.unbounded, view_degree=settings.view_degree)
+    template = HashFieldSettings(contraction=settings.contraction, view_degree=settings.view_degree)
     others = {}
     for kind in KINDS:
         if kind != settings.kind:

@@ -92,7 +92,7 @@ class FourierField(Field):
             edges,
             jitter=jitter,
             occupied=occupied,
-            unbounded=self.settings.unbounded,
+            contraction=self.settings.contraction,
             deepest=deepest,
             density=self.density,
             code=lambda coordinates: coordinates,

@@ -91,7 +91,7 @@ class HashField(Field):
                 edges,
                 jitter=jitter,
                 occupied=occupied,
-                unbounded=self.settings.unbounded,
+                contraction=self.settings.contraction,
                 table=self.table,
                 resolutions=self.settings.resolutions,
                 weights=tuple(self.weights),

@@ -12,13 +12,13 @@ class FieldSettings(abc.ABC):
     """What makes two fields of one kind have the same shape: all that a checkpoint needs besides the numbers.
 
     Args:
-        unbounded: whether space beyond the central ball is contracted into the unit cube.
+        contraction: how space becomes the unit cube, one of `kernels.CONTRACTIONS`.
         view_degree: spherical harmonics of the direction that colours may depend on, 0 (not at all) to 3.
     """
 
     kind: ClassVar[str]
 
-    unbounded: bool
+    contraction: str
     view_degree: int = 3
 
     def to_json(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ def visible_samples(
     *,
     jitter: Tensor,
     occupied: Tensor,
-    unbounded: bool,
+    contraction: str,
     deepest: float,
     density: Callable[[Tensor], Tensor],
     code: Callable[[Tensor], Tensor],
@@ -30,12 +30,12 @@ def visible_samples(
     What stands behind surfaces is computed and left out, which the compiled operation avoids.
 
     Args:
-        origins, directions, edges, jitter, occupied, unbounded, deepest: see `kernels.visible_samples`.
+        origins, directions, edges, jitter, occupied, contraction, deepest: see `kernels.visible_samples`.
         density: (N, 3) coordinates to (N,).
         code: (N, 3) coordinates of the samples that are kept to their (N, C).
     """
     starts, ends, coordinates, offsets = kernels.occupied_samples(
-        origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded
+        origins, directions, edges, jitter=jitter, occupied=occupied, contraction=contraction
     )
     thickness = torch.cat([density(chunk) for chunk in coordinates.split(CHUNK)])
     lit, offsets = kernels.lit_samples(thickness, ends - starts, offsets, deepest=deepest)

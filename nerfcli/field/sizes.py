@@ -34,8 +34,8 @@ def chosen_size(
 
     Args:
         kind: one of `kinds.KINDS`.
-        hash_grid: a hash grid, whose `unbounded` and `view_degree` hold for every kind; its rows are set where there is
-            a `memory_bytes`.
+        hash_grid: a hash grid, whose `contraction` and `view_degree` hold for every kind; its rows are set where there
+            is a `memory_bytes`.
         footprint: what a pixel covers at the centre of the scene, in units of the training frame; the median photo's.
         memory_bytes: what the field's numbers may take; None for a hash grid as it is, 64 MiB in a dense grid, 1/4 MiB
             in a network, whose every number costs time at every sample.
@@ -44,16 +44,16 @@ def chosen_size(
         UserError: the smallest field is larger than the memory.
         ValueError: an unknown kind.
     """
-    unbounded, view_degree = hash_grid.unbounded, hash_grid.view_degree
-    cells = cells_of_footprint(footprint, unbounded)
+    contraction, view_degree = hash_grid.contraction, hash_grid.view_degree
+    cells = cells_of_footprint(footprint, contraction)
 
     def voxels(log2_vertices: int) -> VoxelFieldSettings:
         degree = min(view_degree, VOXEL_DEGREE)
-        return VoxelFieldSettings(unbounded=unbounded, view_degree=degree, log2_vertices=log2_vertices)
+        return VoxelFieldSettings(contraction=contraction, view_degree=degree, log2_vertices=log2_vertices)
 
     def network(width: int) -> FourierFieldSettings:
         octaves = min(max(math.floor(math.log2(cells)), OCTAVES[0]), OCTAVES[1])
-        return FourierFieldSettings(unbounded=unbounded, view_degree=view_degree, width=width, octaves=octaves)
+        return FourierFieldSettings(contraction=contraction, view_degree=view_degree, width=width, octaves=octaves)
 
     match kind:
         case HashFieldSettings.kind:
@@ -69,9 +69,9 @@ def chosen_size(
             raise ValueError(f"no field is of the kind {kind!r}")
 
 
-def cells_of_footprint(footprint: float, unbounded: bool) -> float:
+def cells_of_footprint(footprint: float, contraction: str) -> float:
     """How many cells along the cube's side are as wide as a pixel's footprint; see `kernels.grid_coordinates`."""
-    return (4.0 if unbounded else 2.0) / footprint
+    return (2.0 if contraction == "none" else 4.0) / footprint
 
 
 def largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings], memory_bytes: int) -> FieldSettings:

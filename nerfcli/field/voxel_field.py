@@ -95,7 +95,7 @@ class VoxelField(Field):
             edges,
             jitter=jitter,
             occupied=occupied,
-            unbounded=self.settings.unbounded,
+            contraction=self.settings.contraction,
             deepest=deepest,
             density=self.density,
             code=self._interpolated,

@@ -14,13 +14,16 @@ from torch import Tensor
 
 from nerfcli.kernels import depth as depth_reference
 from nerfcli.kernels import marching, reference
+from nerfcli.kernels.contraction import CONTRACTIONS, contract, contract_to_cube, grid_coordinates
 from nerfcli.kernels.depth import LightEnds
-from nerfcli.kernels.reference import contract, grid_coordinates, sum_along_rays
+from nerfcli.kernels.reference import sum_along_rays
 
 __all__ = [
+    "CONTRACTIONS",
     "adam_rows",
     "composite",
     "contract",
+    "contract_to_cube",
     "density",
     "distortion",
     "grid_coordinates",
@@ -152,12 +155,14 @@ def occupied_samples(
     *,
     jitter: Tensor,
     occupied: Tensor,
-    unbounded: bool,
+    contraction: str,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """See `marching.occupied_samples`."""
     module = _module_for(origins, directions, edges, jitter)
     module = marching if module is reference else module
-    return module.occupied_samples(origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded)
+    return module.occupied_samples(
+        origins, directions, edges, jitter=jitter, occupied=occupied, contraction=contraction
+    )
 
 
 def lit_samples(density: Tensor, lengths: Tensor, offsets: Tensor, *, deepest: float) -> tuple[Tensor, Tensor]:
@@ -173,7 +178,7 @@ def visible_samples(
     *,
     jitter: Tensor,
     occupied: Tensor,
-    unbounded: bool,
+    contraction: str,
     table: Tensor,
     resolutions: tuple[int, ...],
     weights: tuple[Tensor, ...],
@@ -193,7 +198,7 @@ def visible_samples(
         edges,
         jitter=jitter,
         occupied=occupied,
-        unbounded=unbounded,
+        contraction=contraction,
         table=table,
         resolutions=resolutions,
         weights=weights,

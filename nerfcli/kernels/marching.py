@@ -16,15 +16,15 @@ def occupied_samples(
     *,
     jitter: Tensor,
     occupied: Tensor,
-    unbounded: bool,
+    contraction: str,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The samples of `reference.march` with their places.
 
     Returns:
         starts (N,), ends (N,), coordinates (N, 3) in the field's unit cube, offsets (R + 1,).
     """
-    starts, ends, offsets = march(origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded)
-    coordinates = sample_coordinates(origins, directions, starts, ends, offsets=offsets, unbounded=unbounded)
+    starts, ends, offsets = march(origins, directions, edges, jitter=jitter, occupied=occupied, contraction=contraction)
+    coordinates = sample_coordinates(origins, directions, starts, ends, offsets=offsets, contraction=contraction)
     return starts, ends, coordinates, offsets
 
 

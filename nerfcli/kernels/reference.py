@@ -9,47 +9,9 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.activations import density_from_log, opacity
+from nerfcli.kernels.contraction import grid_coordinates
 
 HASH_PRIMES = (1, 2654435761, 805459861)
-
-
-def contract(points: Tensor) -> Tensor:
-    """All of space mapped into the ball of radius 2; the unit ball stays as it is.
-
-    contract(x) = x for |x| <= 1, else (2 - 1/|x|) x / |x|
-
-    Args:
-        points: (..., 3) finite; components up to half of the dtype's largest number.
-
-    Returns:
-        (..., 3) with norm below or at 2.
-
-    Differentiable everywhere, also at 0: norms below 1 are raised to 1, so that no gradient passes through a root at 0.
-    Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 10.
-    """
-    limit = torch.finfo(points.dtype).max
-    far = points.detach().abs().amax(-1, keepdim=True) > limit**0.25  # there, squares could overflow
-    shrink = torch.where(far, limit**-0.5 / 4, 1.0).to(points)
-    small = points * shrink
-    norm = small.square().sum(-1, keepdim=True).maximum(shrink.square()).sqrt()
-    return (2.0 - shrink / norm) * (small / norm)
-
-
-def grid_coordinates(points: Tensor, unbounded: bool) -> Tensor:
-    """Points of the training frame as coordinates of the unit cube that holds the field's grids.
-
-    Bounded scenes live in [-1, 1]^3; unbounded ones are contracted into the ball of radius 2 first.
-
-    Args:
-        points: (..., 3) training frame.
-        unbounded: whether the scene goes on beyond the central ball.
-
-    Returns:
-        (..., 3); inside [0, 1] for every point of an unbounded scene.
-    """
-    if unbounded:
-        return contract(points) / 4.0 + 0.5
-    return points / 2.0 + 0.5
 
 
 def corner_rows(cells: Tensor, resolution: int, rows: int) -> Tensor:
@@ -115,7 +77,7 @@ def march(
     *,
     jitter: Tensor,
     occupied: Tensor,
-    unbounded: bool,
+    contraction: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cut rays into intervals and keep those whose midpoint lies in an occupied cell.
 
@@ -126,7 +88,7 @@ def march(
         edges: (S + 2,) increasing distances, shared by the rays, for S intervals.
         jitter: (R,) in [0, 1).
         occupied: (G, G, G) bool over the unit cube of `grid_coordinates`, indexed [z, y, x].
-        unbounded: see `grid_coordinates`; outside the cube of a bounded scene nothing is occupied.
+        contraction: see `grid_coordinates`; outside the cube of a bounded scene nothing is occupied.
 
     Returns:
         starts (N,), ends (N,), offsets (R + 1,).
@@ -134,7 +96,7 @@ def march(
     cuts = edges[:-1] + jitter[:, None] * (edges[1:] - edges[:-1])  # (R, S + 1)
     starts, ends = cuts[:, :-1], cuts[:, 1:]
     middles = origins[:, None, :] + directions[:, None, :] * ((starts + ends) / 2)[..., None]  # (R, S, 3)
-    coordinates = grid_coordinates(middles, unbounded)
+    coordinates = grid_coordinates(middles, contraction)
     side = occupied.shape[0]
     inside = ((coordinates >= 0) & (coordinates <= 1)).all(-1)
     x, y, z = (coordinates.clamp(0, 1) * side).long().clamp_max(side - 1).unbind(-1)
@@ -277,12 +239,12 @@ def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -
 
 
 def sample_coordinates(
-    origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, unbounded: bool
+    origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, contraction: str
 ) -> Tensor:
     """The middles of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`."""
     rays = ray_indices(offsets)
     points = origins[rays] + directions[rays] * ((starts + ends) / 2)[:, None]
-    return grid_coordinates(points, unbounded)
+    return grid_coordinates(points, contraction)
 
 
 def geometry(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
@@ -334,7 +296,7 @@ def visible_samples(
     *,
     jitter: Tensor,
     occupied: Tensor,
-    unbounded: bool,
+    contraction: str,
     table: Tensor,
     resolutions: tuple[int, ...],
     weights: tuple[Tensor, ...],
@@ -345,7 +307,7 @@ def visible_samples(
     What is left out takes at most exp(-deepest) of a ray's light.
 
     Args:
-        origins, directions, edges, jitter, occupied, unbounded: see `march`.
+        origins, directions, edges, jitter, occupied, contraction: see `march`.
         table, resolutions: see `hash_encode`.
         weights: see `density`.
         deepest: > 0; each ray ends with the sample that brings its optical depth to this.
@@ -355,8 +317,10 @@ def visible_samples(
         offsets (R + 1,). Without gradients.
     """
     with torch.no_grad():
-        starts, ends, offsets = march(origins, directions, edges, jitter=jitter, occupied=occupied, unbounded=unbounded)
-        coordinates = sample_coordinates(origins, directions, starts, ends, offsets=offsets, unbounded=unbounded)
+        starts, ends, offsets = march(
+            origins, directions, edges, jitter=jitter, occupied=occupied, contraction=contraction
+        )
+        coordinates = sample_coordinates(origins, directions, starts, ends, offsets=offsets, contraction=contraction)
         encoded = hash_encode(coordinates, table, resolutions)
         thickness = density(encoded, weights)
         seen = optical_depth_before(thickness, ends - starts, offsets) < deepest

@@ -15,7 +15,9 @@ from nerfcli.field.interface import Field
 from nerfcli.field.kinds import fresh_field, settings_from_json
 from nerfcli.render.sampling import step_edges
 
-FORMAT = "nerfcli field 1"
+FORMAT = "nerfcli field 2"
+# Before there was a choice of contractions; still read.
+FORMAT_1 = "nerfcli field 1"
 BACKGROUND = "background.logits"
 
 
@@ -63,6 +65,11 @@ class Model:
     log_exposure: float | None = None
 
     @property
+    def contraction(self) -> str:
+        """How space becomes the unit cube of the field."""
+        return self.field.settings.contraction
+
+    @property
     def device(self) -> torch.device:
         return self.occupied.device
 
@@ -96,6 +103,9 @@ def load_model(path: Path, device: str) -> Model:
         UserError: the file is missing, damaged, not a field of this version, or holds weights that are not finite.
     """
     tensors, description = load_tensors(path, device)
+    if description.get("format") == FORMAT_1:
+        description["format"] = FORMAT
+        description["field"]["contraction"] = "l2" if description["field"].pop("unbounded") else "none"
     if description.get("format") != FORMAT:
         raise UserError(
             f"{path} holds {description.get('format')!r}, expected {FORMAT!r}",

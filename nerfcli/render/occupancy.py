@@ -47,7 +47,7 @@ class Occupancy:
         inside = torch.rand(len(numbers), 3, generator=generator, device=device)
         coordinates = (place + inside) / side
         density = torch.cat([field.density(chunk) for chunk in coordinates.split(2**16)])
-        radius = training_points(coordinates, field.settings.unbounded).norm(dim=-1)
+        radius = training_points(coordinates, field.settings.contraction).norm(dim=-1)
         step = (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as `sampling.step_length`
         chosen = self.optical_depth.view(-1)[cells]
         chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), density * step))

@@ -166,7 +166,7 @@ def _seen(
         precision.tensor([k * 2.0**-7 for k in range(5 * 2**7)]),
         jitter=precision.tensor([0.0] * len(origins)),
         occupied=make(side, side, side, dtype=torch.bool, device=precision.device),
-        unbounded=False,
+        contraction="none",
         table=precision.tensor([[[0.0] * 4] * 16] * levels),
         resolutions=(2,) * levels,
         weights=tuple(precision.tensor([[0.0] * n] * m) for m, n in ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))),

@@ -67,7 +67,7 @@ class Fitting:
         pool: Pool,
         marching: Marching,
         *,
-        unbounded: bool,
+        contraction: str,
         settings: TrainSettings,
         log_gains: Tensor | None = None,
         points: PointRays | None = None,
@@ -84,7 +84,7 @@ class Fitting:
             size = chosen_size(
                 settings.field,
                 hash_grid=HashFieldSettings(
-                    unbounded=unbounded,
+                    contraction=contraction,
                     levels=settings.levels,
                     log2_rows=settings.log2_rows,
                     width=settings.width,

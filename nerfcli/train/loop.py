@@ -17,13 +17,13 @@ from nerfcli.atomic import cannot_write
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
 from nerfcli.field.cost import field_bytes
-from nerfcli.render.model import Model, save_model
+from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.scene import Scene
 from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
+from nerfcli.train.extent import Extent, choose_extent
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.heldout import HeldoutPixels
 from nerfcli.train.interrupts import held_back
-from nerfcli.train.normalisation import training_frame
 from nerfcli.train.photos import PixelPool, load_album
 from nerfcli.train.point_depth import PointRays, point_depths
 from nerfcli.train.room import needs_of, room_for
@@ -114,22 +114,26 @@ def train(
     notify(told)
     masks = settings.components.masks
     album = load_album(scene.train_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
-    photos, unbounded = album.photos, album.fills_frame
+    photos = album.photos
     test_album = load_album(scene.test_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
-    similarity, marching = training_frame(scene, unbounded=unbounded)
     device = torch.device(settings.device)
+    if resume:
+        extent = _begun(run, settings)
+    else:
+        extent = choose_extent(scene, photos, settings, fills_frame=album.fills_frame, notify=notify)
+    similarity = extent.training_from_scene
     pool = PixelPool(photos, similarity, device, colours=album.colours, room=room)
     notify(
         f"{len(photos)} photos to train on, {len(test_album.photos)} held out, "
         f"{photos[0].frame.camera.width}x{photos[0].frame.camera.height} (1/{factor}), "
-        f"{'unbounded' if unbounded else 'bounded'} scene, {settings.device}, {settings.threads} threads"
+        f"{extent}, {settings.device}, {settings.threads} threads"
     )
     asked, selection = settings, None
     saved = load_tensors(run / STATE, settings.device) if resume else None
     if saved is not None:
         settings = replace(settings, components=chosen_components(read_config(run)))
     elif settings.model == "auto":
-        trials = Trials(photos, similarity, marching, unbounded=unbounded, settings=settings, log_gains=None)
+        trials = Trials(photos, extent, settings=settings, log_gains=None)
         selection = _search(trials, settings, has_alpha=pool.has_alpha, photos=len(photos), notify=notify)
         settings = replace(settings, components=selection.components)
     reference = None if settings.components.exposure == "none" else mean_log_exposure(scene.train_frames)
@@ -150,7 +154,14 @@ def train(
         notify(f"EXIF tells the exposure of {np.isfinite(known).sum()} of {len(known)} photos")
     gains = relative_log_exposures(scene.train_frames, reference)
     log_gains = torch.from_numpy(gains)[:, None].expand(-1, 3)
-    fitting = Fitting(pool, marching, unbounded=unbounded, settings=settings, log_gains=log_gains, points=points)
+    fitting = Fitting(
+        pool,
+        extent.marching,
+        contraction=extent.contraction,
+        settings=settings,
+        log_gains=log_gains,
+        points=points,
+    )
     size = ", ".join(f"{name} {value}" for name, value in fitting.field.settings.to_json().items())
     notify(f"field: {size}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     spent = selection.seconds if selection is not None else 0.0
@@ -167,11 +178,10 @@ def train(
                 old.unlink(missing_ok=True)
         except OSError as error:
             raise cannot_write(run, error) from error
+    described = describe_run(scene, asked, factor=factor, contraction=extent.contraction, selection=selection)
     if resume:
-        config = {**describe_run(scene, asked, factor), "selection": read_config(run).get("selection")}
-        write_sealed(run / CONFIG, config)
-    else:
-        write_sealed(run / CONFIG, describe_run(scene, asked, factor, selection))
+        described["selection"] = read_config(run).get("selection")
+    write_sealed(run / CONFIG, described)
     write_cameras(run, scene.train_frames, scene.test_frames)
     background = fitting.parts.background or (ALPHA_BACKGROUND if pool.has_alpha else OPAQUE_BACKGROUND)
 
@@ -179,7 +189,7 @@ def train(
         return Model(
             fitting.field,
             fitting.occupied,
-            marching,
+            extent.marching,
             background,
             similarity,
             scene.unit,
@@ -318,6 +328,17 @@ def _share(settings: TrainSettings, step: int, totals: _Totals) -> float:
     by_time = (totals.seconds - totals.searched) / left if left > 0 else 0.0
     by_steps = step / settings.steps if settings.steps else 0.0
     return min(1.0, max(by_time, by_steps))
+
+
+def _begun(run: Path, settings: TrainSettings) -> Extent:
+    """The extent in which the run's last checkpoint was trained."""
+    model = load_model(run / FIELD, settings.device)
+    if settings.contraction not in (None, model.contraction):
+        raise UserError(
+            f"{run} was trained with --contraction {model.contraction}, not {settings.contraction}",
+            "train into a new folder with -o, or again with --overwrite",
+        )
+    return Extent(model.contraction, model.training_from_scene, model.marching)
 
 
 def _restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> _Totals:

@@ -11,41 +11,91 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.paths import focus_point
 from nerfcli.cameras.rigid import Similarity, apply, inverse
+from nerfcli.errors import UserError
 from nerfcli.render.model import Marching
 from nerfcli.scene import Scene
 
 # Contracted space ends at infinity; nothing is resolved beyond this many ball radii.
 FARTHEST = 300.0
 NEAREST = 0.02
+# The unit ball reaches at least as far as this share of the depth of a typical pixel. Around an object both are about
+# alike, and the cameras decide; a ball that held most points of a desk in a room cost 0.4 dB.
+BALL_PER_DEPTH = 0.75
+# Fewer points do not tell where a scene ends.
+LEAST_POINTS = 50
+# A box holds all points but these per cent at either end, where wrong ones are, and reaches beyond by this share.
+BOX_PERCENTILE = 0.5
+BOX_MARGIN = 0.1
 
 
-def training_frame(scene: Scene, *, unbounded: bool) -> tuple[Similarity, Marching]:
-    """The similarity from the scene's frame, and the steps along rays in the training frame.
+def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
+    """The similarity from the scene's frame, and the steps along rays, where space beyond is contracted.
 
-    Unbounded scenes: the unit ball is centred where the cameras look and reaches to the median camera. Bounded ones
-    (photos with alpha): the unit ball is the smallest that reaches out of every camera's view, and the cube around it
-    is all there is.
+    The unit ball is centred where the cameras look. It reaches to the median camera, or to three quarters of the median
+    depth if that is farther: in a room the walls are behind the cameras, and nearly all that the photos show would lie
+    in contracted space, with steps that grow as the square of the distance.
 
     Raises:
         UserError: no camera (see `Scene`).
     """
-    frames = scene.frames
     depths = _typical_depths(scene)
-    centre = focus_point(frames, depth_hint=None if depths is None else float(np.median(depths[:, 1])))
-    distances = np.array([np.linalg.norm(frame.world_from_cam[:3, 3] - centre) for frame in frames])
-    if unbounded:
-        radius = max(float(np.median(distances)), 1e-12)
-    else:
-        radius = max(d * math.tan(_half_fov(f)) for d, f in zip(distances, frames, strict=True))
+    centre = _focus(scene, depths)
+    radius = max(float(np.median(_distances(scene, centre))), 1e-12)
+    if depths is not None:
+        radius = max(radius, BALL_PER_DEPTH * float(np.median(depths[:, 1])))
     similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
-    if not unbounded:
-        reach = math.sqrt(3.0)  # the cube's corners
-        near = max(float(distances.min()) / radius - reach, NEAREST)
-        far = float(distances.max()) / radius + reach
-        return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
     near = NEAREST * 5 if depths is None else 0.5 * float(depths[:, 0].min()) / radius
     near = min(max(near, NEAREST), 0.5)
     return similarity, Marching(near=near, far=FARTHEST, shortest_step=1 / 256, growth=1 / 128)
+
+
+def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
+    """The same for photos with alpha: an object in the middle, and nothing else.
+
+    The unit ball is the smallest that reaches out of every camera's view, and the cube around it is all there is.
+
+    Raises:
+        UserError: no camera (see `Scene`).
+    """
+    centre = _focus(scene, _typical_depths(scene))
+    distances = _distances(scene, centre)
+    radius = max(d * math.tan(_half_fov(f)) for d, f in zip(distances, scene.frames, strict=True))
+    reach = math.sqrt(3.0)  # the cube's corners
+    near = max(float(distances.min()) / radius - reach, NEAREST)
+    far = float(distances.max()) / radius + reach
+    similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
+    return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
+
+
+def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
+    """The same for a scene that ends, without alpha: the cube [-1, 1]^3 is the smallest around its points.
+
+    Raises:
+        UserError: the scene has too few points to tell where it ends.
+    """
+    if len(scene.points) < LEAST_POINTS:
+        raise UserError(
+            f"{scene.root} has {len(scene.points)} points, which do not tell where the scene ends",
+            "choose --contraction l2",
+        )
+    low, high = np.percentile(scene.points, (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
+    centre, radius = (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)
+    reach = math.sqrt(3.0)  # the cube's corners
+    depths = _typical_depths(scene)
+    near = NEAREST if depths is None else max(0.5 * float(depths[:, 0].min()) / radius, NEAREST)
+    far = float(_distances(scene, centre).max()) / radius + reach
+    similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
+    return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
+
+
+def _focus(scene: Scene, depths: np.ndarray | None) -> np.ndarray:
+    """Where the cameras look, with what `_typical_depths` says."""
+    return focus_point(scene.frames, depth_hint=None if depths is None else float(np.median(depths[:, 1])))
+
+
+def _distances(scene: Scene, centre: np.ndarray) -> np.ndarray:
+    """Of the cameras from a point."""
+    return np.array([np.linalg.norm(frame.centre - centre) for frame in scene.frames])
 
 
 def _half_fov(frame: Frame) -> float:

@@ -37,7 +37,7 @@ _LOGGED = ("step", "seconds", "loss", "samples", "rays", "peak_memory_bytes")
 
 
 def describe_run(
-    scene: Scene, settings: TrainSettings, factor: int, selection: Selection | None = None
+    scene: Scene, settings: TrainSettings, *, factor: int, contraction: str, selection: Selection | None = None
 ) -> dict[str, Any]:
     """What RUN/config.json holds: enough to know what was done, and to tell whether it is the same again.
 
@@ -45,6 +45,7 @@ def describe_run(
         scene: what was trained on.
         settings: as they were asked for.
         factor: by which photos were made smaller.
+        contraction: of the field.
         selection: how the components were chosen, where the scene decided.
     """
     return {
@@ -58,7 +59,7 @@ def describe_run(
         "history": dict(scene.history),
         "missing_photos": list(scene.missing),
         "warnings": list(rescaling_told(scene.rescaled)),
-        "settings": {**settings.to_json(), "downscale": factor},
+        "settings": {**settings.to_json(), "downscale": factor, "contraction": contraction},
         "selection": None if selection is None else selection.to_json(),
         "versions": {
             "nerfcli": __version__,
@@ -233,11 +234,13 @@ def _frame_from_json(entry: dict[str, Any], run: Path) -> Frame:
 
 def is_same_run(run: Path, scene: Scene, settings: TrainSettings) -> bool:
     """Whether `run` was trained from this scene with these settings; threads and device aside, an automatic downscale
-    counting as whatever was chosen. Settings that a run of an earlier version does not name were the defaults."""
+    and contraction counting as whatever was chosen. Settings that a run of an earlier version does not name were the
+    defaults."""
     config = read_config(run)
     wanted = {key: value for key, value in settings.to_json().items() if key not in ("device", "threads")}
-    if settings.downscale is None:
-        del wanted["downscale"]
+    for name in ("downscale", "contraction"):
+        if wanted[name] is None:
+            del wanted[name]
     trained = {**TrainSettings().to_json(), **config.get("settings", {})}
     return config.get("scene_fingerprint") == fingerprint(scene) and all(
         trained.get(key) == value for key, value in wanted.items()

@@ -186,7 +186,7 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
     fitting = Fitting(
         _SavedBatch(tensors),
         Marching(**description["marching"]),
-        unbounded=size.unbounded,
+        contraction=size.contraction,
         settings=settings,
         size=size,
     )

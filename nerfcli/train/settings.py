@@ -7,6 +7,7 @@ from typing import Any
 from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS
+from nerfcli.kernels import CONTRACTIONS
 from nerfcli.train.components import Components
 
 DOWNSCALES = (1, 2, 4, 8)
@@ -22,6 +23,8 @@ class TrainSettings:
         budget_seconds: training time to spend, without loading and held-out checks; None for no limit.
         steps: optimiser steps in all, those before a resume included; None for no limit.
         downscale: photos are averaged over squares of this many pixels; None for automatic.
+        contraction: how space becomes the unit cube of the field, see `kernels.contraction`; None for automatic: none
+            for photos with alpha, which show an object and nothing else, l2 for others.
         seed: of everything random.
         device: a torch device name.
         threads: CPU threads.
@@ -45,6 +48,7 @@ class TrainSettings:
     budget_seconds: float | None = 120.0
     steps: int | None = None
     downscale: int | None = None
+    contraction: str | None = None
     seed: int = 0
     device: str = "cpu"
     threads: int = 1
@@ -74,6 +78,9 @@ class TrainSettings:
             raise UserError(f"downscale {self.downscale} is not possible", "choose auto, 1, 2, 4 or 8")
         if self.field not in KINDS:
             raise UserError(f"there is no field of the kind {self.field!r}", f"choose {', '.join(KINDS)}")
+
+        if self.contraction not in (None, *CONTRACTIONS):
+            raise UserError(f"there is no contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
 
     def to_json(self) -> dict[str, Any]:
         return {**asdict(self), "fixed": list(self.fixed)}

@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.cameras.rigid import Similarity
-from nerfcli.render.model import Marching
 from nerfcli.train.components import Components
+from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.photos import Photo, PixelPool
 from nerfcli.train.settings import TrainSettings
@@ -64,8 +63,7 @@ class Trials:
 
     Args:
         photos: those to train on.
-        similarity, marching: the training frame.
-        unbounded: see `normalisation.training_frame`.
+        extent: of the field.
         settings: of the training that the trials are for; seed and components are given with each trial.
         log_gains: see `Fitting`.
 
@@ -76,10 +74,8 @@ class Trials:
     def __init__(
         self,
         photos: Sequence[Photo],
-        similarity: Similarity,
-        marching: Marching,
+        extent: Extent,
         *,
-        unbounded: bool,
         settings: TrainSettings,
         log_gains: Tensor | None,
     ):
@@ -88,13 +84,13 @@ class Trials:
         judged = [_blocks(photo.pixels.shape[:2], generator) for photo in photos]
         seen = [_without(photo, blocks) for photo, blocks in zip(photos, judged, strict=True)]
         hidden = [_without(photo, ~blocks) for photo, blocks in zip(photos, judged, strict=True)]
-        self._pool = PixelPool(seen, similarity, device)
-        self._judged = PixelPool(hidden, similarity, device).draw(
+        self._pool = PixelPool(seen, extent.training_from_scene, device)
+        self._judged = PixelPool(hidden, extent.training_from_scene, device).draw(
             JUDGED_PIXELS, torch.Generator(device=device).manual_seed(SEED)
         )
         self._photos = self._pool.photo_of(self._judged.numbers).cpu().numpy()
         self._num_photos = len(photos)
-        self._marching, self._unbounded = marching, unbounded
+        self._extent = extent
         # Small steps all along: they learn more from a sample, which is what a short training has few of.
         self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
         self._log_gains = log_gains
@@ -110,7 +106,11 @@ class Trials:
         """
         settings = replace(self._settings, components=components, seed=seed)
         fitting = Fitting(
-            self._pool, self._marching, unbounded=self._unbounded, settings=settings, log_gains=self._log_gains
+            self._pool,
+            self._extent.marching,
+            contraction=self._extent.contraction,
+            settings=settings,
+            log_gains=self._log_gains,
         )
         took, halfway = 0.0, None
         while (share := fitting.step / steps if steps is not None else took / (seconds or math.inf)) < 1.0:

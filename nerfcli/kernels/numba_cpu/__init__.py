@@ -51,11 +51,11 @@ def warm_up() -> None:
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     weights = tuple(torch.zeros(shape, requires_grad=True) for shape in shapes)
     _, _, _, encoded, points, _ = visible_samples(
-        direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, unbounded=True,
+        direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, contraction="l2",
         table=table, resolutions=(2,) * 8, weights=weights, deepest=10.0,
     )  # fmt: skip
     occupied_samples(
-        direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, unbounded=True
+        direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, contraction="l2"
     )
     encoded = hash_encode(points, table, (2,) * 8, None, encoded)
     hash_encode(points, table, (2,) * 8, None, None)

@@ -7,13 +7,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, padded
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _count(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, unbounded: Any, counts: Any
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, contraction: Any, counts: Any
 ) -> None:
     """How many samples each ray has."""
     intervals = edges.shape[0] - 2 - CHUNK
@@ -21,7 +22,7 @@ def _count(
         places, cells = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
         count = 0
         for first in range(0, intervals, CHUNK):
-            look_ahead(origins, directions, edges, jitter, ray, first, side, unbounded, places, cells)
+            look_ahead(origins, directions, edges, jitter, ray, first, side, contraction, places, cells)
             for i in range(min(CHUNK, intervals - first)):
                 if cells[i] >= 0 and occupied[cells[i]]:
                     count += 1
@@ -30,7 +31,7 @@ def _count(
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _write(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, unbounded: Any, offsets: Any,
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, contraction: Any, offsets: Any,
     starts: Any, ends: Any, coordinates: Any,
 ) -> None:  # fmt: skip
     """The samples of each ray, from its offset on."""
@@ -41,7 +42,7 @@ def _write(
         for first in range(0, intervals, CHUNK):
             if at == offsets[ray + 1]:
                 break
-            look_ahead(origins, directions, edges, jitter, ray, first, side, unbounded, places, cells)
+            look_ahead(origins, directions, edges, jitter, ray, first, side, contraction, places, cells)
             for i in range(min(CHUNK, intervals - first)):
                 if cells[i] >= 0 and occupied[cells[i]]:
                     starts[at] = cut(edges, jitter[ray], first + i)
@@ -58,13 +59,14 @@ def occupied_samples(
     *,
     jitter: Tensor,
     occupied: Tensor,
-    unbounded: bool,
+    contraction: str,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """See `marching.occupied_samples`; float32 on the CPU."""
     use_threads()
     rays = (
         origins.contiguous().numpy(), directions.contiguous().numpy(), padded(edges), jitter.contiguous().numpy(),
-        occupied.contiguous().view(-1).numpy(), occupied.shape[0], unbounded,
+        occupied.contiguous().view(-1).numpy(), occupied.shape[0],
+        CONTRACTIONS.index(contraction),
     )  # fmt: skip
     counts = np.zeros(len(origins), np.int64)
     _count(*rays, counts)

@@ -14,12 +14,16 @@ CHUNK = 16
 
 
 @numba.njit(inline="always")
-def cube(x: Any, y: Any, z: Any, unbounded: Any) -> Any:
-    """`reference.grid_coordinates` of one point; without branches, so that loops over it become vectors."""
+def cube(x: Any, y: Any, z: Any, contraction: Any) -> Any:
+    """`contraction.grid_coordinates` of one point; without branches inside, so that loops over it become vectors.
+
+    `contraction` is the number of the name in `CONTRACTIONS`.
+    """
     half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1), np.float32(2)
-    if not unbounded:
+    if contraction == 0:
         return x * half + half, y * half + half, z * half + half
-    norm = np.sqrt(max(x * x + y * y + z * z, one))
+    largest = max(max(abs(x), abs(y)), max(abs(z), one))
+    norm = np.sqrt(max(x * x + y * y + z * z, one)) if contraction == 1 else largest
     scale = (two - one / norm) / norm * quarter
     return x * scale + half, y * scale + half, z * scale + half
 
@@ -32,7 +36,7 @@ def cut(edges: Any, shift: Any, k: Any) -> Any:
 
 @numba.njit(inline="always")
 def look_ahead(
-    origins: Any, directions: Any, edges: Any, jitter: Any, ray: Any, first: Any, side: Any, unbounded: Any,
+    origins: Any, directions: Any, edges: Any, jitter: Any, ray: Any, first: Any, side: Any, contraction: Any,
     places: Any, cells: Any,
 ) -> None:  # fmt: skip
     """Coordinates (3, CHUNK) of the middles of CHUNK intervals from `first`, and their cells; -1 outside of the grid.
@@ -48,7 +52,7 @@ def look_ahead(
     for i in range(CHUNK):
         start, end = near[i] + shift * (middle[i] - near[i]), middle[i] + shift * (far[i] - middle[i])
         t = (start + end) * half
-        x, y, z = cube(ox + dx * t, oy + dy * t, oz + dz * t, unbounded)
+        x, y, z = cube(ox + dx * t, oy + dy * t, oz + dz * t, contraction)
         xs[i], ys[i], zs[i] = x, y, z
         inside = (x >= zero) & (y >= zero) & (z >= zero) & (x <= one) & (y <= one) & (z <= one)
         # Clamped before they become integers: a far point outside of a bounded scene would not fit into one.

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
 from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, density_range, flat_weights
 from nerfcli.kernels.numba_cpu.rays import CHUNK, cube, cut, look_ahead, padded
@@ -53,12 +54,13 @@ def _occupied_blocks(occupied: Any) -> Any:
 
 @numba.njit(inline="always")
 def _may_hold_something(
-    origins: Any, directions: Any, ray: Any, start: Any, end: Any, blocks: Any, side: Any, reach: Any, unbounded: Any
+    origins: Any, directions: Any, ray: Any, start: Any, end: Any, blocks: Any, side: Any, reach: Any, contraction: Any
 ) -> Any:
     """Whether an interval of a ray may come through an occupied cell.
 
     Where both its ends are within a block's size of its middle, the middle's block and its neighbours hold all of it:
-    coordinates of the cube change by at most 1/2 per distance, and 1/4 in unbounded scenes.
+    coordinates of the cube change by at most 1/2 per distance, 1/4 where space is contracted to a ball, and 1/4 times
+    1.025 where it is contracted to a cube.
     """
     if end - start > reach:
         return True
@@ -67,14 +69,14 @@ def _may_hold_something(
         origins[ray, 0] + directions[ray, 0] * t,
         origins[ray, 1] + directions[ray, 1] * t,
         origins[ray, 2] + directions[ray, 2] * t,
-        unbounded,
+        contraction,
     )
     return blocks[_block(z, side), _block(y, side), _block(x, side)]
 
 
 @numba.njit(inline="always")
 def _follow(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, unbounded: Any,
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
     flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, coming: Any, last_ray: Any,
     counts: Any, owner: Any, record: Any, code: Any,
 ) -> Any:  # fmt: skip
@@ -96,7 +98,7 @@ def _follow(
     x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
     geometry = np.empty(TILE * OUT, np.float32)
     # A block is BLOCK_SIDE / side of the cube wide; see `_may_hold_something`.
-    reach = np.float32(BLOCK_SIDE / side * (8.0 if unbounded else 4.0))
+    reach = np.float32(BLOCK_SIDE / side * (4.0 if contraction == 0 else 7.8))
     found = 0
     while True:
         filled = 0
@@ -111,10 +113,10 @@ def _follow(
                 ray, k = lane_ray[lane], lane_next[lane]
                 while k < intervals and taken == 0:
                     start, end = cut(edges, jitter[ray], k), cut(edges, jitter[ray], k + CHUNK)
-                    if not _may_hold_something(origins, directions, ray, start, end, blocks, side, reach, unbounded):
+                    if not _may_hold_something(origins, directions, ray, start, end, blocks, side, reach, contraction):
                         k += CHUNK
                         continue
-                    look_ahead(origins, directions, edges, jitter, ray, k, side, unbounded, places, cells)
+                    look_ahead(origins, directions, edges, jitter, ray, k, side, contraction, places, cells)
                     past = min(CHUNK, intervals - k)
                     for i in range(past):
                         if cells[i] >= 0 and occupied[cells[i]]:
@@ -156,14 +158,14 @@ def _follow(
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _visible(
-    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, unbounded: Any,
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
     flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, borders: Any, counts: Any,
     owner: Any, record: Any, code: Any, found: Any,
 ) -> None:  # fmt: skip
     """`_follow`, by a thread for the rays from each border to the next."""
     for thread in numba.prange(len(borders) - 1):
         found[thread] = _follow(
-            origins, directions, edges, jitter, occupied, blocks, side, unbounded, flat, rows,
+            origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows,
             resolutions, weights, deepest, borders[thread], borders[thread + 1], counts, owner[thread],
             record[thread], code[thread],
         )  # fmt: skip
@@ -195,7 +197,7 @@ def visible_samples(
     *,
     jitter: Tensor,
     occupied: Tensor,
-    unbounded: bool,
+    contraction: str,
     table: Tensor,
     resolutions: tuple[int, ...],
     weights: tuple[Tensor, ...],
@@ -211,9 +213,10 @@ def visible_samples(
     counts, found = np.zeros(rays, np.int64), np.zeros(threads, np.int64)
     _visible(
         origins.contiguous().numpy(), directions.contiguous().numpy(), padded(edges), jitter.numpy(),
-        occupied.contiguous().view(-1).numpy(), _occupied_blocks(occupied.numpy()), occupied.shape[0], unbounded,
-        table.detach().contiguous().view(-1).numpy(), table.shape[1], np.array(resolutions, dtype=np.int32),
-        flat_weights(weights[:2]), deepest, borders, counts, owner, record, code, found,
+        occupied.contiguous().view(-1).numpy(), _occupied_blocks(occupied.numpy()), occupied.shape[0],
+        CONTRACTIONS.index(contraction), table.detach().contiguous().view(-1).numpy(), table.shape[1],
+        np.array(resolutions, dtype=np.int32), flat_weights(weights[:2]), deepest, borders, counts, owner, record,
+        code, found,
     )  # fmt: skip
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     samples = int(offsets[-1])

@@ -1,0 +1,79 @@
+"""How space becomes the unit cube that holds the field's grids: as it is, or with all that is far away drawn near.
+
+    none    the cube [-1, 1]^3 of the training frame is all there is
+    l2      the unit ball stays as it is, all beyond it goes into the ball of radius 2
+    linf    the cube [-1, 1]^3 stays as it is, all beyond it goes into the cube [-2, 2]^3
+
+A ball wastes the corners of the grid's cube, almost half of it; a cube bends straight lines at its edges, and draws
+what lies along its diagonals nearer.
+"""
+
+import torch
+from torch import Tensor
+
+# The names, in the order of their numbers in compiled kernels.
+CONTRACTIONS = ("none", "l2", "linf")
+
+
+def contract(points: Tensor) -> Tensor:
+    """All of space mapped into the ball of radius 2; the unit ball stays as it is.
+
+    contract(x) = x for |x| <= 1, else (2 - 1/|x|) x / |x|
+
+    Args:
+        points: (..., 3) finite; components up to half of the dtype's largest number.
+
+    Returns:
+        (..., 3) with norm below or at 2.
+
+    Differentiable everywhere, also at 0: norms below 1 are raised to 1, so that no gradient passes through a root at 0.
+    Source: Barron et al. 2022, Mip-NeRF 360, arXiv:2111.12077, eq. 10.
+    """
+    limit = torch.finfo(points.dtype).max
+    far = points.detach().abs().amax(-1, keepdim=True) > limit**0.25  # there, squares could overflow
+    shrink = torch.where(far, limit**-0.5 / 4, 1.0).to(points)
+    small = points * shrink
+    norm = small.square().sum(-1, keepdim=True).maximum(shrink.square()).sqrt()
+    return (2.0 - shrink / norm) * (small / norm)
+
+
+def contract_to_cube(points: Tensor) -> Tensor:
+    """All of space mapped into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
+
+    contract_to_cube(x) = x for m <= 1, else (2 - 1/m) x / m,  m = the largest of |x_1|, |x_2|, |x_3|
+
+    Args:
+        points: (..., 3) finite.
+
+    Returns:
+        (..., 3) with components within 2.
+
+    Differentiable but where two components are largest together; there, and at m = 1, autograd's choice holds.
+    Source: the contraction of Mip-NeRF 360 with the norm that nerfacto takes (Tancik et al. 2023, arXiv:2302.04264).
+    """
+    largest = points.abs().amax(-1, keepdim=True).clamp_min(1.0)
+    return (2.0 - 1.0 / largest) * (points / largest)
+
+
+def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
+    """Points of the training frame as coordinates of the unit cube that holds the field's grids.
+
+    Args:
+        points: (..., 3) training frame.
+        contraction: one of `CONTRACTIONS`.
+
+    Returns:
+        (..., 3); inside [0, 1] for every point, but without contraction for those of [-1, 1]^3 only.
+
+    Raises:
+        ValueError: there is no such contraction.
+    """
+    match contraction:
+        case "none":
+            return points / 2.0 + 0.5
+        case "l2":
+            return contract(points) / 4.0 + 0.5
+        case "linf":
+            return contract_to_cube(points) / 4.0 + 0.5
+        case _:
+            raise ValueError(f"contraction must be one of {CONTRACTIONS}, got {contraction!r}")
