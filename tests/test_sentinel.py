@@ -156,7 +156,7 @@ def test_gradients_are_looked_at_in_the_order_in_which_they_come():
 
 
 def test_replay_of_something_else_is_refused(spheres_run):
-    with pytest.raises(UserError, match="holds 'nerfcli field 1'"):
+    with pytest.raises(UserError, match="holds 'nerfcli field 2'"):
         replay(spheres_run / "field.safetensors")
 
 

@@ -1,5 +1,6 @@
 """Points found in photos with known poses, and how far a scene reaches by them."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.scene import Scene
-from nerfcli.train.extent import choose_extent
+from nerfcli.train.extent import Extent, choose_extent
 from nerfcli.train.photos import Photo
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.triangulation import MOST_PHOTOS, chosen_pairs, meetings, triangulate
@@ -82,6 +83,8 @@ def test_the_unit_ball_follows_what_is_found(photos):
         scene_of(photos), photos, replace(SETTINGS, contraction="none"), fills_frame=True, notify=notes.append
     )
     assert box.contraction == "none"
+    assert str(Extent.from_json(json.loads(json.dumps(box.to_json())))) == "bounded scene"
+    assert Extent.from_json(box.to_json()).marching == box.marching
     on_wall = box.training_from_scene.apply(np.array([[-0.5, 0, 3.0], [1.5, 0, 3.0]]))
     assert np.abs(on_wall).max() < 1
 

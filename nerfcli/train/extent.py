@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.render.model import Marching
@@ -30,6 +31,20 @@ class Extent:
 
     def __str__(self) -> str:
         return _IN_WORDS[self.contraction]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; floats survive a round trip exactly."""
+        return {
+            "contraction": self.contraction,
+            "training_from_scene": self.training_from_scene.to_json(),
+            "marching": vars(self.marching),
+        }
+
+    @staticmethod
+    def from_json(content: dict[str, Any]) -> "Extent":
+        """The extent that `to_json` described."""
+        similarity = Similarity.from_json(content["training_from_scene"])
+        return Extent(content["contraction"], similarity, Marching(**content["marching"]))
 
 
 def choose_extent(

@@ -17,7 +17,7 @@ from nerfcli.atomic import cannot_write
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
 from nerfcli.field.cost import field_bytes
-from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.render.model import Model, save_model
 from nerfcli.scene import Scene
 from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.train.extent import Extent, choose_extent
@@ -46,7 +46,7 @@ from nerfcli.train.settings import TrainSettings, automatic_downscale
 from nerfcli.train.trials import Trials
 from nerfcli.train.watch import that_must_be_finite
 
-STATE_FORMAT = "nerfcli training 1"
+STATE_FORMAT = "nerfcli training 2"
 CHECKPOINT_SECONDS = 30.0
 HELDOUT_SHARES = (0.25, 0.5, 0.75, 1.0)
 # Photos without alpha fill the frame; what the field lets through is black, and little does.
@@ -117,8 +117,9 @@ def train(
     photos = album.photos
     test_album = load_album(scene.test_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
     device = torch.device(settings.device)
-    if resume:
-        extent = _begun(run, settings)
+    saved = load_tensors(run / STATE, settings.device) if resume else None
+    if saved is not None:
+        extent = _begun(run, settings, saved[1])
     else:
         extent = choose_extent(scene, photos, settings, fills_frame=album.fills_frame, notify=notify)
     similarity = extent.training_from_scene
@@ -129,7 +130,6 @@ def train(
         f"{extent}, {settings.device}, {settings.threads} threads"
     )
     asked, selection = settings, None
-    saved = load_tensors(run / STATE, settings.device) if resume else None
     if saved is not None:
         settings = replace(settings, components=chosen_components(read_config(run)))
     elif settings.model == "auto":
@@ -199,9 +199,10 @@ def train(
 
     def checkpoint() -> None:
         tensors, description = fitting.state()
+        description |= {"format": STATE_FORMAT, "extent": extent.to_json(), "totals": vars(totals)}
         writing = [
             lambda: save_model(run / FIELD, model()),
-            lambda: save_tensors(run / STATE, tensors, {"format": STATE_FORMAT, **description, "totals": vars(totals)}),
+            lambda: save_tensors(run / STATE, tensors, description),
         ]
         # A kill may come between the two. The state is all that resuming needs, and never ahead of the field; the first
         # time it is written first, so that there is no field which one can neither go on from nor replace.
@@ -330,21 +331,21 @@ def _share(settings: TrainSettings, step: int, totals: _Totals) -> float:
     return min(1.0, max(by_time, by_steps))
 
 
-def _begun(run: Path, settings: TrainSettings) -> Extent:
-    """The extent in which the run's last checkpoint was trained."""
-    model = load_model(run / FIELD, settings.device)
-    if settings.contraction not in (None, model.contraction):
+def _begun(run: Path, settings: TrainSettings, description: dict[str, Any]) -> Extent:
+    """The extent in which the run was begun, as its last checkpoint says."""
+    if description.get("format") != STATE_FORMAT:
+        raise UserError(f"{run / STATE} was written by another version", "train again with --overwrite")
+    extent = Extent.from_json(description["extent"])
+    if settings.contraction not in (None, extent.contraction):
         raise UserError(
-            f"{run} was trained with --contraction {model.contraction}, not {settings.contraction}",
+            f"{run} was trained with --contraction {extent.contraction}, not {settings.contraction}",
             "train into a new folder with -o, or again with --overwrite",
         )
-    return Extent(model.contraction, model.training_from_scene, model.marching)
+    return extent
 
 
 def _restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> _Totals:
     """Bring `fitting` to the run's last checkpoint, which says this."""
-    if description.get("format") != STATE_FORMAT:
-        raise UserError(f"{run / STATE} was written by another version", "train again with --overwrite")
     if description["field"] != fitting.field.settings.to_json():
         raise UserError(
             f"{run} was trained with another field ({description['field']})",
