@@ -41,7 +41,7 @@ from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.pages.page import asset
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.scene import Scene
-from nerfcli.train.normalisation import training_frame
+from nerfcli.train.normalisation import object_frame
 from nerfcli.train.run_folder import FIELD, append_log, describe_run, write_cameras
 from nerfcli.train.settings import TrainSettings
 
@@ -80,12 +80,15 @@ def _few(monkeypatch: pytest.MonkeyPatch) -> None:
 def foggy(spheres: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the spheres in which nothing was trained: a cube of fog. Look at it, do not write into it."""
     run = tmp_path_factory.mktemp("foggy") / "run"
-    similarity, _ = training_frame(spheres, unbounded=False)
+    similarity, _ = object_frame(spheres)
     model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), similarity, background=(1.0, 1.0, 1.0), step=1 / 16)
     with torch.no_grad():
         dict(model.field.named_parameters())["weights.1"][0, 0] = 0.1  # log density; float16 has no such number
     run.mkdir()
-    write_json(run / "config.json", describe_run(spheres, TrainSettings(budget_seconds=None, steps=7), 4))
+    write_json(
+        run / "config.json",
+        describe_run(spheres, TrainSettings(budget_seconds=None, steps=7), factor=4, contraction="none"),
+    )
     write_cameras(run, spheres.train_frames, spheres.test_frames)
     save_model(run / FIELD, model)
     append_log(
