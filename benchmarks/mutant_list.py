@@ -206,7 +206,10 @@ GROUPS: tuple[Group, ...] = (
             Mutant("range(thread, resolutions.shape[0], threads)", "range(0, resolutions.shape[0], threads)"),
             Mutant("column = level * FEATURES", "column = 0"),
             Mutant("if a != 0 or b != 0 or c != 0 or d != 0:", "if a != 0 or b != 0 or c != 0:"),
-            Mutant("total if ctx.sink is None else None", "total"),
+            Mutant("of_table if ctx.sink is None else None", "of_table"),
+            Mutant("low += a * (dots", "low -= a * (dots"),
+            Mutant("(one - b) * low + b * high", "b * low + (one - b) * high"),
+            Mutant("at >= np.float32(0) and at <= one", "at > np.float32(0) and at < one"),
         ),
     ),
     Group(
@@ -222,6 +225,21 @@ GROUPS: tuple[Group, ...] = (
             Mutant("_layer_32(g, back, C2, g2)", "_layer_32(g, back, C1, g2)"),
             Mutant("out[i * WIDTH + OUT + j] = harmonics[ray, j]", "out[i * WIDTH + OUT + j] = harmonics[0, j]"),
             Mutant("_weights_32(c0, g2, total, C1)", "_weights_32(h2, g2, total, C1)"),
+            Mutant(
+                "view_gradient[first + i, j] = g[i * WIDTH + OUT + j]", "view_gradient[i, j] = g[i * WIDTH + OUT + j]"
+            ),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/coordinates.py",
+        ("tests/test_numba_kernels.py",),
+        "sample_coordinates",
+        (),
+        (
+            Mutant("if norm <= one:", "if norm <= two:"),
+            Mutant("two * inverse * (inverse - one)", "two * inverse * (inverse + one)"),
+            Mutant("by_direction[ray, 1] += b * t", "by_direction[ray, 1] += b"),
+            Mutant("if contraction == 2:", "if contraction == 3:"),
         ),
     ),
     Group(

@@ -73,6 +73,28 @@ def test_hash_encode(samples, magnitude, generator):
         assert (fast.grad.double() - exact.grad).norm() <= 700 * 2e-7 * exact.grad.norm()
 
 
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("magnitude", [1e-6, 1.0, 1e6])
+def test_hash_encode_by_points(samples, magnitude, generator):
+    resolutions = (4, 7, 40, 700)
+    table = torch.randn(4, 512, 4, generator=generator) * magnitude
+    points = torch.rand(samples, 3, generator=generator) * 1.2 - 0.1
+    points[::7, 0], points[1::7, 1] = 0.0, 1.0  # on the border the slope is that inside
+    gradient = torch.randn(samples, 16, generator=generator)
+    fast, same_precision, exact = (
+        points.to(t).clone().requires_grad_() for t in (torch.float32,) * 2 + (torch.float64,)
+    )
+    numba_cpu.hash_encode(fast, table, resolutions, None, None).backward(gradient)
+    reference.hash_encode(same_precision, table, resolutions).backward(gradient)
+    reference.hash_encode(exact, table.double(), resolutions).backward(gradient.double())
+    assert_close(fast.grad, same_precision.grad, "gradient by points")
+    outside = (points < 0) | (points > 1)
+    assert fast.grad is not None
+    assert not fast.grad[outside].any()
+    if samples == 5:  # few enough that none lies on a face where rounding chooses another cell
+        assert_close(fast.grad, exact.grad, "gradient by points, against float64", relative=1e-3)
+
+
 def test_hash_encode_takes_a_sink_and_known_values(generator):
     table = torch.randn(2, 64, 4, generator=generator, requires_grad=True)
     points = torch.rand(50, 3, generator=generator)
@@ -122,13 +144,13 @@ def test_radiance_and_density(samples, magnitude, generator):
     by_density, by_rgb = torch.randn(samples, generator=generator), torch.randn(samples, 3, generator=generator)
 
     def run(function, dtype):
-        inputs = [x.to(dtype).clone().requires_grad_() for x in (encoded, *weights)]
-        density, rgb = function(inputs[0], harmonics.to(dtype), rays, tuple(inputs[1:]))
+        inputs = [x.to(dtype).clone().requires_grad_() for x in (encoded, harmonics, *weights)]
+        density, rgb = function(inputs[0], inputs[1], rays, tuple(inputs[2:]))
         (density @ by_density.to(dtype) + (rgb * by_rgb.to(dtype)).sum()).backward()
         return density.detach(), rgb.detach(), *(x.grad for x in inputs)
 
     fast, exact = run(numba_cpu.radiance, torch.float32), run(reference.radiance, torch.float64)
-    names = ("density", "rgb", "encoded", *(f"weights {i}" for i in range(5)))
+    names = ("density", "rgb", "encoded", "harmonics", *(f"weights {i}" for i in range(5)))
     for name, actual, expected in zip(names, fast, exact, strict=True):
         if name in ("density", "rgb") or samples == 0:
             assert_close(actual, expected, name)
@@ -138,6 +160,38 @@ def test_radiance_and_density(samples, magnitude, generator):
             # Where a sigmoid saturates, float64's own 1 - value ends at 1e-16; the kernel goes on.
             assert_close(actual, expected, name, relative=5 * RELATIVE, floor=1e-15)
     assert_close(numba_cpu.density(encoded, tuple(weights)), exact[0], "density alone")
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
+@pytest.mark.parametrize("reach", [1e-3, 2.0, 1e6])
+def test_sample_coordinates(samples, contraction, reach, generator):
+    offsets = offsets_of(samples, generator)
+    rays = len(offsets) - 1
+    origins, directions = torch.randn(2, rays, 3, generator=generator)
+    starts = torch.rand(samples, generator=generator) * reach
+    ends = starts + 0.1 * reach
+    gradient = torch.randn(samples, 3, generator=generator)
+
+    def run(function, dtype):
+        inputs = [x.to(dtype).clone().requires_grad_() for x in (origins, directions)]
+        spans = (starts.to(dtype), ends.to(dtype))
+        coordinates = function(*inputs, *spans, offsets=offsets, contraction=contraction)
+        coordinates.backward(gradient.to(dtype))
+        return coordinates.detach(), *(x.grad for x in inputs)
+
+    fast, exact = run(kernels.sample_coordinates, torch.float32), run(reference.sample_coordinates, torch.float64)
+    for name, actual, expected in zip(("coordinates", "origins", "directions"), fast, exact, strict=True):
+        assert_close(actual, expected, name)
+
+
+@once
+def test_sample_coordinates_that_are_known_are_taken(generator):
+    ray = torch.randn(1, 3, generator=generator)
+    known, offsets = torch.rand(2, 3, generator=generator), torch.tensor([0, 2])
+    starts = torch.tensor([0.0, 1.0])
+    taken = kernels.sample_coordinates(ray, ray, starts, starts + 1, offsets=offsets, contraction="l2", known=known)
+    assert torch.equal(taken, known)
 
 
 @pytest.mark.parametrize("samples", SIZES)

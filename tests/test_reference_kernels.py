@@ -197,6 +197,16 @@ def test_hash_encode_gradcheck_in_the_table():
     assert torch.autograd.gradcheck(lambda t: reference.hash_encode(points, t, (2, 5, 11)), table)
 
 
+def test_hash_encode_gradcheck_in_points_inside_cells(generator):
+    table = torch.randn(3, 64, 4, generator=generator, dtype=torch.float64)
+    points = torch.rand(6, 3, generator=generator, dtype=torch.float64)
+    resolutions = (2, 5, 11)
+    places = torch.cat([points * resolution for resolution in resolutions])
+    assert ((places - places.round()).abs() > 1e-3).all(), "a step of gradcheck would cross a face"
+    points.requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: reference.hash_encode(p, table, resolutions), points)
+
+
 def test_hash_encode_says_what_is_wrong():
     with pytest.raises(ValueError, match="must have 2 levels"):
         reference.hash_encode(torch.rand(1, 3), torch.rand(3, 64, 2), (2, 3))

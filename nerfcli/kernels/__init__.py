@@ -39,6 +39,7 @@ __all__ = [
     "prepare",
     "radiance",
     "ray_indices",
+    "sample_coordinates",
     "sum_along_rays",
     "visible_samples",
 ]
@@ -57,6 +58,29 @@ def ray_indices(offsets: Tensor) -> Tensor:
     """See `reference.ray_indices`."""
     numba_cpu = _numba_cpu() if offsets.device.type == "cpu" else None
     return (numba_cpu or reference).ray_indices(offsets)
+
+
+def sample_coordinates(
+    origins: Tensor,
+    directions: Tensor,
+    starts: Tensor,
+    ends: Tensor,
+    *,
+    offsets: Tensor,
+    contraction: str,
+    known: Tensor | None = None,
+) -> Tensor:
+    """See `reference.sample_coordinates`.
+
+    Args:
+        known: (N, 3), the answer, where it has been computed before without gradients.
+    """
+    module = _module_for(origins, directions, starts, ends, constant=(starts, ends))
+    if module is reference:
+        return reference.sample_coordinates(origins, directions, starts, ends, offsets=offsets, contraction=contraction)
+    return module.sample_coordinates(
+        origins, directions, starts, ends, offsets=offsets, contraction=contraction, known=known
+    )
 
 
 def hash_encode(
@@ -101,7 +125,7 @@ def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
 def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """See `reference.radiance`."""
     numba_cpu = _numba_cpu()
-    if numba_cpu is not None and not harmonics.requires_grad and numba_cpu.can_radiance(encoded, weights):
+    if numba_cpu is not None and numba_cpu.can_radiance(encoded, weights):
         return numba_cpu.radiance(encoded, harmonics, rays, weights)
     return reference.radiance(encoded, harmonics, rays, weights)
 

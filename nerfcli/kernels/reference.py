@@ -49,8 +49,9 @@ def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> 
     Raises:
         ValueError: the table does not have one level per resolution, or T is not a power of two.
 
-    Differentiable in the table only: the gradient with respect to points is that of the piecewise trilinear
-    function, which jumps at cell borders, and is left to autograd.
+    Differentiable in the table, and in points inside the cells: the gradient is that of the piecewise trilinear
+    function. It jumps where a point crosses a face of a cell of any level, and is there that of the upper cell; outside
+    [0, 1] it is 0.
     Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, section 3.
     """
     levels, rows, _ = table.shape
@@ -241,7 +242,10 @@ def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -
 def sample_coordinates(
     origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, contraction: str
 ) -> Tensor:
-    """The middles of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`."""
+    """The middles of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`.
+
+    Differentiable in origins and directions.
+    """
     rays = ray_indices(offsets)
     points = origins[rays] + directions[rays] * ((starts + ends) / 2)[:, None]
     return grid_coordinates(points, contraction)
@@ -281,7 +285,7 @@ def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Te
     Returns:
         density (N,), rgb (N, 3) in (0, 1).
 
-    Differentiable in encoded and weights.
+    Differentiable in encoded, harmonics and weights.
     """
     shape = geometry(encoded, weights)
     hidden = torch.relu(torch.cat([shape, harmonics[rays]], dim=-1) @ weights[2].t())

@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
+from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
 from nerfcli.kernels.numba_cpu.depth import light_ends, mixture_quantile
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.marching import occupied_samples
@@ -31,6 +32,7 @@ __all__ = [
     "pixel_rays",
     "radiance",
     "ray_indices",
+    "sample_coordinates",
     "visible_samples",
     "warm_up",
 ]
@@ -57,10 +59,14 @@ def warm_up() -> None:
     occupied_samples(
         direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, contraction="l2"
     )
+    spans = (starts, starts + 1)
+    sample_coordinates(direction, direction, *spans, offsets=offsets, contraction="l2", known=None)
+    ray = direction.clone().requires_grad_()
+    points = sample_coordinates(ray, ray, *spans, offsets=offsets, contraction="l2", known=points)
     encoded = hash_encode(points, table, (2,) * 8, None, encoded)
-    hash_encode(points, table, (2,) * 8, None, None)
-    optical_depth_before(density(encoded, weights), lengths, offsets)
-    thickness, rgb = radiance(encoded, torch.zeros(1, 16), ray_indices(offsets), weights)
+    hash_encode(points.detach(), table, (2,) * 8, None, None)
+    optical_depth_before(density(encoded.detach(), weights), lengths, offsets)
+    thickness, rgb = radiance(encoded, torch.zeros(1, 16, requires_grad=True), ray_indices(offsets), weights)
     interval_weights(thickness, lengths, offsets)
     light_ends(thickness, starts, starts + 1, offsets=offsets, shares=(0.5,))
     mixture_quantile(thickness, starts, starts + 1, offsets=offsets, rays_per_pixel=1, share=0.5)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import ROW, gather_rows, prefetch, scatter_rows
+from nerfcli.kernels.numba_cpu.vector import ROW, dot_rows, gather_rows, prefetch, scatter_rows
 
 # Row width that the kernels are written for, corners of a cell, and samples in a block.
 FEATURES = ROW
@@ -138,6 +138,48 @@ def _encode_backward(points: Any, gradient: Any, rows: Any, resolutions: Any, fl
                         scatter_rows(flat, offset, index, weight, i, BLOCK, gradient, at)
 
 
+@numba.njit(inline="always")
+def _slopes(inside: Any, count: Any, resolution: Any, dots: Any, points: Any, first: Any, out: Any) -> None:
+    """Add to `out` what the coordinates of a block of samples change: differences across the cell, between corners'
+    scalar products of gradient and row, each weighted by the place along the two other axes."""
+    one, scale = np.float32(1), np.float32(resolution)
+    for i in range(count):
+        for axis in range(3):
+            across, other = (axis + 1) % 3, (axis + 2) % 3
+            bit, bit_across, bit_other = 1 << axis, 1 << across, 1 << other
+            a, b = inside[across, i], inside[other, i]
+            low = (one - a) * (dots[bit * BLOCK + i] - dots[i])
+            low += a * (dots[(bit | bit_across) * BLOCK + i] - dots[bit_across * BLOCK + i])
+            high = (one - a) * (dots[(bit | bit_other) * BLOCK + i] - dots[bit_other * BLOCK + i])
+            high += a * (dots[7 * BLOCK + i] - dots[(bit_across | bit_other) * BLOCK + i])
+            at = points[first + i, axis]
+            if at >= np.float32(0) and at <= one:  # beyond, coordinates are clamped
+                out[first + i, axis] += scale * ((one - b) * low + b * high)
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _points_backward(
+    points: Any, flat: Any, rows: Any, resolutions: Any, gradient: Any, out: Any, threads: Any
+) -> None:
+    width = resolutions.shape[0] * FEATURES
+    blocks = (points.shape[0] + BLOCK - 1) // BLOCK
+    for thread in numba.prange(threads):
+        begin = thread * blocks // threads * BLOCK
+        end = min((thread + 1) * blocks // threads * BLOCK, points.shape[0])
+        scratch = new_scratch()
+        inside, index, dots = scratch[1], scratch[2], scratch[3]
+        for level in range(resolutions.shape[0]):
+            resolution = resolutions[level]
+            offset = np.int64(level) * rows * FEATURES
+            for first in range(begin, end, BLOCK):
+                count = min(BLOCK, end - first)
+                _prepare_block(points, first, count, level, resolution, rows, flat, scratch)
+                for i in range(count):
+                    at = (first + i) * width + level * FEATURES
+                    dot_rows(flat, offset, index, dots, i, BLOCK, gradient, at)
+                _slopes(inside, count, resolution, dots, points, first, out)
+
+
 class _HashEncode(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -156,23 +198,23 @@ class _HashEncode(torch.autograd.Function):
             _encode_forward(points.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(), use_threads())
         else:
             out = known.view_as(known)
-        ctx.save_for_backward(points)
+        ctx.save_for_backward(points, table if ctx.needs_input_grad[0] else table[:0])
         ctx.table_shape, ctx.sides, ctx.sink = table.shape, sides, sink
         return out
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor | None, None, None, None]:
-        (points,) = ctx.saved_tensors
-        total = torch.zeros(ctx.table_shape) if ctx.sink is None else ctx.sink
-        _encode_backward(
-            points.numpy(),
-            gradients[0].contiguous().view(-1).numpy(),
-            ctx.table_shape[1],
-            ctx.sides,
-            total.view(-1).numpy(),
-            use_threads(),
-        )
-        return None, total if ctx.sink is None else None, None, None, None
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+        points, table = ctx.saved_tensors
+        gradient = gradients[0].contiguous().view(-1).numpy()
+        rows, of_points, of_table = ctx.table_shape[1], None, None
+        if ctx.needs_input_grad[0]:
+            of_points = torch.zeros_like(points)
+            flat = table.view(-1).numpy()
+            _points_backward(points.numpy(), flat, rows, ctx.sides, gradient, of_points.numpy(), use_threads())
+        if ctx.needs_input_grad[1]:
+            of_table = torch.zeros(ctx.table_shape) if ctx.sink is None else ctx.sink
+            _encode_backward(points.numpy(), gradient, rows, ctx.sides, of_table.view(-1).numpy(), use_threads())
+        return of_points, of_table if ctx.sink is None else None, None, None, None
 
 
 def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> bool:
@@ -181,7 +223,6 @@ def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...])
     return (
         points.device.type == table.device.type == "cpu"
         and points.dtype == table.dtype == torch.float32
-        and not points.requires_grad
         and features == FEATURES
         and len(resolutions) == len(table)
         and rows & (rows - 1) == 0
@@ -191,5 +232,5 @@ def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...])
 def hash_encode(
     points: Tensor, table: Tensor, resolutions: tuple[int, ...], sink: Tensor | None, known: Tensor | None
 ) -> Tensor:
-    """See `kernels.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in the table."""
+    """See `kernels.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in points and table."""
     return _HashEncode.apply(points, table, resolutions, sink, known)  # type: ignore[return-value]

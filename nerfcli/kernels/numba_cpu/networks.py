@@ -191,9 +191,11 @@ def _radiance_backward(
     density_gradient: Any,
     rgb_gradient: Any,
     encoded_gradient: Any,
+    view_gradient: Any,
     sums: Any,
     threads: Any,
 ) -> None:
+    """`view_gradient` is of the harmonics of each sample; without rows, nobody wants it."""
     samples = encoded.shape[0]
     tiles = (samples + TILE - 1) // TILE
     for thread in numba.prange(threads):
@@ -237,6 +239,10 @@ def _radiance_backward(
             for i in range(TILE):
                 for j in range(OUT):
                     g_out[i * OUT + j] = g[i * WIDTH + j]
+            if view_gradient.shape[0] > 0:
+                for i in range(count):
+                    for j in range(OUT):
+                        view_gradient[first + i, j] = g[i * WIDTH + OUT + j]
             _densities(geometry, own)
             for i in range(count):
                 g_out[i * OUT] += density_gradient[first + i] * own[i]
@@ -279,16 +285,20 @@ class _Radiance(torch.autograd.Function):
         encoded, harmonics, rays, *weights = ctx.saved_tensors
         threads = use_threads()
         encoded_gradient = torch.empty_like(encoded)
+        view_gradient = encoded.new_empty(len(encoded) if ctx.needs_input_grad[1] else 0, OUT)
         sums = np.zeros((threads, WEIGHTS), np.float32)
         _radiance_backward(
             encoded.numpy(), harmonics.numpy(), rays.numpy(), flat_weights(weights), _flat_back(weights),
-            gradients[0].contiguous().numpy(), gradients[1].contiguous().numpy(), encoded_gradient.numpy(), sums,
-            threads,
+            gradients[0].contiguous().numpy(), gradients[1].contiguous().numpy(), encoded_gradient.numpy(),
+            view_gradient.numpy(), sums, threads,
         )  # fmt: skip
         total = torch.from_numpy(sums.sum(0))
         slots = zip((D1, D2, C1, C2, C3), (D2, C1, C2, C3, WEIGHTS), weights, strict=True)
         by_layer = [total[a:b].view(WIDTH, -1).t()[: len(w)].contiguous() for a, b, w in slots]
-        return encoded_gradient, None, None, *by_layer
+        of_rays = None
+        if ctx.needs_input_grad[1]:
+            of_rays = torch.zeros_like(harmonics).index_add_(0, rays, view_gradient)
+        return encoded_gradient, of_rays, None, *by_layer
 
 
 def can_radiance(encoded: Tensor, weights: tuple[Tensor, ...]) -> bool:
@@ -302,7 +312,7 @@ def can_radiance(encoded: Tensor, weights: tuple[Tensor, ...]) -> bool:
 
 
 def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """See `reference.radiance`; float32 on the CPU, differentiable in `encoded` and the weights."""
+    """See `reference.radiance`; float32 on the CPU, differentiable in `encoded`, `harmonics` and the weights."""
     return _Radiance.apply(encoded, harmonics, rays, *weights)  # type: ignore[return-value]
 
 

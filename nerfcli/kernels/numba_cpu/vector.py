@@ -35,7 +35,7 @@ def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
 prefetch: Callable[[Any, Any], None] = cast(Any, _prefetch)
 
 
-# Width of a table row in `gather_rows` and `scatter_rows`.
+# Width of a table row in `gather_rows`, `scatter_rows` and `dot_rows`.
 ROW = 4
 CORNERS = 8
 
@@ -44,6 +44,7 @@ def _row_access(generate: Callable[..., None]) -> Any:
     """An intrinsic over the 8 corners of a cell: (flat, offset, index, weight, at, stride, row, row_at).
 
     Corner c has the table row index[at + c stride], at flat[offset + 4 index], and the weight weight[at + c stride].
+    `generate` is given the builder, pointers to the corners' rows and weights, and one to row[row_at : row_at + 4].
     """
 
     @intrinsic
@@ -60,17 +61,13 @@ def _row_access(generate: Callable[..., None]) -> Any:
                 context.cast(builder, args[i], signature.args[i], types.intp) for i in (1, 4, 5, 7)
             )
             long, vector = ir.IntType(64), ir.VectorType(ir.FloatType(), ROW)
-            spread = ir.Constant(ir.VectorType(ir.IntType(32), ROW), [0] * ROW)
-            undefined = ir.Constant(vector, ir.Undefined)
             corners = []
             for corner in range(CORNERS):
                 place = builder.add(at, builder.mul(stride, ir.Constant(long, corner)))
                 number = builder.zext(builder.load(builder.gep(index_data, [place])), long)
                 element = builder.add(offset, builder.mul(number, ir.Constant(long, ROW)))
                 pointer = builder.bitcast(builder.gep(flat_data, [element]), vector.as_pointer())
-                scalar = builder.load(builder.gep(weight_data, [place]))
-                first = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
-                corners.append((pointer, builder.shuffle_vector(first, undefined, spread)))
+                corners.append((pointer, builder.gep(weight_data, [place])))
             generate(builder, corners, builder.bitcast(builder.gep(row_data, [row_at]), vector.as_pointer()))
             return context.get_dummy_value()
 
@@ -79,9 +76,18 @@ def _row_access(generate: Callable[..., None]) -> Any:
     return access
 
 
+def _in_all_lanes(builder: Any, pointer: Any) -> Any:
+    """The number at a pointer, once for each number of a row."""
+    undefined = ir.Constant(ir.VectorType(ir.FloatType(), ROW), ir.Undefined)
+    first = builder.insert_element(undefined, builder.load(pointer), ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(ir.IntType(32), ROW), [0] * ROW))
+
+
 def _gather(builder: Any, corners: Any, row: Any) -> None:
+    # All weights are loaded before anything is stored: the compiler cannot know that they do not stand in the row.
+    weights = [_in_all_lanes(builder, weight) for _, weight in corners]
     total = None
-    for pointer, weight in corners:
+    for (pointer, _), weight in zip(corners, weights, strict=True):
         product = builder.fmul(weight, builder.load(pointer, align=4), flags=("contract",))
         total = product if total is None else builder.fadd(total, product, flags=("contract",))
     builder.store(total, row, align=4)
@@ -89,15 +95,30 @@ def _gather(builder: Any, corners: Any, row: Any) -> None:
 
 def _scatter(builder: Any, corners: Any, row: Any) -> None:
     gradient = builder.load(row, align=4)
-    for pointer, weight in corners:  # one after the other: two corners may share a row
+    weights = [_in_all_lanes(builder, weight) for _, weight in corners]
+    for (pointer, _), weight in zip(corners, weights, strict=True):  # one after the other: two may share a row
         product = builder.fmul(weight, gradient, flags=("contract",))
         builder.store(builder.fadd(builder.load(pointer, align=4), product, flags=("contract",)), pointer, align=4)
+
+
+def _dot(builder: Any, corners: Any, row: Any) -> None:
+    vector = builder.load(row, align=4)
+    lanes = [ir.Constant(ir.IntType(32), lane) for lane in range(ROW)]
+    sums = []
+    for pointer, _ in corners:
+        product = builder.fmul(vector, builder.load(pointer, align=4))
+        parts = [builder.extract_element(product, lane) for lane in lanes]
+        sums.append(builder.fadd(builder.fadd(parts[0], parts[1]), builder.fadd(parts[2], parts[3])))
+    for (_, place), total in zip(corners, sums, strict=True):
+        builder.store(total, place)
 
 
 # gather_rows: row[row_at : row_at + 4] = sum over corners of weight * flat row.  All arrays flat; index is uint32.
 gather_rows = _row_access(_gather)
 # scatter_rows: each flat row += weight * row[row_at : row_at + 4].
 scatter_rows = _row_access(_scatter)
+# dot_rows: each weight becomes the scalar product of the flat row with row[row_at : row_at + 4].
+dot_rows = _row_access(_dot)
 
 
 def _block_product(vectors: int, *, begin: Callable[..., Any], finish: Callable[..., Any]) -> Callable[..., None]:

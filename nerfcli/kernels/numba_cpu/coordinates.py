@@ -1,0 +1,128 @@
+"""Gradients of the coordinates of samples to their rays, on CPU threads; a thread owns rays.
+
+Same operation as `reference.sample_coordinates`, in float32.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.contraction import CONTRACTIONS
+from nerfcli.kernels.numba_cpu.rays import cube
+from nerfcli.kernels.numba_cpu.threads import use_threads
+
+
+@numba.njit(inline="always")
+def _back_from_cube(x: Any, y: Any, z: Any, contraction: Any, a: Any, b: Any, c: Any) -> Any:
+    """The transposed Jacobian of `rays.cube` at (x, y, z), times (a, b, c).
+
+    cube(p) = s(m) p / 4 + 1/2 with s(m) = (2 - 1/m) / m and m the norm, at least 1: the Jacobian is
+    (s + s'(m) p grad(m)^T) / 4, where grad(m) is 0 inside.
+    """
+    half, quarter, one, two = np.float32(0.5), np.float32(0.25), np.float32(1), np.float32(2)
+    if contraction == 0:
+        return a * half, b * half, c * half
+    largest = max(max(abs(x), abs(y)), abs(z))
+    norm = np.sqrt(x * x + y * y + z * z) if contraction == 1 else largest
+    if norm <= one:
+        return a * quarter, b * quarter, c * quarter
+    inverse = one / norm
+    scale = (two - inverse) * inverse
+    # In units of the norm, as squares of what is far away would overflow.
+    u, v, w = x * inverse, y * inverse, z * inverse
+    along = two * inverse * (inverse - one) * (u * a + v * b + w * c)
+    if contraction == 2:  # the gradient of the largest component is its sign
+        u = np.sign(x) if abs(x) == largest else np.float32(0)
+        v = np.sign(y) if abs(y) == largest and u == 0 else np.float32(0)
+        w = np.sign(z) if abs(z) == largest and u == 0 and v == 0 else np.float32(0)
+    return (
+        (scale * a + along * u) * quarter,
+        (scale * b + along * v) * quarter,
+        (scale * c + along * w) * quarter,
+    )
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _coordinates(
+    origins: Any, directions: Any, starts: Any, ends: Any, offsets: Any, contraction: Any, out: Any
+) -> None:
+    for ray in numba.prange(origins.shape[0]):
+        for i in range(offsets[ray], offsets[ray + 1]):
+            t = (starts[i] + ends[i]) * np.float32(0.5)
+            x, y, z = cube(
+                origins[ray, 0] + directions[ray, 0] * t,
+                origins[ray, 1] + directions[ray, 1] * t,
+                origins[ray, 2] + directions[ray, 2] * t,
+                contraction,
+            )
+            out[i, 0], out[i, 1], out[i, 2] = x, y, z
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _backward(
+    origins: Any, directions: Any, starts: Any, ends: Any, offsets: Any, contraction: Any, gradient: Any,
+    by_origin: Any, by_direction: Any,
+) -> None:  # fmt: skip
+    for ray in numba.prange(origins.shape[0]):
+        for i in range(offsets[ray], offsets[ray + 1]):
+            t = (starts[i] + ends[i]) * np.float32(0.5)
+            a, b, c = _back_from_cube(
+                origins[ray, 0] + directions[ray, 0] * t,
+                origins[ray, 1] + directions[ray, 1] * t,
+                origins[ray, 2] + directions[ray, 2] * t,
+                contraction,
+                gradient[i, 0],
+                gradient[i, 1],
+                gradient[i, 2],
+            )
+            by_origin[ray, 0] += a
+            by_origin[ray, 1] += b
+            by_origin[ray, 2] += c
+            by_direction[ray, 0] += a * t
+            by_direction[ray, 1] += b * t
+            by_direction[ray, 2] += c * t
+
+
+class _SampleCoordinates(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor,
+        contraction: int, known: Tensor | None,
+    ) -> Tensor:  # fmt: skip
+        rays = [t.detach().contiguous() for t in (origins, directions, starts, ends, offsets)]
+        ctx.save_for_backward(*rays)
+        ctx.contraction = contraction
+        if known is not None:
+            return known.view_as(known)
+        use_threads()
+        out = torch.empty(len(starts), 3)
+        o, d, s, e, at = (t.numpy() for t in rays)
+        _coordinates(o, d, s, e, at, contraction, out.numpy())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        use_threads()
+        o, d, s, e, at = (t.numpy() for t in ctx.saved_tensors)
+        by_origin, by_direction = (torch.zeros(len(o), 3) for _ in range(2))
+        gradient = gradients[0].contiguous().numpy()
+        _backward(o, d, s, e, at, ctx.contraction, gradient, by_origin.numpy(), by_direction.numpy())
+        return by_origin, by_direction, None, None, None, None, None
+
+
+def sample_coordinates(
+    origins: Tensor,
+    directions: Tensor,
+    starts: Tensor,
+    ends: Tensor,
+    *,
+    offsets: Tensor,
+    contraction: str,
+    known: Tensor | None,
+) -> Tensor:
+    """See `kernels.sample_coordinates`; float32 on the CPU, differentiable in origins and directions."""
+    number = CONTRACTIONS.index(contraction)
+    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, known)  # type: ignore[return-value]
