@@ -1,19 +1,22 @@
 """What damage does: random corruptions of scene, run and image files, and random kills of poses, train and render.
 
     python benchmarks/faults.py corruptions --count 500 -o corruptions.csv
+    python benchmarks/faults.py corruptions --first 16 --count 1      one case again, alone
     python benchmarks/faults.py kills --count 20 -o kills.csv
 
 Every corruption damages one file of a small capture or of its run; one command is run on it, in a child process.
 Verdicts: `refused` (exit codes 3, 4 or 5, two lines), `same` (the result is that of the whole files), `other input`
 (the damage is in a file that has no checksum, a JPEG or a COLMAP model say, and reads as another picture or another
 number; what comes out belongs to it); bad ones: `traceback`, `crash`, `hang`, `wrong`, and `lost` where a file of the
-user's has changed.
+user's has changed. A crash is told with its signal, the last lines of stderr and whether the kernel ran out of memory.
+What is bad is tried again in a fresh process, and its capture is kept beside the CSV.
 
 Kills: SIGKILL at random moments, the same command again (train with --resume where a state is there), until it is done;
 then every file that says something is compared with those of a command that nobody disturbed.
 """
 
 import csv
+import faulthandler
 import hashlib
 import json
 import os
@@ -26,6 +29,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,6 +60,7 @@ class Case:
     command: str
     exit_code: int
     verdict: str
+    again: str
     text: str
 
 
@@ -186,6 +191,7 @@ def serve() -> None:
 
     from nerfcli.cli import app as program
 
+    faulthandler.enable()
     channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     for line in sys.stdin:
@@ -209,20 +215,17 @@ def serve() -> None:
 class Child:
     """A process that runs commands until one of them is its end."""
 
-    def __init__(self) -> None:
+    def __init__(self, log: Path) -> None:
+        self.log = log
         self.start()
 
     def start(self) -> None:
         command = [sys.executable, __file__, "serve"]
         environment = {**os.environ, "GOMP_SPINCOUNT": "1000"}
-        self.process = subprocess.Popen(
-            command,
-            text=True,
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-        )
+        with self.log.open("w") as log:
+            self.process = subprocess.Popen(
+                command, text=True, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log
+            )
 
     def ask(self, folder: Path, command: tuple[str, ...]) -> dict[str, Any]:
         assert self.process.stdin is not None
@@ -230,7 +233,7 @@ class Child:
         self.process.stdin.write(json.dumps({"folder": str(folder), "command": command}) + "\n")
         self.process.stdin.flush()
 
-        began = self._cpu_seconds()
+        began, kills_before = self._cpu_seconds(), out_of_memory_kills()
 
         # Processor time: a busy machine is no endless loop. What waits for ever takes none; it has a wall clock.
         def give_up(signum: int, frame: object) -> None:
@@ -247,43 +250,55 @@ class Child:
             return self._again("hang")
         finally:
             signal.alarm(0)
-        return json.loads(line) if line else self._again("crash")
+        if line:
+            return json.loads(line)
+        return self._again("crash", told=f"out-of-memory kills meanwhile: {out_of_memory_kills() - kills_before}")
 
     def _cpu_seconds(self) -> float:
         """Of the process and of those of its children that have ended."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
-    def _again(self, why: str) -> dict[str, Any]:
+    def _again(self, why: str, told: str = "") -> dict[str, Any]:
+        if why == "crash":
+            with suppress(subprocess.TimeoutExpired):  # it ends by itself: its own signal is what counts
+                self.process.wait(30)
         self.process.kill()
         code = self.process.wait()
+        said = self.log.read_text(errors="replace")[-2000:]
         self.start()
-        return {"code": code, "raised": False, "text": why, "outcome": "", "verdict": why}
+        name = signal.Signals(-code).name if code < 0 else f"status {code}"
+        return {"code": code, "raised": False, "text": f"{name} {told}\n{said}", "outcome": "", "verdict": why}
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
 
 
-def corruption_cases(count: int, seed: int, place: Path) -> Iterator[Case]:
+def out_of_memory_kills() -> int:
+    """How often the kernel has killed for want of memory since it started; 0 where it does not say."""
+    try:
+        lines = Path("/proc/vmstat").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) for line in lines if line.startswith("oom_kill "))
+
+
+def corruption_cases(numbers: range, seed: int, place: Path, keep: Path) -> Iterator[Case]:
     """Damage one file at a time, run one command, look at what is left."""
     whole, broken = place / "whole", place / "case"
     make_capture(whole)
     files = [path for path in sorted(digests(whole)) if not path.endswith((".lock", "poses_report.json"))]
     kinds = sorted({kind_of(file) for file in files})
     contents = [(whole / file).read_bytes() for file in files]
-    draw, child, expected = random.Random(seed), Child(), dict[tuple[str, ...], str]()
+    child, expected = Child(place / "stderr"), dict[tuple[str, ...], str]()
 
     def fresh() -> None:
         shutil.rmtree(broken, ignore_errors=True)
         shutil.copytree(whole, broken)
 
-    for number in range(count):
-        kind = draw.choice(kinds)
-        file = draw.choice([name for name in files if kind_of(name) == kind])
-        command = commands_for(file, draw)
-        if command not in expected:
-            fresh()
-            answer = child.ask(broken, command)
-            expected[command] = answer["outcome"] or f"exit {answer['code']}"
+    def tried(command: tuple[str, ...], file: str, content: bytes | None) -> tuple[str, dict[str, Any]]:
         fresh()
-        damage, content = damaged((whole / file).read_bytes(), contents, draw)
         if content is None:
             (broken / file).unlink()
         else:
@@ -291,11 +306,37 @@ def corruption_cases(count: int, seed: int, place: Path) -> Iterator[Case]:
         before = {name: digest for name, digest in digests(broken).items() if is_kept(name, command)}
         answer = child.ask(broken, command)
         after = digests(broken)
-        verdict = verdict_of(answer, expected[command], file)
         if changed := [name for name, digest in before.items() if after.get(name) != digest]:
-            verdict, answer["text"] = "lost", ", ".join(changed)
-        yield Case(number, file, damage, " ".join(command[:2]), answer["code"], verdict, answer["text"])
-    child.process.kill()
+            return "lost", {**answer, "text": ", ".join(changed)}
+        return verdict_of(answer, expected[command], file), answer
+
+    for number in numbers:
+        draw = random.Random(f"{seed} {number}")  # so that each can be had alone
+        kind = draw.choice(kinds)
+        file = draw.choice([name for name in files if kind_of(name) == kind])
+        command = commands_for(file, draw)
+        if command not in expected:
+            fresh()
+            answer = child.ask(broken, command)
+            expected[command] = answer["outcome"] or f"exit {answer['code']}"
+        damage, content = damaged((whole / file).read_bytes(), contents, draw)
+        verdict, answer = tried(command, file, content)
+        again = ""
+        if verdict in BAD:
+            child.end()
+            child.start()
+            again, _ = tried(command, file, content)
+            kept = keep / f"seed-{seed}-case-{number}"
+            shutil.rmtree(kept, ignore_errors=True)
+            fresh()
+            shutil.move(broken, kept)
+            if content is None:
+                (kept / file).unlink()
+            else:
+                (kept / file).write_bytes(content)
+            (kept / "command.txt").write_text(" ".join(command) + f"\n# damaged: {file}\n")
+        yield Case(number, file, damage, " ".join(command[:2]), answer["code"], verdict, again, answer["text"])
+    child.end()
 
 
 def kind_of(file: str) -> str:
@@ -316,6 +357,8 @@ def verdict_of(answer: dict[str, Any], expected: str, file: str) -> str:
         return answer["verdict"]
     if answer["raised"] or answer["code"] == 1:
         return "traceback"
+    if answer["outcome"].startswith("unreadable"):
+        return "wrong"
     if answer["code"] != 0:
         good = answer["code"] in (3, 4, 5) and answer["text"].count("Error:") == 1
         return "refused" if good else "same" if expected == f"exit {answer['code']}" else "wrong"
@@ -328,28 +371,35 @@ def verdict_of(answer: dict[str, Any], expected: str, file: str) -> str:
 def corruptions(
     count: Annotated[int, typer.Option(help="Files to damage.", min=1)] = 500,
     seed: int = 0,
+    first: Annotated[int, typer.Option(help="Number of the first case.", min=0)] = 0,
     output: Annotated[Path, typer.Option("-o", help="CSV with a line per case.")] = Path("corruptions.csv"),
 ) -> None:
     """Damage files and see what the commands say."""
-    table: Counter[tuple[str, str]] = Counter()
+    by_command, by_file = Counter[tuple[str, str]](), Counter[tuple[str, str]]()
     with tempfile.TemporaryDirectory() as place, output.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(Case.__dataclass_fields__))
         writer.writeheader()
-        for case in corruption_cases(count, seed, Path(place)):
+        keep = output.with_name(f"{output.stem}-bad")
+        for case in corruption_cases(range(first, first + count), seed, Path(place), keep):
             writer.writerow(asdict(case))
             file.flush()
-            table[case.command, case.verdict] += 1
+            by_command[case.command, case.verdict] += 1
+            by_file[kind_of(case.file), case.verdict] += 1
             if case.verdict in BAD:
-                typer.echo(f"{case.number}: {case.file} {case.damage}: {case.command}: {case.verdict}: {case.text}")
-    show(table)
+                typer.echo(
+                    f"{case.number}: {case.file} {case.damage}: {case.command}: {case.verdict}, "
+                    f"again: {case.again}: {case.text}"
+                )
+    show(by_command)
+    show(by_file)
 
 
 def show(table: Counter[tuple[str, str]]) -> None:
     """Commands in rows, verdicts in columns."""
     verdicts = sorted({verdict for _, verdict in table})
-    typer.echo(f"{'':20s}" + "".join(f"{verdict:>13s}" for verdict in verdicts))
+    typer.echo(f"{'':32s}" + "".join(f"{verdict:>13s}" for verdict in verdicts))
     for row in sorted({row for row, _ in table}):
-        typer.echo(f"{row:20s}" + "".join(f"{table[row, verdict]:13d}" for verdict in verdicts))
+        typer.echo(f"{row:32s}" + "".join(f"{table[row, verdict]:13d}" for verdict in verdicts))
 
 
 @app.command()
