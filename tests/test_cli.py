@@ -771,7 +771,8 @@ def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(capture):
 def test_ctrl_c_on_a_terminal_leaves_no_process_and_no_half_file(finished, tmp_path):
     """All processes of --jobs get the signal from the terminal, not the command alone."""
     ours, theirs = os.openpty()
-    program = "import os; os.open(os.ttyname(0), os.O_RDWR); from nerfcli.cli import main; main()"  # takes the terminal
+    program = "import os, signal; os.open(os.ttyname(0), os.O_RDWR); "  # it becomes the terminal of this session
+    program += "signal.signal(signal.SIGINT, signal.default_int_handler); from nerfcli.cli import main; main()"
     words = ("render", finished, "--cameras", "orbit", "--count", "2000", "--max-size", "64", "--jobs", "2", "--quiet")
     command = [sys.executable, "-c", program, *map(str, words), "-o", str(tmp_path / "out")]
     process = subprocess.Popen(

@@ -7,6 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnProcess
 from typing import Any
@@ -164,13 +165,25 @@ def _tell_death(worker: _Worker, order: Order, notify: Callable[[str], None], *,
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """A process that is started here never hears Ctrl-C: the one that started it ends it."""
-    try:
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:  # not in the main thread, which alone may do this
-        yield
+    """A process that is started here never hears Ctrl-C: the one that started it ends it.
+
+    Starting takes seconds, as the new process reads the model only when it has come up. A Ctrl-C that comes meanwhile
+    is kept for afterwards.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows: there it is lost
+        try:
+            before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        except ValueError:  # not in the main thread, which alone may do this
+            yield
+            return
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
         return
+    resource_tracker.ensure_running()  # it would be started with the first process, and let signals in again
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
