@@ -160,6 +160,7 @@ def commands_for(file: str, draw: random.Random) -> tuple[str, ...]:
 def outcome(folder: Path, command: tuple[str, ...], text: str) -> str:
     """What a command that succeeded says: a hash of the numbers, without times and places."""
     from nerfcli.field.checkpoint import load_tensors
+    from nerfcli.media.images import read_image
 
     name, content = command[0], hashlib.blake2b()
     if name == "info":
@@ -175,8 +176,10 @@ def outcome(folder: Path, command: tuple[str, ...], text: str) -> str:
         content.update(json.dumps([metrics["mean"]["psnr"], images]).encode())
     elif name == "render":
         for path in sorted((folder / "out").rglob("*")):
-            if path.suffix == ".npy" or path.parent.name == "rgb":
-                content.update(np.load(path).tobytes() if path.suffix == ".npy" else Image.open(path).tobytes())
+            if path.suffix == ".npy":
+                content.update(np.load(path).tobytes())
+            elif path.suffix == ".png" and "rgb" in path.parts:
+                content.update(read_image(path).tobytes())
     else:
         content.update(
             json.dumps(json.loads((folder / "out" / "poses_report.json").read_text())["registered"]).encode()
@@ -319,6 +322,8 @@ def corruption_cases(numbers: range, seed: int, place: Path, keep: Path) -> Iter
             fresh()
             answer = child.ask(broken, command)
             expected[command] = answer["outcome"] or f"exit {answer['code']}"
+            if answer["raised"] or expected[command].startswith("unreadable"):
+                raise SystemExit(f"{command} on whole files: {answer}")
         damage, content = damaged((whole / file).read_bytes(), contents, draw)
         verdict, answer = tried(command, file, content)
         again = ""

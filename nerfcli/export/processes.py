@@ -23,6 +23,10 @@ from nerfcli.render.model import Model
 # A frame at which processes died this often is not tried once more.
 _MOST_DEATHS = 2
 
+# The exception by which a process leaves may be lost: Python drops those raised in a callback or while it frees objects.
+# The process then ends with its frame, as the connection is closed; one that hangs is killed.
+_SECONDS_TO_LEAVE = 60
+
 
 @dataclass
 class _Worker:
@@ -65,10 +69,10 @@ def render_in_processes(
         ours, theirs = context.Pipe()
         share = max(1, threads // jobs)
         process = context.Process(target=_serve, args=(theirs, model, order, unfinished, share), daemon=True)
-        with _without_interrupts():
+        with _without_interrupts():  # an interrupt that was kept comes at the end, and has to find the process
             process.start()
+            workers.append(_Worker(process, ours))
         theirs.close()
-        workers.append(_Worker(process, ours))
         give(workers[-1])
 
     def give(worker: _Worker) -> None:
@@ -104,7 +108,10 @@ def render_in_processes(
     finally:
         for worker in workers:
             worker.process.terminate()
+            worker.connection.close()
         for worker in workers:
+            worker.process.join(_SECONDS_TO_LEAVE)
+            worker.process.kill()
             worker.process.join()
 
 
