@@ -193,6 +193,33 @@ def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals cannot be kept for later here")
+def test_ctrl_c_while_a_process_starts_is_kept_and_ends_it(model, tmp_path, monkeypatch):
+    start = multiprocessing.get_context("spawn").Process.start
+    started: list[Any] = []
+
+    def start_and_interrupt(process: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        start(process)
+        started.append(process)
+
+    monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_interrupt)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            export_frames(
+                *(model, order(), tmp_path / "views"),
+                on_rays=lambda rays: None,
+                notify=lambda text: None,
+                workers=Workers(jobs=2, threads=2),
+            )
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert len(started) == 1
+    assert not started[0].is_alive()
+    assert not (tmp_path / "views").exists()
+
+
 @pytest.mark.slow
 def test_what_goes_wrong_in_a_process_is_told_as_it_is_without(model, tmp_path):
     with pytest.raises(KeyboardInterrupt):
