@@ -23,7 +23,7 @@ from nerfcli.render.model import Model
 # A frame at which processes died this often is not tried once more.
 _MOST_DEATHS = 2
 
-# The exception by which a process leaves may be lost: Python drops those raised in a callback or while it frees objects.
+# The exception by which a process leaves may be lost: Python drops those raised in callbacks and while freeing objects.
 # The process then ends with its frame, as the connection is closed; one that hangs is killed.
 _SECONDS_TO_LEAVE = 60
 
