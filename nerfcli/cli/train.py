@@ -253,8 +253,6 @@ def _fit(
             detail = (
                 f"step {progress.step}  loss {progress.loss:.4f}  {progress.samples_per_second / 1e3:.0f} k samples/s"
             )
-            if progress.heldout_psnr is not None:
-                detail += f"  held-out {progress.heldout_psnr:.2f} dB"
             update(progress.share, detail)
 
         try:

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -203,9 +203,17 @@ def _is_number(value: Any) -> bool:
 
 def cut_log(run: Path, step: int) -> None:
     """Forget the entries behind `step`: a killed training logs more than its last checkpoint knows of."""
-    kept = [entry for entry in read_log(run) if entry["step"] <= step]
+    _write_log(run, [entry for entry in read_log(run) if entry["step"] <= step])
+
+
+def add_to_log(run: Path, measured: Mapping[int, dict[str, Any]]) -> None:
+    """Put what was measured afterwards, by step, into the entries of these steps."""
+    _write_log(run, [entry | measured.get(entry["step"], {}) for entry in read_log(run)])
+
+
+def _write_log(run: Path, entries: Iterable[dict[str, Any]]) -> None:
     with atomic_path(run / LOG) as partial:
-        partial.write_text("".join(f"{json.dumps(entry)}\n" for entry in kept), encoding="utf-8")
+        partial.write_text("".join(f"{json.dumps(entry)}\n" for entry in entries), encoding="utf-8")
 
 
 def _frame_to_json(frame: Frame, run: Path) -> dict[str, Any]:

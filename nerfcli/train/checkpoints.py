@@ -1,0 +1,116 @@
+"""What of a training is in the run folder, so that it can be looked at, and gone on with bit for bit."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from nerfcli.errors import UserError
+from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
+from nerfcli.render.model import Model, save_model
+from nerfcli.scene import Scene
+from nerfcli.train.extent import Extent
+from nerfcli.train.fitting import Fitting
+from nerfcli.train.preparation import Begun, Prepared
+from nerfcli.train.run_folder import FIELD, STATE, chosen_components, read_config
+from nerfcli.train.settings import TrainSettings
+from nerfcli.train.watch import that_must_be_finite
+
+STATE_FORMAT = "nerfcli training 2"
+# Photos without alpha fill the frame; what the field lets through is black, and little does.
+OPAQUE_BACKGROUND = (0.0, 0.0, 0.0)
+ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
+
+
+@dataclass
+class Totals:
+    """What accumulates over the whole training, resumed parts included; `searched` is the part of the seconds that the
+    choice of the components took."""
+
+    seconds: float = 0.0
+    searched: float = 0.0
+    samples: int = 0
+    rays: int = 0
+
+
+class Checkpoints:
+    """The files of one training.
+
+    Args:
+        run: the folder.
+        fitting, totals: are read when a checkpoint is written.
+        prepared: what the fitting was made from.
+        scene: gives the unit of length.
+    """
+
+    def __init__(self, run: Path, fitting: Fitting, totals: Totals, *, prepared: Prepared, scene: Scene):
+        self._run, self._fitting, self._totals = run, fitting, totals
+        self._prepared, self._scene = prepared, scene
+
+    def model(self) -> Model:
+        """What the field is now."""
+        fitting, prepared = self._fitting, self._prepared
+        alone = ALPHA_BACKGROUND if prepared.pool.has_alpha else OPAQUE_BACKGROUND
+        return Model(
+            fitting.field,
+            fitting.occupied,
+            prepared.extent.marching,
+            fitting.parts.background or alone,
+            prepared.extent.training_from_scene,
+            self._scene.unit,
+            self._scene.unit_source,
+            log_exposure=prepared.log_exposure,
+        )
+
+    def write(self) -> None:
+        """Write RUN/field.safetensors and RUN/state.safetensors."""
+        tensors, description = self._fitting.state()
+        extent = self._prepared.extent.to_json()
+        description |= {"format": STATE_FORMAT, "extent": extent, "totals": vars(self._totals)}
+        writing = [
+            lambda: save_model(self._run / FIELD, self.model()),
+            lambda: save_tensors(self._run / STATE, tensors, description),
+        ]
+        # A kill may come between the two. The state is all that resuming needs, and never ahead of the field; the first
+        # time it is written first, so that there is no field which one can neither go on from nor replace.
+        for write in writing if (self._run / FIELD).exists() else reversed(writing):
+            write()
+
+
+def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]) -> Begun:
+    """What the run was begun with, as its last checkpoint and its settings say.
+
+    Raises:
+        UserError: another version wrote it, or it was begun with another contraction than is asked for.
+    """
+    if description.get("format") != STATE_FORMAT:
+        raise UserError(f"{run / STATE} was written by another version", "train again with --overwrite")
+    extent = Extent.from_json(description["extent"])
+    if settings.contraction not in (None, extent.contraction):
+        raise UserError(
+            f"{run} was trained with --contraction {extent.contraction}, not {settings.contraction}",
+            "train into a new folder with -o, or again with --overwrite",
+        )
+    return Begun(extent, chosen_components(read_config(run)))
+
+
+def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:
+    """Bring `fitting` to the run's last checkpoint, which says this.
+
+    Raises:
+        UserError: it is of another field or of other components, or holds numbers that are not finite.
+    """
+    if description["field"] != fitting.field.settings.to_json():
+        raise UserError(
+            f"{run} was trained with another field ({description['field']})",
+            "train into a new folder with -o, or again with --overwrite",
+        )
+    if missing := [name for name in fitting.parts.state_dict() if f"parts.{name}" not in tensors]:
+        raise UserError(
+            f"{run} was trained without what --with asks for now ({missing[0]})",
+            "train into a new folder with -o, or again with --overwrite",
+        )
+    refuse_non_finite(that_must_be_finite(tensors), run / STATE)
+    fitting.restore(tensors, description)
+    return Totals(**description["totals"])

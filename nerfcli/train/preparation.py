@@ -1,0 +1,164 @@
+"""What a training starts from: photos and their rays, the extent of the field, and the components the scene needs.
+
+Of held-out photos nothing is read here but the sizes that their cameras have.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.errors import UserError
+from nerfcli.scene import Scene
+from nerfcli.train.components import Components
+from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
+from nerfcli.train.extent import Extent, choose_extent
+from nerfcli.train.fitting import Fitting
+from nerfcli.train.photos import Album, PixelPool, load_album
+from nerfcli.train.point_depth import PointRays, point_depths
+from nerfcli.train.room import Room, needs_of, room_for
+from nerfcli.train.selection import SEARCH_SHARE, Selection, proposals, select
+from nerfcli.train.settings import TrainSettings, automatic_downscale
+from nerfcli.train.trials import Trials
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What an interrupted training had decided on."""
+
+    extent: Extent
+    components: Components
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What a training goes over, and what was decided for it.
+
+    Args:
+        settings: with the components that are taken.
+        factor: photos are averaged over squares of this many pixels.
+        room: where arrays of the size of the photos go.
+        extent: of the field.
+        pool: the training photos.
+        selection: how the scene decided on the components; None where it was not asked.
+        log_exposure: the mean of the training photos by EXIF; None where exposures are not asked for, or not known.
+        log_gains: (photos, 3) logarithms of their exposures relative to it, as far as EXIF tells; else 0.
+        points: pixels with a point of structure from motion, where the components ask for them.
+    """
+
+    settings: TrainSettings
+    factor: int
+    room: Room
+    extent: Extent
+    pool: PixelPool
+    selection: Selection | None
+    log_exposure: float | None
+    log_gains: Tensor
+    points: PointRays | None
+
+    def fitting(self) -> Fitting:
+        """A training at its first step."""
+        return Fitting(
+            self.pool,
+            self.extent.marching,
+            contraction=self.extent.contraction,
+            settings=self.settings,
+            log_gains=self.log_gains,
+            points=self.points,
+        )
+
+
+def prepare(
+    scene: Scene,
+    settings: TrainSettings,
+    *,
+    run: Path,
+    memory_bytes: int | None,
+    begun: Begun | None,
+    notify: Callable[[str], None],
+) -> Prepared:
+    """Read the training photos and decide what is to be decided.
+
+    Args:
+        scene: photos, cameras and split.
+        settings: as asked for.
+        run: where files may stand that hold what does not fit into memory.
+        memory_bytes: that may be resident.
+        begun: decisions of a training that goes on; None for a new one.
+        notify: takes lines for the user.
+
+    Raises:
+        UserError: too little memory, no training photo, unreadable photos.
+    """
+    if not scene.train_frames:
+        raise UserError(f"{scene.root} has no training photo", "every 8th photo is held out; at least 2 are needed")
+    first = scene.train_frames[0].camera
+    factor = settings.downscale or automatic_downscale(first.width, first.height)
+    needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
+    room, told = room_for(needs, memory_bytes, folder=run)
+    notify(told)
+    masks = settings.components.masks
+    album = load_album(scene.train_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
+    if begun is not None:
+        extent = begun.extent
+    else:
+        extent = choose_extent(scene, album.photos, settings, fills_frame=album.fills_frame, notify=notify)
+    device = torch.device(settings.device)
+    pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, room=room)
+    camera = album.photos[0].frame.camera
+    notify(
+        f"{len(album.photos)} photos to train on, {len(scene.test_frames)} held out, "
+        f"{camera.width}x{camera.height} (1/{factor}), {extent}, {settings.device}, {settings.threads} threads"
+    )
+    if pool.without_ray:
+        notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
+    selection = None
+    if begun is not None:
+        settings = replace(settings, components=begun.components)
+    elif settings.model == "auto":
+        selection = _search(album, extent, settings, notify=notify)
+        settings = replace(settings, components=selection.components)
+    reference, gains = _exposures(scene, settings.components, notify=notify)
+    points = None
+    if settings.components.points:
+        points = PointRays(point_depths(scene, pool, extent.training_from_scene), pool)
+        notify(f"{len(points.known.numbers)} pixels have a point of structure from motion")
+    return Prepared(settings, factor, room, extent, pool, selection, reference, gains, points)
+
+
+def _search(album: Album, extent: Extent, settings: TrainSettings, *, notify: Callable[[str], None]) -> Selection:
+    """Let the scene decide on the components, and tell how it did."""
+    trials = Trials(album.photos, extent, settings=settings, log_gains=None)
+    candidates = proposals(
+        settings.components,
+        has_alpha=album.colours.shape[-1] == 4,
+        photos=len(album.photos),
+        fixed=settings.fixed,
+    )
+    budget, steps = settings.budget_seconds, settings.steps
+    notify(f"tries {len(candidates)} components in short trainings, for {SEARCH_SHARE:.0%} of the budget")
+    selection = select(
+        trials,
+        settings.components,
+        candidates,
+        seconds=None if budget is None else SEARCH_SHARE * budget,
+        steps=None if steps is None else round(SEARCH_SHARE * steps),
+    )
+    for decision in selection.decisions:
+        notify(decision.in_words())
+    if not selection.decisions:
+        notify("the budget is too small to try components; those that most scenes need are taken")
+    return selection
+
+
+def _exposures(scene: Scene, components: Components, *, notify: Callable[[str], None]) -> tuple[float | None, Tensor]:
+    """The mean exposure of the training photos, and the (photos, 3) logarithms of theirs relative to it."""
+    frames = scene.train_frames
+    reference = None if components.exposure == "none" else mean_log_exposure(frames)
+    if reference is not None:
+        notify(f"EXIF tells the exposure of {np.isfinite(log_exposures(frames)).sum()} of {len(frames)} photos")
+    gains = torch.from_numpy(relative_log_exposures(frames, reference))
+    return reference, gains[:, None].expand(-1, 3)

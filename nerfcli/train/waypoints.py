@@ -1,0 +1,85 @@
+"""The field at a few moments of its training, measured when that is over: no held-out photo is opened before.
+
+What training cannot read, it cannot learn from, nor be stopped or steered by.
+"""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from nerfcli.atomic import cannot_write
+from nerfcli.errors import UserError
+from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.scene import Scene
+from nerfcli.train.exif_exposure import relative_log_exposures
+from nerfcli.train.heldout import HeldoutPixels
+from nerfcli.train.photos import load_album
+from nerfcli.train.preparation import Prepared
+from nerfcli.train.run_folder import add_to_log
+
+SHARES = (0.25, 0.5, 0.75, 1.0)
+FOLDER = "waypoints"
+
+
+def keep_waypoint(run: Path, step: int, model: Model) -> None:
+    """Write the field as it is after a step.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    try:
+        (run / FOLDER).mkdir(exist_ok=True)
+    except OSError as error:
+        raise cannot_write(run / FOLDER, error) from error
+    save_model(_path(run, step), model)
+
+
+def forget_waypoints(run: Path, *, after: int = -1) -> None:
+    """Remove those of later steps than `after`: a killed training has come farther than its last checkpoint."""
+    for step in _kept(run):
+        if step > after:
+            _path(run, step).unlink(missing_ok=True)
+    if not _kept(run):
+        shutil.rmtree(run / FOLDER, ignore_errors=True)
+
+
+def measure_waypoints(scene: Scene, run: Path, prepared: Prepared, *, notify: Callable[[str], None]) -> None:
+    """Add the PSNR of some held-out pixels to the entries of RUN/log.jsonl that stand for waypoints, and remove these.
+
+    Held-out photos that cannot be read are told, and nothing is measured: the training is done without them.
+    """
+    settings, device = prepared.settings, prepared.settings.device
+    steps = _kept(run)
+    if scene.test_frames and steps:
+        masks = settings.components.masks
+        try:
+            album = load_album(
+                scene.test_frames, factor=prepared.factor, threads=settings.threads, room=prepared.room, masks=masks
+            )
+            pixels = HeldoutPixels(
+                album.photos,
+                prepared.extent.training_from_scene,
+                torch.device(device),
+                log_gains=relative_log_exposures(scene.test_frames, prepared.log_exposure),
+                colours=album.colours,
+                room=prepared.room,
+            )
+        except UserError as error:
+            notify(f"the training is complete, but its held-out photos cannot be compared with: {error}")
+            return
+        measured = {step: pixels.psnr(load_model(_path(run, step), device)) for step in steps}
+        add_to_log(run, {step: {"heldout_psnr": psnr} for step, psnr in measured.items()})
+        told = ", ".join(f"{psnr:.2f} at step {step}" for step, psnr in measured.items())
+        notify(f"PSNR of some held-out pixels, in dB: {told}")
+    forget_waypoints(run)
+
+
+def _kept(run: Path) -> list[int]:
+    """The steps of which there are waypoints, in order."""
+    return sorted(int(path.stem) for path in (run / FOLDER).glob("*.safetensors") if path.stem.isdecimal())
+
+
+def _path(run: Path, step: int) -> Path:
+    return run / FOLDER / f"{step}.safetensors"

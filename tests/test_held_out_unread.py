@@ -1,0 +1,131 @@
+"""Held-out photos are opened by no stage of training or of the selection of components; only when both are over.
+
+Evidence: the interpreter's own audit of opened files; and fields that are the same to the bit whatever is in the
+held-out photos, which also covers what a library opens by itself. (Reading the scene comes first: where a format has no
+sizes of pictures, they are in the pictures' headers.)
+"""
+
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SPHERES
+
+from nerfcli import scene as scenes
+from nerfcli.field.checkpoint import load_tensors
+from nerfcli.media.images import write_png
+from nerfcli.scene import Scene
+from nerfcli.train import loop, preparation, selection, waypoints
+from nerfcli.train.components import Components
+from nerfcli.train.loop import train
+from nerfcli.train.run_folder import FIELD, read_log
+from nerfcli.train.settings import TrainSettings
+
+HELD_OUT = "test"  # the folder of these photos in the capture
+_listeners: list[list[str]] = []
+
+
+def _audit(event: str, arguments: tuple[object, ...]) -> None:
+    if event == "open" and _listeners and isinstance(arguments[0], str | bytes):
+        name = arguments[0] if isinstance(arguments[0], str) else arguments[0].decode(errors="replace")
+        for listener in _listeners:
+            listener.append(name)
+
+
+sys.addaudithook(_audit)  # for the rest of the process: Python has no way to take it away
+
+
+@pytest.fixture
+def opened() -> Iterator[list[str]]:
+    """The names of files that are opened meanwhile."""
+    names: list[str] = []
+    _listeners.append(names)
+    yield names
+    _listeners.remove(names)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(SPHERES, tmp_path / "capture"))
+
+
+def settings(model: str, components: Components) -> TrainSettings:
+    return TrainSettings(
+        budget_seconds=None,
+        steps=12,
+        first_samples_per_step=2**9,
+        samples_per_step=2**9,
+        model=model,
+        components=components,
+    )
+
+
+def fit(scene: Scene, run: Path, asked: TrainSettings) -> list[str]:
+    told: list[str] = []
+    train(scene, run, asked, resume=False, notify=told.append, on_progress=lambda progress: None)
+    return told
+
+
+def is_held_out(name: str, capture: Path) -> bool:
+    return str(capture / HELD_OUT) + "/" in name
+
+
+CASES = {
+    "default": ("default", Components()),
+    "auto": ("auto", Components()),
+    "exposures": ("default", Components(exposure="learned", masks="empty")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, opened, tmp_path, monkeypatch):
+    monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
+    monkeypatch.setattr(preparation, "SEARCH_SHARE", 1.0)
+    until_then: list[str] = []
+    measure = waypoints.measure_waypoints
+
+    def after_training(*arguments, **named) -> None:
+        until_then.extend(opened)
+        measure(*arguments, **named)
+
+    monkeypatch.setattr(loop, "measure_waypoints", after_training)
+    scene = scenes.load(capture)
+    opened.clear()
+    fit(scene, tmp_path / "run", settings(*CASES[case]))
+    assert any(str(capture / "train") in name for name in until_then), "the audit sees training photos"
+    assert [name for name in until_then if is_held_out(name, capture)] == []
+    assert any(is_held_out(name, capture) for name in opened), "they are compared with afterwards"
+
+
+@pytest.mark.parametrize("case", ["default", "auto"])
+def test_the_field_does_not_depend_on_what_is_in_held_out_photos(case, capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(selection, "FEWEST_STEPS", 1)
+    monkeypatch.setattr(preparation, "SEARCH_SHARE", 1.0)
+    # Trials are as long by steps; seconds would differ.
+    asked = settings(*CASES[case])
+    fit(scenes.load(capture), tmp_path / "run", asked)
+    noise = np.random.default_rng(0).integers(0, 256, (72, 96, 4), dtype=np.uint8)
+    for photo in (capture / HELD_OUT).glob("*.png"):
+        write_png(photo, noise)
+    fit(scenes.load(capture), tmp_path / "other", asked)
+    before, after = (load_tensors(tmp_path / name / FIELD, "cpu")[0] for name in ("run", "other"))
+    assert {name: tensor.numpy().tobytes() for name, tensor in before.items()} == {
+        name: tensor.numpy().tobytes() for name, tensor in after.items()
+    }
+    # What is measured does.
+    psnr, of_noise = (read_log(tmp_path / name)[-1]["heldout_psnr"] for name in ("run", "other"))
+    assert psnr != pytest.approx(of_noise, abs=0.1)
+
+
+def test_held_out_photos_that_are_gone_do_not_undo_a_training(capture, tmp_path):
+    loaded = scenes.load(capture)
+    for photo in (capture / HELD_OUT).glob("*.png"):
+        photo.unlink()
+    told = fit(loaded, tmp_path / "run", replace(settings("default", Components()), steps=4))
+    assert (tmp_path / "run" / FIELD).exists()
+    assert any("held-out photos cannot be compared with" in line for line in told)
+    assert "heldout_psnr" not in read_log(tmp_path / "run")[-1]
