@@ -69,14 +69,20 @@ class Capture:
         self.extent = choose_extent(capture, photos, settings, fills_frame=fills_frame, notify=print)
         self.similarity = self.extent.training_from_scene
         self.pool = PixelPool(photos, self.similarity, torch.device("cpu"))
-        test_photos = load_photos(capture.test_frames, factor=factor, threads=threads)
+        self.test_photos = load_photos(capture.test_frames, factor=factor, threads=threads)
         self.heldout = HeldoutPixels(
-            test_photos, self.similarity, torch.device("cpu"), log_gains=np.zeros((len(test_photos), 3))
+            self.test_photos, self.similarity, torch.device("cpu"), log_gains=np.zeros((len(self.test_photos), 3))
         )
         # A network of megabytes takes seconds for what a grid renders in milliseconds.
         for name in ("origins", "directions", "colours"):
             setattr(self.heldout, name, getattr(self.heldout, name)[:pixels])
         self.background = (1.0, 1.0, 1.0) if self.pool.has_alpha else (0.0, 0.0, 0.0)
+
+    def model(self, fitting: Fitting) -> Model:
+        """What the training of `fitting` has come to."""
+        return Model(
+            fitting.field, fitting.occupied, self.extent.marching, self.background, self.similarity, "arbitrary"
+        )
 
 
 def measure(capture: Capture, kind: str, *, megabytes: float, seconds: float, threads: int) -> Line:
@@ -96,9 +102,7 @@ def measure(capture: Capture, kind: str, *, megabytes: float, seconds: float, th
     while (used := time.process_time() - began) < budget:
         taken += fitting.advance(used / budget).samples
     clock = time.perf_counter() - clock
-    model = Model(
-        fitting.field, fitting.occupied, capture.extent.marching, capture.background, capture.similarity, "arbitrary"
-    )
+    model = capture.model(fitting)
     rendering = time.process_time()
     psnr = capture.heldout.psnr(model)
     rendering = time.process_time() - rendering

@@ -32,7 +32,9 @@ def trained(folder: Path, seconds: float, threads: int) -> Fitting:
     first = capture.train_frames[0].camera
     factor = automatic_downscale(first.width, first.height)
     photos = load_photos(capture.train_frames, factor=factor, threads=threads)
-    settings = TrainSettings(budget_seconds=seconds, threads=threads)
+    settings = TrainSettings(
+        budget_seconds=seconds, threads=threads, first_samples_per_step=TrainSettings.samples_per_step
+    )
     fills_frame = any(photo.pixels.shape[-1] == 3 for photo in photos)
     extent = choose_extent(capture, photos, settings, fills_frame=fills_frame, notify=print)
     pool = PixelPool(photos, extent.training_from_scene, torch.device("cpu"))

@@ -171,6 +171,24 @@ def test_a_fresh_field_is_a_thin_grey_fog():
     assert (rgb.mean(0) - 0.5).abs().max() < 0.25
 
 
+@pytest.mark.parametrize(("share", "learning"), [(None, 6), (0.0, 4), (0.24, 4), (0.26, 5), (0.5, 6), (1.0, 6)])
+def test_fine_levels_learn_later(share, learning):
+    """Of 6 levels, 4 from the start and the others one after the other up to half of the budget; a field that is read
+    from a file has all. Those that do not learn have no gradient, nor have the weights that read them."""
+    field = HashField(HashFieldSettings(contraction="none", levels=6, log2_rows=8, coarsest=4, finest=64, width=16))
+    if share is not None:
+        field.refine(share)
+    directions = torch.nn.functional.normalize(torch.randn(5, 3), dim=-1)
+    density, rgb = field.radiance(torch.rand(50, 3), directions, torch.arange(50) // 10)
+    (density.sum() + rgb.sum()).backward()
+    by_weight = field.weights[0].grad
+    assert field.table.grad is not None
+    assert by_weight is not None
+    wanted = [level < learning for level in range(6)]
+    assert (field.table.grad != 0).any((1, 2)).tolist() == wanted
+    assert (by_weight != 0).any(0).view(6, -1).any(1).tolist() == wanted
+
+
 def test_resolutions_run_from_coarsest_to_finest_in_geometric_progression():
     sides = HashFieldSettings(contraction="none", levels=5, coarsest=16, finest=256).resolutions
     assert sides == (16, 32, 64, 128, 256)

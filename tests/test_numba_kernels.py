@@ -53,12 +53,12 @@ once = pytest.mark.parametrize("threads", [1], ids=["1 thread"], indirect=True)
 @pytest.mark.parametrize("samples", SIZES)
 @pytest.mark.parametrize("magnitude", [1e-6, 1.0, 1e6])
 def test_hash_encode(samples, magnitude, generator):
-    resolutions = (4, 7, 40, 700)  # the second has as many vertices as the table has rows
-    table = torch.randn(4, 512, 4, generator=generator) * magnitude
+    resolutions = (4, 7, 0, 40, 700)  # the second has as many vertices as the table has rows, the third is left out
+    table = torch.randn(5, 512, 4, generator=generator) * magnitude
     points = torch.rand(samples, 3, generator=generator) * 1.2 - 0.1  # some are clamped
-    gradient = torch.randn(samples, 16, generator=generator)
+    gradient = torch.randn(samples, 20, generator=generator)
     for feature in range(4):
-        gradient[feature::5, [i for i in range(16) if i % 4 != feature]] = 0.0  # one feature alone has a gradient
+        gradient[feature::5, [i for i in range(20) if i % 4 != feature]] = 0.0  # one feature alone has a gradient
     fast, exact = table.clone().requires_grad_(), table.double().requires_grad_()
     encoded = numba_cpu.hash_encode(points, fast, resolutions, None, None)
     encoded.backward(gradient)
@@ -76,11 +76,11 @@ def test_hash_encode(samples, magnitude, generator):
 @pytest.mark.parametrize("samples", SIZES)
 @pytest.mark.parametrize("magnitude", [1e-6, 1.0, 1e6])
 def test_hash_encode_by_points(samples, magnitude, generator):
-    resolutions = (4, 7, 40, 700)
-    table = torch.randn(4, 512, 4, generator=generator) * magnitude
+    resolutions = (4, 7, 0, 40, 700)
+    table = torch.randn(5, 512, 4, generator=generator) * magnitude
     points = torch.rand(samples, 3, generator=generator) * 1.2 - 0.1
     points[::7, 0], points[1::7, 1] = 0.0, 1.0  # on the border the slope is that inside
-    gradient = torch.randn(samples, 16, generator=generator)
+    gradient = torch.randn(samples, 20, generator=generator)
     fast, same_precision, exact = (
         points.to(t).clone().requires_grad_() for t in (torch.float32,) * 2 + (torch.float64,)
     )

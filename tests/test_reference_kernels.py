@@ -191,6 +191,16 @@ def test_hash_encode_reads_no_row_that_is_no_vertex():
     assert torch.equal(reference.hash_encode(points, table, (4,)), torch.ones(3, 4))
 
 
+def test_hash_encode_leaves_levels_out():
+    table = torch.rand(3, ROWS, 2, dtype=torch.float64, requires_grad=True)
+    points = torch.rand(50, 3, dtype=torch.float64)
+    encoded = reference.hash_encode(points, table, (4, 0, 40))
+    whole = reference.hash_encode(points, table, RESOLUTIONS)
+    assert torch.equal(encoded, whole * torch.tensor([1, 1, 0, 0, 1, 1]))
+    (gradient,) = torch.autograd.grad(encoded.sum(), table)
+    assert (gradient != 0).any((1, 2)).tolist() == [True, False, True]
+
+
 def test_hash_encode_gradcheck_in_the_table():
     table = torch.rand(3, 64, 2, dtype=torch.float64, requires_grad=True)
     points = torch.rand(5, 3, dtype=torch.float64)

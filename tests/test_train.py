@@ -223,6 +223,27 @@ def test_resume_goes_on_to_a_larger_total(views, tmp_path):
     assert fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True) == []
 
 
+def test_what_has_learned_goes_on_learning_in_a_larger_budget(views, tmp_path):
+    """The finest level of the grid is not due at 4 of 400 steps, but in a field that has it already."""
+
+    def stop(progress: Progress) -> None:
+        if progress.step == 4:
+            raise KeyboardInterrupt
+
+    def finest(run: Path) -> torch.Tensor:
+        return load_tensors(run / "field.safetensors", "cpu")[0]["table"][-1]
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(views, tmp_path / "fresh", replace(FEW, steps=400), on_progress=stop)
+    assert finest(tmp_path / "fresh").abs().max() <= 1e-4  # as it was made
+    fit(views, tmp_path / "run", replace(FEW, steps=3))
+    learned = finest(tmp_path / "run")
+    assert learned.abs().max() > 1e-4
+    with pytest.raises(KeyboardInterrupt):
+        fit(views, tmp_path / "run", replace(FEW, steps=400), resume=True, on_progress=stop)
+    assert not torch.equal(finest(tmp_path / "run"), learned)
+
+
 @pytest.mark.parametrize("last", ["field.safetensors", "state.safetensors"])
 def test_a_kill_between_field_and_state_is_no_harm(last, views, tmp_path):
     # The second checkpoint dies after its first file, or the first one does.

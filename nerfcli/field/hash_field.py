@@ -14,6 +14,8 @@ from nerfcli.field.interface import Field, FieldSettings, Samples
 # Outputs of the density network, the logarithm of the density first; all of them go on to the colour network.
 GEOMETRY = 16
 HARMONICS = 16
+# The levels that learn from the start, and the share of the budget from which on all do.
+FIRST_LEVELS, ALL_LEVELS_SHARE = 4, 0.5
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,7 @@ class HashField(Field):
         self.table = nn.Parameter(torch.empty(shape).uniform_(-1e-4, 1e-4))
         sizes = ((width, encoded), (GEOMETRY, width), (width, GEOMETRY + HARMONICS), (width, width), (3, width))
         self.weights = nn.ParameterList([_uniform_weights(*size) for size in sizes])
+        self._resolutions = settings.resolutions
 
     @property
     def settings(self) -> HashFieldSettings:
@@ -66,12 +69,18 @@ class HashField(Field):
     def rows(self) -> nn.Parameter:
         return self.table
 
+    def refine(self, share: float) -> None:
+        resolutions = self.settings.resolutions
+        first = min(FIRST_LEVELS, len(resolutions))
+        learning = first + int((len(resolutions) - first) * share / ALL_LEVELS_SHARE)
+        self._resolutions = tuple(side if level < learning else 0 for level, side in enumerate(resolutions))
+
     def density(self, coordinates: Tensor) -> Tensor:
-        encoded = kernels.hash_encode(coordinates, self.table, self.settings.resolutions)
+        encoded = kernels.hash_encode(coordinates, self.table, self._resolutions)
         return kernels.density(encoded, tuple(self.weights))
 
     def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        encoded = kernels.hash_encode(coordinates, self.table, self.settings.resolutions)
+        encoded = kernels.hash_encode(coordinates, self.table, self._resolutions)
         return self._radiance_of_encoded(encoded, directions, rays)
 
     def visible_samples(
@@ -93,7 +102,7 @@ class HashField(Field):
                 occupied=occupied,
                 contraction=self.settings.contraction,
                 table=self.table,
-                resolutions=self.settings.resolutions,
+                resolutions=self._resolutions,
                 weights=tuple(self.weights),
                 deepest=deepest,
             )
@@ -105,9 +114,7 @@ class HashField(Field):
     def radiance_of_samples(
         self, samples: Samples, directions: Tensor, rays: Tensor, *, sink: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        encoded = kernels.hash_encode(
-            samples.coordinates, self.table, self.settings.resolutions, sink=sink, known=samples.code
-        )
+        encoded = kernels.hash_encode(samples.coordinates, self.table, self._resolutions, sink=sink, known=samples.code)
         return self._radiance_of_encoded(encoded, directions, rays)
 
     def _radiance_of_encoded(self, encoded: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:

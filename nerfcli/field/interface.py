@@ -68,6 +68,12 @@ class Field(nn.Module, abc.ABC):
         parameters take part in every sample.
         """
 
+    def refine(self, share: float) -> None:
+        """Have the details learn that are due at this share of the budget; see `hash_field`.
+
+        Those that do not learn yet are as they were made: nothing that can be seen.
+        """
+
     @abc.abstractmethod
     def density(self, coordinates: Tensor) -> Tensor:
         """Density (N,) in 1 / training unit at coordinates (N, 3) of the unit cube."""

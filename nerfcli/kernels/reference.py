@@ -41,10 +41,10 @@ def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> 
     Args:
         points: (N, 3) in [0, 1]; values outside are clamped.
         table: (L, T, F), T a power of two.
-        resolutions: cells per axis of each of the L levels.
+        resolutions: cells per axis of each of the L levels; 0 leaves a level out.
 
     Returns:
-        (N, L * F), level after level.
+        (N, L * F), level after level; 0 for a level that is left out.
 
     Raises:
         ValueError: the table does not have one level per resolution, or T is not a power of two.
@@ -62,6 +62,9 @@ def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> 
     corners = torch.tensor([[i >> axis & 1 for axis in range(3)] for i in range(8)], device=points.device)
     encoded = []
     for level, resolution in enumerate(resolutions):
+        if resolution == 0:
+            encoded.append(table.new_zeros(len(points), table.shape[2]))
+            continue
         scaled = points.clamp(0.0, 1.0) * resolution
         cell = scaled.detach().floor().clamp_max(resolution - 1)  # the far border belongs to the last cell
         inside = (scaled - cell)[:, None, :]  # (N, 1, 3)

@@ -26,11 +26,16 @@ OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
 REFRESH_TURNS = 8
 MOST_RAYS = 2**14
+# Steps until a step is twice as large. What many steps have gone over is learned by larger ones, which cost less for a
+# sample; a training that has few steps in all learns more from many small ones.
+DOUBLING_STEPS, MOST_DOUBLINGS = 600, 16
 # Rays of the training end where less than a thousandth of the light is left.
 DEEPEST = 7.0
 # Rays pass over cells where a step takes away less light than this: hardly any at first, when all of space is thin fog
 # and nothing tells yet where the surfaces are; then ever more, so that surfaces have to become compact.
 FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
+# Both beginnings are over at these shares of the budget at the latest, however few the steps.
+WARMUP_SHARE, CLOSING_SHARE = 0.1, 0.3
 # Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
 STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
 
@@ -79,6 +84,8 @@ class Fitting:
         self.marching = marching
         self.settings = settings
         self.step = 0
+        # The largest share of a budget so far: a training that goes on to a larger one has used less of that.
+        self.furthest = 0.0
         self.components = settings.components
         if size is None:
             size = chosen_size(
@@ -119,6 +126,8 @@ class Fitting:
         """
         self.in_step = True
         watch.state(self.state)
+        self.furthest = max(self.furthest, share)
+        self.field.refine(self.furthest)
         drawn = self.draw(share)
         rays = len(drawn.origins)
         stride = next(stride for until, stride in STRIDES if share <= until)
@@ -142,7 +151,8 @@ class Fitting:
         settings = self.settings
         if self.step % REFRESH_EVERY == 0:
             self._refresh_occupancy()
-        wanted = settings.first_samples_per_step + share * (settings.samples_per_step - settings.first_samples_per_step)
+        growth = 2.0 ** min(self.step / DOUBLING_STEPS, MOST_DOUBLINGS)
+        wanted = min(settings.samples_per_step, growth * settings.first_samples_per_step)
         rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
         drawn = self.pool.draw(rays, self.generator)
         if self.points is None or fading(share) == 0.0:
@@ -158,7 +168,7 @@ class Fitting:
         """Linear warm-up, then an exponential from the first to the final rate over the budget."""
         settings = self.settings
         decay = math.log(settings.final_learning_rate / settings.learning_rate)
-        warmup = min(1.0, (self.step + 1) / settings.warmup_steps)
+        warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, share / WARMUP_SHARE))
         return self.rate_factor * settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
 
     def _loss(self, drawn: Drawn, *, edges: Tensor, share: float, watch: Watch) -> tuple[Tensor, int]:
@@ -233,7 +243,7 @@ class Fitting:
 
     def _open_cells(self) -> Tensor:
         """The cells that rays look into: those that take away more light than the threshold of this step."""
-        closed = min(1.0, self.step / self.field.closing_steps)
+        closed = min(1.0, max(self.step / self.field.closing_steps, self.furthest / CLOSING_SHARE))
         threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
         return self.occupancy.above(threshold)
 
@@ -264,6 +274,7 @@ class Fitting:
             "samples_per_ray": self.samples_per_ray,
             "rate_factor": self.rate_factor,
             "rollbacks": self.rollbacks,
+            "furthest": self.furthest,
         }
 
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
@@ -279,6 +290,7 @@ class Fitting:
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]
+        self.furthest = description.get("furthest", 1.0)  # all details used to learn from the start
         self.in_step = False
         # Not opened anew: the threshold moves between two refreshes, the open cells do not.
         self.occupied = tensors["occupied"]

@@ -28,7 +28,7 @@ class TrainSettings:
         seed: of everything random.
         device: a torch device name.
         threads: CPU threads.
-        first_samples_per_step, samples_per_step: field samples that a step aims at, at the start and at the end; the
+        first_samples_per_step, samples_per_step: field samples that a step aims at, at the start and at most; the
             number of rays follows. Small steps learn more from a sample, large ones cost less each.
         learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
         warmup_steps: steps over which the learning rate rises from 0.

@@ -100,6 +100,11 @@ def encode_range(
     width = resolutions.shape[0] * FEATURES
     for level in range(resolutions.shape[0]):
         resolution = resolutions[level]
+        if resolution == 0:
+            for i in range(first, last):
+                for feature in range(FEATURES):
+                    out[i * width + level * FEATURES + feature] = np.float32(0)
+            continue
         offset = np.int64(level) * rows * FEATURES
         for start in range(first, last, BLOCK):
             count = min(BLOCK, last - start)
@@ -126,6 +131,8 @@ def _encode_backward(points: Any, gradient: Any, rows: Any, resolutions: Any, fl
         index, weight = scratch[2], scratch[3]
         for level in range(thread, resolutions.shape[0], threads):
             resolution = resolutions[level]
+            if resolution == 0:
+                continue
             offset = np.int64(level) * rows * FEATURES
             column = level * FEATURES
             for first in range(0, samples, BLOCK):
@@ -170,6 +177,8 @@ def _points_backward(
         inside, index, dots = scratch[1], scratch[2], scratch[3]
         for level in range(resolutions.shape[0]):
             resolution = resolutions[level]
+            if resolution == 0:
+                continue
             offset = np.int64(level) * rows * FEATURES
             for first in range(begin, end, BLOCK):
                 count = min(BLOCK, end - first)
