@@ -31,6 +31,8 @@ from nerfcli.media.images import downscale, read_image
 
 SAMPLES = Path(__file__).parent.parent / "sample_scenes"
 DESK_DOWNSCALE = 2
+# What the photos of `scales` are smaller by.
+SCALES = (1, 4)
 # Of the views of the balls.
 VIEWS, WIDTH, HEIGHT, SUBPIXELS, REACH, FOV_X = 48, 160, 120, 3, 4.4, 0.8
 EXPOSURE_SPREAD, WHITE_BALANCE_SPREAD = 0.3, 0.06
@@ -141,6 +143,19 @@ def focal(views: list[View], generator: np.random.Generator) -> tuple[list[View]
     camera = views[0].camera
     wrong = replace(camera, params=(camera.params[0] * (1 + FOCAL_ERROR), *camera.params[1:]))
     return [view if view.test else replace(view, camera=wrong) for view in views], {"params": list(camera.params)}
+
+
+def scales() -> list[View]:
+    """The desk in photos of two sizes in turn, as from near and from four times as far away, among the held-out ones,
+    too: what is a pixel wide in one is a quarter of a pixel in the other."""
+    views = desk_views()
+    places = {view.name: i for held in (False, True) for i, view in enumerate(v for v in views if v.test == held)}
+    changed = []
+    for view in views:
+        factor = SCALES[places[view.name] % len(SCALES)]
+        camera = view.camera.resized(view.camera.width // factor, view.camera.height // factor)
+        changed.append(replace(view, camera=camera, pixels=downscale(view.pixels, factor)))
+    return changed
 
 
 # --- the balls --------------------------------------------------------------------------------------------------------
@@ -322,6 +337,7 @@ MAKERS: dict[str, tuple[Callable[[], list[View]], Change | None]] = {
     "desk": (desk_views, None),
     **{name: (desk_views, change) for name, change in CHANGES.items()},
     "alpha": (alpha, None),
+    "scales": (scales, None),
     **{f"{name}-balls": (alpha, change) for name, change in CHANGES.items()},
     "glossy": (glossy, None),
     "unbounded": (unbounded, None),

@@ -41,6 +41,7 @@ CASES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("unbounded", 1, ("", "background=constant", "background")),
     ("turntable", 1, ("", "masks")),
     ("few", 1, ("", "points", "points=1")),
+    ("scales", 1, ("", "antialias")),
 )
 
 

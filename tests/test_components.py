@@ -48,6 +48,14 @@ def test_unknown_names_and_values_are_wrong_usage(included, excluded, match):
     assert caught.value.exit_code == 2
 
 
+def test_only_a_grid_of_levels_can_let_them_fade_out():
+    components = replace(Components(), antialias=True)
+    TrainSettings(components=components)
+    with pytest.raises(UserError, match="--field voxels: a field of this kind has no levels") as caught:
+        TrainSettings(components=components, field="voxels")
+    assert caught.value.exit_code == 2
+
+
 def test_components_are_in_the_settings_as_json():
     settings = TrainSettings(components=replace(Components(), view=1)).to_json()
     assert json.loads(json.dumps(settings))["components"] == {**Components().to_json(), "view": 1}

@@ -110,7 +110,15 @@ class Wall:
         self.model = fog(foggy_cells((0, 0, 0), (0, 0, 0)), Similarity(1 / 3, np.eye(3), np.zeros(3)))
         self.calls = 0
 
-    def render(self, model: Model, origins: Tensor, directions: Tensor, *, background: Tensor) -> RaysSeen:
+    def render(
+        self,
+        model: Model,
+        origins: Tensor,
+        directions: Tensor,
+        *,
+        background: Tensor,
+        cones: Tensor | None = None,
+    ) -> RaysSeen:
         self.calls += 1
         hit = 3.0 * (origins - directions * (origins[:, 2:] / directions[:, 2:])).double()  # scene units
         waves = torch.stack(

@@ -15,7 +15,7 @@ from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.encodings import fourier_features, spherical_harmonics
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
-from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
@@ -234,6 +234,34 @@ def test_the_sink_gets_the_gradient_of_the_rows(field):
             assert torch.equal(changed.any(-1), touched)
         else:
             assert changed.float().mean() > 0.5
+
+
+def test_marching_and_learning_see_pixels_of_the_same_width():
+    """Density and colour with gradients are those that the march saw, and levels count min(1, cell / width) in both;
+    without antialias, nothing has a width."""
+    settings = HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=64, antialias=True)
+    blurred, sharp = HashField(settings), HashField(replace(settings, antialias=False))
+    with torch.no_grad():
+        blurred.table.normal_()
+        sharp.load_state_dict(blurred.state_dict())
+    torch.manual_seed(0)
+    directions = looks(5)
+    marched = {"jitter": torch.zeros(5), "occupied": torch.ones(4, 4, 4, dtype=torch.bool), "deepest": 50.0}
+    rays = (-2 * directions, directions, torch.linspace(1, 3, 9))
+    for width in (1e-6, 0.05, 1e9):
+        cones = torch.full((5,), width)
+        samples = blurred.visible_samples(*rays, **marched, cones=cones)
+        of_rays = kernels.ray_indices(samples.offsets)
+        density, rgb = blurred.radiance_of_samples(samples, directions, of_rays, sink=None)
+        torch.testing.assert_close(density, samples.density, rtol=1e-5, atol=0)
+        torch.testing.assert_close(rgb, blurred.colour_of_code(samples.code, directions, of_rays), rtol=1e-5, atol=0)
+        assert sharp.visible_samples(*rays, **marched, cones=cones).widths is None
+        whole = kernels.hash_encode(samples.coordinates, blurred.table, settings.resolutions)
+        middles = (samples.starts + samples.ends) / 2
+        # All of them lie inside the unit ball, where a coordinate is a quarter of a length.
+        assert (middles < 3).all()
+        left = 1 / (width * middles[:, None] / 4 * torch.tensor(settings.resolutions)).clamp_min(1.0)
+        torch.testing.assert_close(samples.code, whole * left.repeat_interleave(4, dim=1), rtol=1e-4, atol=1e-6)
 
 
 def test_the_state_of_the_optimiser_comes_back(field):

@@ -68,6 +68,14 @@ def test_hash_encode(samples, magnitude, generator):
     same_precision = table.clone().requires_grad_()
     reference.hash_encode(points, same_precision, resolutions).backward(gradient)
     assert_close(fast.grad, same_precision.grad, "table gradient")
+    widths = torch.rand(samples, generator=generator).pow(4)
+    faded = table.clone().requires_grad_()
+    encoded = numba_cpu.hash_encode(points, faded, resolutions, None, None, widths)
+    encoded.backward(gradient)
+    assert_close(encoded, reference.hash_encode(points, table, resolutions, widths), "encoded, with widths")
+    same_precision.grad = None
+    reference.hash_encode(points, same_precision, resolutions, widths).backward(gradient)
+    assert_close(faded.grad, same_precision.grad, "table gradient, with widths")
     if samples and fast.grad is not None and exact.grad is not None:
         # Against float64 the place inside a cell is off by 700 * eps; so are weights and gradients.
         assert (fast.grad.double() - exact.grad).norm() <= 700 * 2e-7 * exact.grad.norm()
@@ -256,7 +264,8 @@ def test_ray_indices(samples, generator):
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 # Thin fog lets every ray through; at 8 the densities reach e^15, and some rays end in their first sample.
 @pytest.mark.parametrize("contrast", [0.0, 1.0, 8.0])
-def test_visible_samples(rays, contraction, contrast, generator):
+@pytest.mark.parametrize("with_cones", [False, True])
+def test_visible_samples(rays, contraction, contrast, with_cones, generator):
     origins = torch.randn(rays, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
     edges = torch.rand(60, generator=generator).cumsum(0) * 0.2
@@ -270,6 +279,7 @@ def test_visible_samples(rays, contraction, contrast, generator):
         "resolutions": (4, 5, 6, 7, 9, 11, 13, 16),
         "weights": weights,
         "deepest": 7.0,
+        "cones": torch.rand(rays, generator=generator) if with_cones else None,
     }
     fast = numba_cpu.visible_samples(origins, directions, edges, **settings)
     exact = reference.visible_samples(origins, directions, edges, **settings)

@@ -13,6 +13,7 @@ from oracles import march_through_slabs, trilinear_hash
 from nerfcli import kernels
 from nerfcli.field.contraction import training_points, uncontract
 from nerfcli.kernels import reference
+from nerfcli.kernels.contraction import cube_widths
 
 
 def random_rays(seed, counts, dtype=torch.float64):
@@ -205,6 +206,31 @@ def test_hash_encode_gradcheck_in_the_table():
     table = torch.rand(3, 64, 2, dtype=torch.float64, requires_grad=True)
     points = torch.rand(5, 3, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda t: reference.hash_encode(points, t, (2, 5, 11)), table)
+    widths = torch.tensor([0.0, 1e-9, 0.1, 0.3, 10.0], dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda t: reference.hash_encode(points, t, (2, 5, 11), widths), table)
+
+
+def test_hash_encode_fades_levels_finer_than_a_pixel():
+    # Closed form: a pixel as wide as n cells of a level leaves 1 / n of it, one narrower than a cell leaves all.
+    table = torch.rand(3, ROWS, 2, dtype=torch.float64)
+    points = torch.rand(5, 3, dtype=torch.float64)
+    widths = torch.tensor([0.0, 1 / 40, 1 / 7, 0.5, 1e30], dtype=torch.float64)
+    left = torch.tensor([[1, 1, 1], [1, 1, 1], [1, 1, 7 / 40], [1 / 2, 2 / 7, 1 / 20], [0, 0, 0]]).double()
+    whole = reference.hash_encode(points, table, RESOLUTIONS)
+    faded = reference.hash_encode(points, table, RESOLUTIONS, widths)
+    torch.testing.assert_close(faded, whole * left.repeat_interleave(2, dim=1))
+
+
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
+@pytest.mark.parametrize("radius", [1e-3, 0.9, 1.1, 30.0, 1e6])
+def test_widths_are_those_of_a_short_line_across(contraction, radius):
+    # Against `grid_coordinates` of both ends of a line across the direction from the centre, along an axis, where the
+    # cube's norm does not change along the line.
+    point = torch.tensor([[0.0, -radius, 0.0]], dtype=torch.float64)
+    across = torch.tensor([[radius * 1e-6, 0.0, 0.0]], dtype=torch.float64)
+    ends = [kernels.grid_coordinates(point + half * across, contraction) for half in (-0.5, 0.5)]
+    width = cube_widths(point, across.norm(dim=-1), contraction)
+    torch.testing.assert_close(width, (ends[1] - ends[0]).norm(dim=-1), rtol=1e-6, atol=0)
 
 
 def test_hash_encode_gradcheck_in_points_inside_cells(generator):

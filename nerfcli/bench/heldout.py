@@ -155,6 +155,7 @@ def _rendered(
             background=behind[begin : begin + len(some)],
             shares=(),
             tolerance=tolerance,
+            cones=rays.cones[begin : begin + len(some)].to(dtype),
         ).rgb
         for begin, some in zip(range(0, len(directions), at_a_time), directions.split(at_a_time), strict=True)
     ]

@@ -98,7 +98,8 @@ def align_pose(
         moved = replace(frame, world_from_cam=pose)
         rays = pixel_rays(moved, model.training_from_scene, pixels=chosen, places=CENTRES, device=model.device)
         behind = colours_behind(background, rays.directions)
-        rgb = render_rays(model, rays.origin.expand_as(rays.directions), rays.directions, background=behind).rgb
+        origins = rays.origin.expand_as(rays.directions)
+        rgb = render_rays(model, origins, rays.directions, background=behind, cones=rays.cones).rgb
         if log_gain != 0.0:
             rgb = exposed(rgb, rgb.new_tensor(log_gain))
         return (rgb.clamp(0.0, 1.0).cpu().numpy().astype(np.float64) - wanted).ravel()

@@ -84,6 +84,7 @@ class FourierField(Field):
         jitter: Tensor,
         occupied: Tensor,
         deepest: float,
+        cones: Tensor | None = None,
     ) -> Samples:
         # Training needs the layers again, with gradients: the code is no more than the place.
         return visible_samples(

@@ -27,6 +27,7 @@ class HashFieldSettings(FieldSettings):
         log2_rows: rows per level as a power of two.
         coarsest, finest: cells per axis of the first and the last level; those between are in geometric progression.
         width: neurons of the hidden layers.
+        antialias: whether levels finer than a pixel fade out of what it sees.
     """
 
     kind: ClassVar[str] = "hash"
@@ -37,6 +38,7 @@ class HashFieldSettings(FieldSettings):
     coarsest: int = 16
     finest: int = 1024
     width: int = 32
+    antialias: bool = False
 
     @property
     def resolutions(self) -> tuple[int, ...]:
@@ -92,21 +94,31 @@ class HashField(Field):
         jitter: Tensor,
         occupied: Tensor,
         deepest: float,
+        cones: Tensor | None = None,
     ) -> Samples:
-        return Samples(
+        contraction, cones = self.settings.contraction, cones if self.settings.antialias else None
+        samples = Samples(
             *kernels.visible_samples(
                 origins,
                 directions,
                 edges,
                 jitter=jitter,
                 occupied=occupied,
-                contraction=self.settings.contraction,
+                contraction=contraction,
                 table=self.table,
                 resolutions=self._resolutions,
                 weights=tuple(self.weights),
                 deepest=deepest,
+                cones=cones,
             )
         )
+        if cones is None:
+            return samples
+        rays = kernels.ray_indices(samples.offsets)
+        widths = kernels.sample_widths(
+            origins, directions, samples.starts, samples.ends, rays=rays, cones=cones, contraction=contraction
+        )
+        return samples._replace(widths=widths)
 
     def colour_of_code(self, code: Tensor, directions: Tensor, rays: Tensor) -> Tensor:
         return self._radiance_of_encoded(code, directions, rays)[1]
@@ -114,7 +126,9 @@ class HashField(Field):
     def radiance_of_samples(
         self, samples: Samples, directions: Tensor, rays: Tensor, *, sink: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        encoded = kernels.hash_encode(samples.coordinates, self.table, self._resolutions, sink=sink, known=samples.code)
+        encoded = kernels.hash_encode(
+            samples.coordinates, self.table, self._resolutions, sink=sink, known=samples.code, widths=samples.widths
+        )
         return self._radiance_of_encoded(encoded, directions, rays)
 
     def _radiance_of_encoded(self, encoded: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:

@@ -35,6 +35,7 @@ class Samples(NamedTuple):
         code: (N, C) what the field computed on the way to the density and can go on with to the colour.
         coordinates: (N, 3) in the field's unit cube.
         offsets: (R + 1,) int64.
+        widths: (N,) of pixels there, see `kernels.hash_encode`; None where they do not matter.
     """
 
     starts: Tensor
@@ -43,6 +44,7 @@ class Samples(NamedTuple):
     code: Tensor
     coordinates: Tensor
     offsets: Tensor
+    widths: Tensor | None = None
 
 
 class Field(nn.Module, abc.ABC):
@@ -92,8 +94,13 @@ class Field(nn.Module, abc.ABC):
         jitter: Tensor,
         occupied: Tensor,
         deepest: float,
+        cones: Tensor | None = None,
     ) -> Samples:
-        """The samples of rays that light gets to; see `kernels.visible_samples`."""
+        """The samples of rays that light gets to; see `kernels.visible_samples`.
+
+        Args:
+            cones: (R,) width of the pixel of each ray per distance; what has no levels does not look at it.
+        """
 
     @abc.abstractmethod
     def colour_of_code(self, code: Tensor, directions: Tensor, rays: Tensor) -> Tensor:

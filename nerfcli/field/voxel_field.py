@@ -88,6 +88,7 @@ class VoxelField(Field):
         jitter: Tensor,
         occupied: Tensor,
         deepest: float,
+        cones: Tensor | None = None,
     ) -> Samples:
         return visible_samples(
             origins,

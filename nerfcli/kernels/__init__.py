@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nerfcli.kernels import depth as depth_reference
 from nerfcli.kernels import marching, reference
-from nerfcli.kernels.contraction import CONTRACTIONS, contract, contract_to_cube, grid_coordinates
+from nerfcli.kernels.contraction import CONTRACTIONS, contract, contract_to_cube, grid_coordinates, sample_widths
 from nerfcli.kernels.depth import LightEnds
 from nerfcli.kernels.reference import sum_along_rays
 
@@ -40,6 +40,7 @@ __all__ = [
     "radiance",
     "ray_indices",
     "sample_coordinates",
+    "sample_widths",
     "sum_along_rays",
     "visible_samples",
 ]
@@ -90,6 +91,7 @@ def hash_encode(
     *,
     sink: Tensor | None = None,
     known: Tensor | None = None,
+    widths: Tensor | None = None,
 ) -> Tensor:
     """See `reference.hash_encode`.
 
@@ -100,7 +102,7 @@ def hash_encode(
     """
     numba_cpu = _numba_cpu()
     if numba_cpu is not None and numba_cpu.can_hash_encode(points, table, resolutions):
-        return numba_cpu.hash_encode(points, table, resolutions, sink, known)
+        return numba_cpu.hash_encode(points, table, resolutions, sink, known, widths)
     if sink is not None and table.requires_grad and torch.is_grad_enabled():
         leaf = table.detach().to(sink.dtype).requires_grad_()  # half precision's gradients go on unrounded
 
@@ -109,8 +111,8 @@ def hash_encode(
                 sink.add_(given.grad)
 
         leaf.register_post_accumulate_grad_hook(add_to_sink)
-        return reference.hash_encode(points, leaf, resolutions)
-    return reference.hash_encode(points, table, resolutions)
+        return reference.hash_encode(points, leaf, resolutions, widths)
+    return reference.hash_encode(points, table, resolutions, widths)
 
 
 def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
@@ -207,6 +209,7 @@ def visible_samples(
     resolutions: tuple[int, ...],
     weights: tuple[Tensor, ...],
     deepest: float,
+    cones: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """See `reference.visible_samples`."""
     numba_cpu = _numba_cpu()
@@ -227,6 +230,7 @@ def visible_samples(
         resolutions=resolutions,
         weights=weights,
         deepest=deepest,
+        cones=cones,
     )
 
 

@@ -77,3 +77,47 @@ def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
             return contract_to_cube(points) / 4.0 + 0.5
         case _:
             raise ValueError(f"contraction must be one of {CONTRACTIONS}, got {contraction!r}")
+
+
+def cube_widths(points: Tensor, widths: Tensor, contraction: str) -> Tensor:
+    """How wide what a pixel sees at some points is, in coordinates of the cube of `grid_coordinates`.
+
+    The stretch across the line from the centre: 1/2 without contraction, else 1/4 of (2 - 1/m) / m with m the norm of
+    the contraction, at least 1. What is far away is seen along that line.
+
+    Args:
+        points: (N, 3) training frame.
+        widths: (N,) of a pixel there, in units of the training frame.
+        contraction: one of `CONTRACTIONS`.
+
+    Returns:
+        (N,).
+    """
+    if contraction == "none":
+        return widths / 2.0
+    norm = points.norm(dim=-1) if contraction == "l2" else points.abs().amax(-1)
+    norm = norm.clamp_min(1.0)
+    return widths * ((2.0 - 1.0 / norm) / norm / 4.0)
+
+
+def sample_widths(
+    origins: Tensor,
+    directions: Tensor,
+    starts: Tensor,
+    ends: Tensor,
+    *,
+    rays: Tensor,
+    cones: Tensor,
+    contraction: str,
+) -> Tensor:
+    """`cube_widths` of pixels at the middles of intervals along rays, (N,).
+
+    Args:
+        origins, directions: (R, 3), unit directions, training frame.
+        starts, ends: (N,) distances.
+        rays: (N,) int64, the ray of each interval.
+        cones: (R,) width of the pixel of each ray per distance.
+        contraction: one of `CONTRACTIONS`.
+    """
+    middles = (starts + ends) / 2
+    return cube_widths(origins[rays] + directions[rays] * middles[:, None], cones[rays] * middles, contraction)

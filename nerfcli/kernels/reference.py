@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.activations import density_from_log, opacity
-from nerfcli.kernels.contraction import grid_coordinates
+from nerfcli.kernels.contraction import grid_coordinates, sample_widths
 
 HASH_PRIMES = (1, 2654435761, 805459861)
 
@@ -35,13 +35,17 @@ def corner_rows(cells: Tensor, resolution: int, rows: int) -> Tensor:
     return mixed & (rows - 1)  # the low bits are the same in 32 and in 64 bits
 
 
-def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> Tensor:
+def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...], widths: Tensor | None = None) -> Tensor:
     """Trilinear interpolation in a multiresolution hash table.
+
+    With widths, a level of n cells per axis counts min(1, 1 / (n width)): details smaller than what a pixel covers
+    fade out of what it sees.
 
     Args:
         points: (N, 3) in [0, 1]; values outside are clamped.
         table: (L, T, F), T a power of two.
         resolutions: cells per axis of each of the L levels; 0 leaves a level out.
+        widths: (N,) of a pixel at the points, as a share of the cube's side, >= 0; without gradient.
 
     Returns:
         (N, L * F), level after level; 0 for a level that is left out.
@@ -52,7 +56,8 @@ def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> 
     Differentiable in the table, and in points inside the cells: the gradient is that of the piecewise trilinear
     function. It jumps where a point crosses a face of a cell of any level, and is there that of the upper cell; outside
     [0, 1] it is 0.
-    Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, section 3.
+    Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, section 3; for the widths Barron et al. 2023, Zip-NeRF,
+    arXiv:2304.06706, eq. 3, with a cheaper function that falls off alike.
     """
     levels, rows, _ = table.shape
     if levels != len(resolutions):
@@ -70,6 +75,8 @@ def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> 
         inside = (scaled - cell)[:, None, :]  # (N, 1, 3)
         weights = torch.where(corners == 1, inside, 1.0 - inside).prod(-1)  # (N, 8)
         index = corner_rows(cell.long()[:, None, :] + corners, resolution, rows)  # (N, 8)
+        if widths is not None:
+            weights = weights / (resolution * widths).clamp_min(1.0)[:, None]
         encoded.append((table[level][index] * weights[..., None]).sum(1))
     return torch.cat(encoded, dim=-1)
 
@@ -308,6 +315,7 @@ def visible_samples(
     resolutions: tuple[int, ...],
     weights: tuple[Tensor, ...],
     deepest: float,
+    cones: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The samples of `march` in front of which the optical depth is below a limit, with what the field says of them.
 
@@ -318,6 +326,7 @@ def visible_samples(
         table, resolutions: see `hash_encode`.
         weights: see `density`.
         deepest: > 0; each ray ends with the sample that brings its optical depth to this.
+        cones: (R,) width of the pixel of each ray per distance, for `hash_encode` with widths; None for without.
 
     Returns:
         starts (N,), ends (N,), density (N,), encoded (N, L * F), coordinates (N, 3) in the field's unit cube,
@@ -328,7 +337,11 @@ def visible_samples(
             origins, directions, edges, jitter=jitter, occupied=occupied, contraction=contraction
         )
         coordinates = sample_coordinates(origins, directions, starts, ends, offsets=offsets, contraction=contraction)
-        encoded = hash_encode(coordinates, table, resolutions)
+        widths = None
+        if cones is not None:
+            rays = ray_indices(offsets)
+            widths = sample_widths(origins, directions, starts, ends, rays=rays, cones=cones, contraction=contraction)
+        encoded = hash_encode(coordinates, table, resolutions, widths)
         thickness = density(encoded, weights)
         seen = optical_depth_before(thickness, ends - starts, offsets) < deepest
         kept = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]

@@ -136,6 +136,7 @@ def _renderings(
             background=background,
             shares=shares(depth) if depth is not None else (),
             tolerance=wanted,
+            cones=rays.cones[rays.valid],
         )
         for parts, wanted in ((1, tolerance), (1, TIGHT), (2, TIGHT), (4, TIGHT))
     ]

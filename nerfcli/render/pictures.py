@@ -157,6 +157,7 @@ def _render_tile(
         background=behind,
         shares=wanted,
         tolerance=quality.tolerance,
+        cones=rays.cones[part],
     )
     scale = model.training_from_scene.scale
     # From the training frame's distance along the ray to the scene's along the axis; there is no z behind the camera.

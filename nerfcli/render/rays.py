@@ -4,6 +4,7 @@ Ray of pixel p:  origin = R c + t scaled,  direction = R_frame R_cam bearing(p) 
 along rays are lengths and density times length is an optical depth.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,12 +27,14 @@ class Rays:
         directions: (N, 3) unit.
         valid: (N,) bool; places that the lens model cannot invert have no ray.
         cosines: (N,) between each ray and the optical axis: z = distance * cosine.
+        cones: (N,) width per distance of what a ray stands for: a pixel's, or a share of its area.
     """
 
     origin: Tensor
     directions: Tensor
     valid: Tensor
     cosines: Tensor
+    cones: Tensor
 
 
 def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> Rays:
@@ -59,6 +62,7 @@ def pixel_rays(
         directions=tensor(directions),
         valid=torch.as_tensor(valid, device=device),
         cosines=tensor(bearings[:, 2]),
+        cones=tensor(np.full(len(bearings), 1.0 / (frame.camera.focal_px * math.sqrt(len(places))))),
     )
 
 

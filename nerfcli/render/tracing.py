@@ -62,6 +62,7 @@ def render_rays(
     background: Tensor,
     shares: tuple[float, ...] = (),
     tolerance: float = TOLERANCE,
+    cones: Tensor | None = None,
 ) -> RaysSeen:
     """March rays through the model. The answer of a ray does not depend on the others.
 
@@ -71,10 +72,11 @@ def render_rays(
         background: (3,) or (R, 3) sRGB.
         shares: quantiles to compute.
         tolerance: bound on what is left out of a colour, > 0.
+        cones: (R,) width per distance of what each ray stands for, see `Rays`; None for lines.
     """
     cuts = uniform_cuts(model.marching).to(directions)
     return render_cut_rays(
-        model, origins, directions, cuts=cuts, background=background, shares=shares, tolerance=tolerance
+        model, origins, directions, cuts=cuts, background=background, shares=shares, tolerance=tolerance, cones=cones
     )
 
 
@@ -93,16 +95,18 @@ def render_cut_rays(
     background: Tensor,
     shares: tuple[float, ...],
     tolerance: float,
+    cones: Tensor | None = None,
 ) -> RaysSeen:
     """`render_rays` with all rays cut at the same distances `cuts` (S + 1,)."""
     stop = deepest(tolerance)
-    starts, ends, density, code, _, offsets = model.field.visible_samples(
+    starts, ends, density, code, _, offsets, _ = model.field.visible_samples(
         origins,
         directions,
         torch.cat([cuts, cuts[-1:]]),  # the last is never used: there is no jitter
         jitter=torch.zeros_like(directions[:, 0]),
         occupied=model.occupied,
         deepest=stop,
+        cones=cones,
     )
     lengths = ends - starts
     weights, _ = kernels.interval_weights(density, lengths, offsets)

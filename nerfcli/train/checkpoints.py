@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
+from nerfcli.field.kinds import settings_from_json
 from nerfcli.render.model import Model, save_model
 from nerfcli.scene import Scene
 from nerfcli.train.extent import Extent
@@ -101,7 +102,7 @@ def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description
     Raises:
         UserError: it is of another field or of other components, or holds numbers that are not finite.
     """
-    if description["field"] != fitting.field.settings.to_json():
+    if settings_from_json(description["field"]) != fitting.field.settings:
         raise UserError(
             f"{run} was trained with another field ({description['field']})",
             "train into a new folder with -o, or again with --overwrite",

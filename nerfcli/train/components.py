@@ -37,6 +37,7 @@ class Components:
         near: whether gradients near a camera are scaled down; see `fitting.scale_gradients`.
         distortion: weight of `losses.distortion_loss`; 0.05 is best or as good as any on real and synthetic
             captures.
+        antialias: whether details smaller than a pixel fade out of what it sees; see `kernels.hash_encode`.
     """
 
     background: str = "auto"
@@ -47,6 +48,7 @@ class Components:
     entropy: float = 0.0
     near: bool = True
     distortion: float = 0.05
+    antialias: bool = False
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -97,6 +99,7 @@ CHOICES = {
     "entropy": Choice("rays are opaque or clear, weight", 0.0, 0.01, None),
     "near": Choice("smaller gradients near cameras", False, True, (False, True)),
     "distortion": Choice("light of a ray in one place, weight", 0.0, 0.05, None),
+    "antialias": Choice("details smaller than a pixel fade out", False, True, (False, True)),
 }
 assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
 

@@ -96,6 +96,7 @@ class Fitting:
                     log2_rows=settings.log2_rows,
                     width=settings.width,
                     view_degree=self.components.view,
+                    antialias=self.components.antialias,
                 ),
                 footprint=pool.footprint,
                 memory_bytes=settings.field_memory_bytes,
@@ -178,7 +179,7 @@ class Fitting:
         jitter = torch.rand(len(origins), generator=self.generator, device=device)
         background = self.parts.behind(len(origins), self.generator)
         samples = self.field.visible_samples(
-            origins, directions, edges, jitter=jitter, occupied=self.occupied, deepest=DEEPEST
+            origins, directions, edges, jitter=jitter, occupied=self.occupied, deepest=DEEPEST, cones=self._cones(drawn)
         )
         starts, ends, offsets = samples.starts, samples.ends, samples.offsets
         rays = kernels.ray_indices(offsets)
@@ -218,7 +219,13 @@ class Fitting:
         middle = torch.full_like(origins[:, 0], 0.5)
         behind = torch.full_like(origins, 1.0 if self.pool.has_alpha else 0.0)
         samples = self.field.visible_samples(
-            origins, directions, self.edges, jitter=middle, occupied=self.occupied, deepest=DEEPEST
+            origins,
+            directions,
+            self.edges,
+            jitter=middle,
+            occupied=self.occupied,
+            deepest=DEEPEST,
+            cones=self._cones(drawn),
         )
         rays = kernels.ray_indices(samples.offsets)
         density, rgb = self.field.radiance_of_samples(samples, directions, rays, sink=None)
@@ -226,6 +233,10 @@ class Fitting:
             density, rgb, samples.ends - samples.starts, offsets=samples.offsets, background=behind
         )
         return self.parts.compared(rendered, transmittance, drawn, behind=behind)
+
+    def _cones(self, drawn: Drawn) -> Tensor | None:
+        """Widths of pixels per distance, where they matter."""
+        return self.pool.cones[self.pool.photo_of(drawn.numbers)] if self.components.antialias else None
 
     def _refresh_occupancy(self) -> None:
         # The whole grid once, after a warm-up in which everything is open; then a share at a time.

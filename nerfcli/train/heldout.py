@@ -45,6 +45,7 @@ class HeldoutPixels:
         pool = PixelPool(photos, training_from_scene, device, colours=colours, room=room)
         generator = torch.Generator(device=device).manual_seed(SEED)
         self.origins, self.directions, self.colours, numbers = pool.draw(PIXELS, generator)[:4]
+        self.cones = pool.cones[pool.photo_of(numbers)]
         self.log_gains = torch.as_tensor(log_gains, dtype=torch.float32, device=device)[pool.photo_of(numbers)]
 
     @torch.no_grad()
@@ -52,10 +53,12 @@ class HeldoutPixels:
         """PSNR in dB over these pixels together, clipped to [0, 1], on the model's background."""
         background = colours_behind(model.background, self.directions)
         parts = zip(
-            *(rays.split(RAYS_AT_A_TIME) for rays in (self.origins, self.directions, background)),
+            *(rays.split(RAYS_AT_A_TIME) for rays in (self.origins, self.directions, self.cones, background)),
             strict=True,
         )
-        rendered = torch.cat([render_rays(model, *rays, background=behind).rgb for *rays, behind in parts])
+        rendered = torch.cat(
+            [render_rays(model, *rays, background=behind, cones=cones).rgb for *rays, cones, behind in parts]
+        )
         wanted = over_background(self.colours, background)
         if self.log_gains.any():
             rendered = exposed(rendered, self.log_gains[:, None])

@@ -153,6 +153,7 @@ class Pool(Protocol):
     colours: Tensor
     first_pixel: Tensor
     footprint: float
+    cones: Tensor
 
     @property
     def has_alpha(self) -> bool:
@@ -172,7 +173,8 @@ class PixelPool:
     """All usable pixels of some photos, and the ray of each, in the training frame; `frames` are those of the photos.
 
     Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
-    pixels that the lens model has no direction for, which are left out; `footprint` is that of `pixel_footprint`.
+    pixels that the lens model has no direction for, which are left out; `footprint` is that of `pixel_footprint`;
+    `cones` (P,) are the widths of a pixel of each photo per distance.
 
     Args:
         photos: one at least.
@@ -199,6 +201,8 @@ class PixelPool:
         poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
         self.poses = torch.tensor(np.array(poses), dtype=torch.float32, device=device)
 
+        widths = [1.0 / photo.frame.camera.focal_px for photo in photos]
+        self.cones = torch.tensor(widths, dtype=torch.float32, device=device)
         self.footprint = pixel_footprint([photo.frame for photo in photos], training_from_scene)
 
         cameras = dict.fromkeys(photo.frame.camera for photo in photos)

@@ -124,6 +124,7 @@ class Sentinel:
         batch = {
             **drawn._asdict(),
             "first_pixel": fitting.pool.first_pixel,
+            "cones": fitting.pool.cones,
             "after_draw": fitting.generator.get_state(),
         }
         pixels = [self._pool.place(int(drawn.numbers[ray])) for ray in bad.rays[:PIXELS_NAMED]]
@@ -152,6 +153,7 @@ class _SavedBatch:
 
     def __init__(self, tensors: dict[str, Tensor]):
         self.colours, self.first_pixel = tensors["batch.colours"], tensors["batch.first_pixel"]
+        self.cones = tensors["batch.cones"]
         self._drawn = Drawn(**{name: tensors[f"batch.{name}"] for name in Drawn._fields})
         self._after_draw = tensors["batch.after_draw"]
         self.footprint = math.nan  # the field's size is known

@@ -78,7 +78,12 @@ class TrainSettings:
             raise UserError(f"downscale {self.downscale} is not possible", "choose auto, 1, 2, 4 or 8")
         if self.field not in KINDS:
             raise UserError(f"there is no field of the kind {self.field!r}", f"choose {', '.join(KINDS)}")
-
+        if self.components.antialias and self.field != HashFieldSettings.kind:
+            raise UserError(
+                f"--with antialias --field {self.field}: a field of this kind has no levels that could fade out",
+                "train a hash grid, or leave it out",
+                2,
+            )
         if self.contraction not in (None, *CONTRACTIONS):
             raise UserError(f"there is no contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
 

@@ -66,8 +66,18 @@ def _corner_weights(inside: Any, count: Any, weight: Any) -> None:
 
 
 @numba.njit(inline="always")
+def _fade(widths: Any, first: Any, count: Any, resolution: Any, weight: Any) -> None:
+    """Lower the weights of a level whose cells are smaller than a pixel; without widths, of none."""
+    if widths.shape[0] > 0:
+        one, side = np.float32(1), np.float32(resolution)
+        for corner in range(8):
+            for i in range(count):
+                weight[corner * BLOCK + i] /= max(side * widths[first + i], one)
+
+
+@numba.njit(inline="always")
 def _prepare_block(
-    points: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any, scratch: Any
+    points: Any, widths: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any, scratch: Any
 ) -> None:
     """Rows and weights of all corners of a block of samples, with the rows on their way into the cache."""
     cell, inside, index, weight = scratch
@@ -78,6 +88,7 @@ def _prepare_block(
         for i in range(count):
             prefetch(flat, offset + np.int64(index[corner * BLOCK + i]) * FEATURES)
     _corner_weights(inside, count, weight)
+    _fade(widths, first, count, resolution, weight)
 
 
 @numba.njit(inline="always")
@@ -93,7 +104,7 @@ def new_scratch() -> Any:
 
 @numba.njit(inline="always")
 def encode_range(
-    points: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any, out: Any
+    points: Any, widths: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any, out: Any
 ) -> None:
     """All levels of samples first to last into the flat array `out`, with `new_scratch`."""
     index, weight = scratch[2], scratch[3]
@@ -108,22 +119,24 @@ def encode_range(
         offset = np.int64(level) * rows * FEATURES
         for start in range(first, last, BLOCK):
             count = min(BLOCK, last - start)
-            _prepare_block(points, start, count, level, resolution, rows, flat, scratch)
+            _prepare_block(points, widths, start, count, level, resolution, rows, flat, scratch)
             for i in range(count):
                 gather_rows(flat, offset, index, weight, i, BLOCK, out, (start + i) * width + level * FEATURES)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _encode_forward(points: Any, flat: Any, rows: Any, resolutions: Any, out: Any, threads: Any) -> None:
+def _encode_forward(points: Any, widths: Any, flat: Any, rows: Any, resolutions: Any, out: Any, threads: Any) -> None:
     blocks = (points.shape[0] + BLOCK - 1) // BLOCK
     for thread in numba.prange(threads):
         first = thread * blocks // threads * BLOCK
         last = min((thread + 1) * blocks // threads * BLOCK, points.shape[0])
-        encode_range(points, first, last, flat, rows, resolutions, new_scratch(), out)
+        encode_range(points, widths, first, last, flat, rows, resolutions, new_scratch(), out)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _encode_backward(points: Any, gradient: Any, rows: Any, resolutions: Any, flat: Any, threads: Any) -> None:
+def _encode_backward(
+    points: Any, widths: Any, gradient: Any, rows: Any, resolutions: Any, flat: Any, threads: Any
+) -> None:
     samples = points.shape[0]
     width = resolutions.shape[0] * FEATURES
     for thread in numba.prange(threads):
@@ -137,7 +150,7 @@ def _encode_backward(points: Any, gradient: Any, rows: Any, resolutions: Any, fl
             column = level * FEATURES
             for first in range(0, samples, BLOCK):
                 count = min(BLOCK, samples - first)
-                _prepare_block(points, first, count, level, resolution, rows, flat, scratch)
+                _prepare_block(points, widths, first, count, level, resolution, rows, flat, scratch)
                 for i in range(count):
                     at = (first + i) * width + column
                     a, b, c, d = gradient[at], gradient[at + 1], gradient[at + 2], gradient[at + 3]
@@ -146,11 +159,14 @@ def _encode_backward(points: Any, gradient: Any, rows: Any, resolutions: Any, fl
 
 
 @numba.njit(inline="always")
-def _slopes(inside: Any, count: Any, resolution: Any, dots: Any, points: Any, first: Any, out: Any) -> None:
+def _slopes(
+    inside: Any, count: Any, resolution: Any, dots: Any, points: Any, widths: Any, first: Any, out: Any
+) -> None:
     """Add to `out` what the coordinates of a block of samples change: differences across the cell, between corners'
     scalar products of gradient and row, each weighted by the place along the two other axes."""
-    one, scale = np.float32(1), np.float32(resolution)
+    one, side = np.float32(1), np.float32(resolution)
     for i in range(count):
+        scale = side / max(side * widths[first + i], one) if widths.shape[0] > 0 else side
         for axis in range(3):
             across, other = (axis + 1) % 3, (axis + 2) % 3
             bit, bit_across, bit_other = 1 << axis, 1 << across, 1 << other
@@ -166,7 +182,7 @@ def _slopes(inside: Any, count: Any, resolution: Any, dots: Any, points: Any, fi
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _points_backward(
-    points: Any, flat: Any, rows: Any, resolutions: Any, gradient: Any, out: Any, threads: Any
+    points: Any, widths: Any, flat: Any, rows: Any, resolutions: Any, gradient: Any, out: Any, threads: Any
 ) -> None:
     width = resolutions.shape[0] * FEATURES
     blocks = (points.shape[0] + BLOCK - 1) // BLOCK
@@ -182,11 +198,11 @@ def _points_backward(
             offset = np.int64(level) * rows * FEATURES
             for first in range(begin, end, BLOCK):
                 count = min(BLOCK, end - first)
-                _prepare_block(points, first, count, level, resolution, rows, flat, scratch)
+                _prepare_block(points, widths, first, count, level, resolution, rows, flat, scratch)
                 for i in range(count):
                     at = (first + i) * width + level * FEATURES
                     dot_rows(flat, offset, index, dots, i, BLOCK, gradient, at)
-                _slopes(inside, count, resolution, dots, points, first, out)
+                _slopes(inside, count, resolution, dots, points, widths, first, out)
 
 
 class _HashEncode(torch.autograd.Function):
@@ -198,32 +214,40 @@ class _HashEncode(torch.autograd.Function):
         resolutions: tuple[int, ...],
         sink: Tensor | None,
         known: Tensor | None,
+        widths: Tensor | None,
     ) -> Tensor:
         points, table = points.detach().contiguous(), table.detach().contiguous()
+        widths = points.new_empty(0) if widths is None else widths.detach().contiguous()
         levels, rows, features = table.shape
         sides = np.array(resolutions, dtype=np.int32)
         if known is None:
             out = torch.empty(len(points), levels * features)
-            _encode_forward(points.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(), use_threads())
+            _encode_forward(
+                points.numpy(), widths.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(),
+                use_threads(),
+            )  # fmt: skip
         else:
             out = known.view_as(known)
-        ctx.save_for_backward(points, table if ctx.needs_input_grad[0] else table[:0])
+        ctx.save_for_backward(points, widths, table if ctx.needs_input_grad[0] else table[:0])
         ctx.table_shape, ctx.sides, ctx.sink = table.shape, sides, sink
         return out
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
-        points, table = ctx.saved_tensors
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None, None]:
+        points, widths, table = ctx.saved_tensors
         gradient = gradients[0].contiguous().view(-1).numpy()
         rows, of_points, of_table = ctx.table_shape[1], None, None
         if ctx.needs_input_grad[0]:
             of_points = torch.zeros_like(points)
             flat = table.view(-1).numpy()
-            _points_backward(points.numpy(), flat, rows, ctx.sides, gradient, of_points.numpy(), use_threads())
+            _points_backward(
+                points.numpy(), widths.numpy(), flat, rows, ctx.sides, gradient, of_points.numpy(), use_threads()
+            )
         if ctx.needs_input_grad[1]:
             of_table = torch.zeros(ctx.table_shape) if ctx.sink is None else ctx.sink
-            _encode_backward(points.numpy(), gradient, rows, ctx.sides, of_table.view(-1).numpy(), use_threads())
-        return of_points, of_table if ctx.sink is None else None, None, None, None
+            flat = of_table.view(-1).numpy()
+            _encode_backward(points.numpy(), widths.numpy(), gradient, rows, ctx.sides, flat, use_threads())
+        return of_points, of_table if ctx.sink is None else None, None, None, None, None
 
 
 def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> bool:
@@ -239,7 +263,12 @@ def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...])
 
 
 def hash_encode(
-    points: Tensor, table: Tensor, resolutions: tuple[int, ...], sink: Tensor | None, known: Tensor | None
+    points: Tensor,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    sink: Tensor | None,
+    known: Tensor | None,
+    widths: Tensor | None = None,
 ) -> Tensor:
     """See `kernels.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in points and table."""
-    return _HashEncode.apply(points, table, resolutions, sink, known)  # type: ignore[return-value]
+    return _HashEncode.apply(points, table, resolutions, sink, known, widths)  # type: ignore[return-value]

@@ -75,9 +75,22 @@ def _may_hold_something(
 
 
 @numba.njit(inline="always")
+def _stretch(origins: Any, directions: Any, ray: Any, t: Any, contraction: Any) -> Any:
+    """How much `contraction.cube_widths` makes of a width of 1 at a distance along a ray."""
+    quarter, one, two = np.float32(0.25), np.float32(1), np.float32(2)
+    if contraction == 0:
+        return np.float32(0.5)
+    x, y = origins[ray, 0] + directions[ray, 0] * t, origins[ray, 1] + directions[ray, 1] * t
+    z = origins[ray, 2] + directions[ray, 2] * t
+    largest = max(max(abs(x), abs(y)), max(abs(z), one))
+    norm = np.sqrt(max(x * x + y * y + z * z, one)) if contraction == 1 else largest
+    return (two - one / norm) / norm * quarter
+
+
+@numba.njit(inline="always")
 def _follow(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, coming: Any, last_ray: Any,
+    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, coming: Any, last_ray: Any,
     counts: Any, owner: Any, record: Any, code: Any,
 ) -> Any:  # fmt: skip
     """Samples of rays `coming` to `last_ray` in the order in which they are found, and how many they are.
@@ -92,6 +105,7 @@ def _follow(
     tile_lane = np.empty(ROUND, np.int64)
     tile_span = np.empty((ROUND, 2), np.float32)
     points = np.empty((ROUND, 3), np.float32)
+    widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
     encoded = np.empty((ROUND, WIDTH), np.float32)
     density = np.empty(ROUND, np.float32)
     scratch = new_scratch()
@@ -125,6 +139,9 @@ def _follow(
                             tile_span[filled, 1] = cut(edges, jitter[ray], k + i + 1)
                             for axis in range(3):
                                 points[filled, axis] = places[axis, i]
+                            if cones.shape[0] > 0:
+                                t = (tile_span[filled, 0] + tile_span[filled, 1]) * np.float32(0.5)
+                                widths[filled] = cones[ray] * t * _stretch(origins, directions, ray, t, contraction)
                             filled += 1
                             taken += 1
                             if taken == AHEAD:
@@ -136,7 +153,7 @@ def _follow(
                     lane_ray[lane] = -1
         if filled == 0:
             return found
-        encode_range(points, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1))
+        encode_range(points, widths, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1))
         density_range(encoded, 0, filled, weights, x, h, geometry, density)
         for i in range(filled):
             lane = tile_lane[i]
@@ -159,14 +176,14 @@ def _follow(
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _visible(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, borders: Any, counts: Any,
+    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, borders: Any, counts: Any,
     owner: Any, record: Any, code: Any, found: Any,
 ) -> None:  # fmt: skip
     """`_follow`, by a thread for the rays from each border to the next."""
     for thread in numba.prange(len(borders) - 1):
         found[thread] = _follow(
             origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows,
-            resolutions, weights, deepest, borders[thread], borders[thread + 1], counts, owner[thread],
+            resolutions, weights, deepest, cones, borders[thread], borders[thread + 1], counts, owner[thread],
             record[thread], code[thread],
         )  # fmt: skip
 
@@ -202,9 +219,11 @@ def visible_samples(
     resolutions: tuple[int, ...],
     weights: tuple[Tensor, ...],
     deepest: float,
+    cones: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """See `reference.visible_samples`; float32 on the CPU."""
     threads, rays, intervals = use_threads(), len(origins), len(edges) - 2
+    cones = origins.new_empty(0) if cones is None else cones
     borders = np.arange(threads + 1) * rays // threads
     # Room for all samples of all rays: memory that nobody writes to is never really taken.
     room = (threads, -(-rays // threads) * intervals)
@@ -215,8 +234,8 @@ def visible_samples(
         origins.contiguous().numpy(), directions.contiguous().numpy(), padded(edges), jitter.numpy(),
         occupied.contiguous().view(-1).numpy(), _occupied_blocks(occupied.numpy()), occupied.shape[0],
         CONTRACTIONS.index(contraction), table.detach().contiguous().view(-1).numpy(), table.shape[1],
-        np.array(resolutions, dtype=np.int32), flat_weights(weights[:2]), deepest, borders, counts, owner, record,
-        code, found,
+        np.array(resolutions, dtype=np.int32), flat_weights(weights[:2]), deepest, cones.contiguous().numpy(),
+        borders, counts, owner, record, code, found,
     )  # fmt: skip
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     samples = int(offsets[-1])
