@@ -8,7 +8,14 @@ import typer
 
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.evaluation import held_out_photos, predictions_are_there, saved_predictions, tell_numbers, tell_spread
+from nerfcli.cli.evaluation import (
+    billboards_of,
+    held_out_photos,
+    predictions_are_there,
+    saved_predictions,
+    tell_numbers,
+    tell_spread,
+)
 from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, device_name, thread_count
 from nerfcli.errors import GATE_NOT_MET, UserError
 
@@ -171,6 +178,7 @@ def evaluate_run(
     }
     held_out = held_out_photos(config, cameras["test"], log_exposure=model.log_exposure, threads=threads)
     perceptual = find_perceptual(console.note)
+    billboards = billboards_of(config, cameras["train"], threads=threads, console=console)
     with (
         saved_predictions(run, cameras["test"], wanted.predictions, checkpoint=checkpoint) as keep,
         console.progress("evaluate") as update,
@@ -179,7 +187,7 @@ def evaluate_run(
             model,
             held_out,
             on_image=lambda done, total: update(done / total, f"{done}/{total} rays"),
-            extras=Extras(cameras["train"], perceptual, wanted.align_poses, keep),
+            extras=Extras(cameras["train"], perceptual, billboards, wanted.align_poses, keep),
         )
     ledger = leak_ledger(config)
     metrics["training"] = training

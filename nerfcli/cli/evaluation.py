@@ -3,13 +3,16 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfcli.cli.console import Console
+from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
     from nerfcli.cameras.frame import Frame
+    from nerfcli.evaluate.billboards import Billboards
     from nerfcli.evaluate.protocol import Compared, HeldOut
 
 _COLUMNS = {
@@ -49,8 +52,33 @@ def held_out_photos(
     ]
 
 
+def billboards_of(
+    config: dict[str, Any], frames: "Sequence[Frame]", *, threads: int, console: Console
+) -> "Billboards | None":
+    """The model without shape of a run's training photos; None, with a line, where these cannot be read any more."""
+    from nerfcli.evaluate.billboards import Billboards, reduction
+    from nerfcli.evaluate.protocol import over_white
+    from nerfcli.train.photos import downscaled_camera, load_photos
+    from nerfcli.train.run_folder import chosen_components
+
+    masks, small, cameras = chosen_components(config).masks, [], []
+    try:
+        for frame in frames:
+            trained = replace(frame, camera=downscaled_camera(frame.camera, config["settings"]["downscale"]))
+            factor = config["settings"]["downscale"] * reduction(trained)
+            (photo,) = load_photos([frame], factor=factor, threads=1, masks=masks)
+            cameras.append(photo.frame)
+            small.append(over_white(photo.pixels))
+    except UserError as error:
+        console.note(f"no comparison with a model without shape: {error}")
+        return None
+    return Billboards(cameras, small)
+
+
 def tell_numbers(run: Path, metrics: dict[str, Any], console: Console) -> None:
-    """The result in two lines and a table."""
+    """The result in a few lines and a table."""
+    from nerfcli.evaluate.billboards import Shape
+
     mean, kinds = metrics["mean"], metrics["kinds"]
     console.note(
         f"{run}: PSNR {mean['psnr']:.2f} dB, SSIM {_number(mean['ssim'], 3)} on {len(metrics['images'])} held-out "
@@ -63,6 +91,8 @@ def tell_numbers(run: Path, metrics: dict[str, Any], console: Console) -> None:
         if mean.get(f"psnr{key}") is not None
     ]
     console.table(("", "PSNR", "SSIM", "LPIPS"), rows, styles={})
+    if metrics["shape"] is not None:
+        console.note(Shape(**metrics["shape"]).in_words())
     if kinds:
         parts = [f"{group['images']} by {kind}, PSNR {group['psnr']:.2f} dB" for kind, group in kinds.items()]
         console.note(f"views: {'; '.join(parts)}")

@@ -13,6 +13,7 @@ import torch
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.alignment import align_pose, halves
+from nerfcli.evaluate.billboards import Billboards, ShapeEvidence
 from nerfcli.evaluate.colour import colour_aligned
 from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.novelty import novelty
@@ -67,12 +68,14 @@ class Extras:
     Args:
         training: the training views, to tell how new the held-out ones are.
         perceptual: LPIPS, where it can be had.
+        billboards: a model without shape that the field is compared with.
         align_poses: whether each held-out pose is refined, too; it costs a render and about 60 times 2048 pixels.
         keep: takes what was compared, photo by photo.
     """
 
     training: Sequence[Frame] = ()
     perceptual: Perceptual | None = None
+    billboards: Billboards | None = None
     align_poses: bool = False
     keep: Callable[[Compared], None] = lambda compared: None
 
@@ -97,7 +100,7 @@ def evaluate_model(
         extras: what is measured besides.
 
     Returns:
-        The keys "protocol", "mean", "images", "kinds" and "render" of metrics.json.
+        The keys "protocol", "shape", "warnings", "mean", "images", "kinds" and "render" of metrics.json.
 
     Raises:
         UserError: nothing was held out, or a mask hides a whole photo.
@@ -117,6 +120,7 @@ def evaluate_model(
         on_image(done, total)
 
     views = novelty([photo.frame for photo in held_out], extras.training) if extras.training else None
+    evidence = ShapeEvidence(extras.billboards) if extras.billboards is not None else None
     images, seconds = [], []
     for index, photo in enumerate(held_out):
         background = WHITE if photo.pixels.shape[-1] == 4 else model.background
@@ -125,6 +129,8 @@ def evaluate_model(
         seconds.append(time.perf_counter() - began)
         compared = compare(photo, picture)
         extras.keep(compared)
+        if evidence is not None:
+            evidence.add(compared.frame, compared.rendered, compared.photo, compared.used)
         entry = {
             "name": photo.frame.name,
             **_measured(compared, extras.perceptual),
@@ -135,8 +141,11 @@ def evaluate_model(
         if views is not None:
             entry["view"] = views[index].to_json()
         images.append(entry | {"seconds": seconds[-1]})
+    shape = evidence.shape() if evidence is not None else None
     return {
         "protocol": _protocol_name(held_out, extras),
+        "shape": shape.to_json() if shape is not None else None,
+        "warnings": [shape.in_words()] if shape is not None and not shape.shown else [],
         "mean": mean_of(images),
         "images": images,
         "kinds": _kinds(images),

@@ -59,6 +59,11 @@ def _of_kind(kind: str) -> Callable[[RunFacts], str]:
     return read
 
 
+def _shape(run: RunFacts) -> str:
+    shape = (run.metrics or {}).get("shape")
+    return f"{shape['gain_db']:+.2f} dB" if shape else ""
+
+
 def number(value: float | None, digits: int) -> str:
     """With so many digits; "" where there is none."""
     return "" if value is None else f"{value:.{digits}f}"
@@ -187,6 +192,7 @@ _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("the same, poses aligned on the left halves", _metric("psnr_pose_aligned", "{:.2f} dB")),
     ("PSNR of views between training views", _of_kind("interpolation")),
     ("PSNR of views beyond them", _of_kind("extrapolation")),
+    ("PSNR against photos on billboards, without shape", _shape),
     ("training", _last("seconds", "{:.1f} s")),
     ("steps", _last("step", "{:,}")),
     ("samples a second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),

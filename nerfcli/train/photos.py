@@ -53,7 +53,7 @@ class Album:
     fills_frame: bool
 
 
-def load_photos(frames: Sequence[Frame], *, factor: int, threads: int, masks: str = "ignore") -> list[Photo]:
+def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: str = "ignore") -> list[Photo]:
     """Read, orient and downscale the photos of `frames`, in parallel, in order.
 
     Args:
@@ -105,7 +105,7 @@ def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room
     raise AssertionError("four channels hold every photo")
 
 
-def _load_photo(frame: Frame, factor: int, masks: str) -> Photo:
+def _load_photo(frame: Frame, factor: float, masks: str) -> Photo:
     if frame.image is None:
         raise UserError(f"{frame.name} has no photo", "this camera can be rendered, but not trained on or evaluated")
     pixels = read_image(frame.image)

@@ -1,0 +1,226 @@
+"""A model without shape: each training photo hangs around its camera at one distance. What a field must beat.
+
+Any shape explains any photos, if colour may depend on the direction as it likes (shape-radiance ambiguity: Zhang et al.
+2020, NeRF++, arXiv:2010.07492, section 3). Here the shape says nothing, the photos are the radiance, and one distance
+per camera is fitted. Photos that carry three-dimensional information lift a field above this on views that neither has
+seen; a camera that only turned, or two photos, do not.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import centres_of, focus_point, views_of
+from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.evaluate.metrics import psnr_of, to_8_bit
+from nerfcli.media.images import downscale
+
+# Sides of the photos on the billboards, at most; a model without shape is off by more than these pixels.
+LONGER_SIDE_PX = 400
+# How each billboard is fitted: this many pixels of each of the nearest other photos, at distances from 1/50 to 100
+# times that of what the cameras look at.
+FITTED_PIXELS, FITTED_PHOTOS = 400, 4
+DISTANCES = np.geomspace(0.02, 100.0, 64)
+# Distances are compared if so many rays hit the billboard there, as a share of those at the best distance for that.
+ENOUGH_HITS = 0.5
+COMPARED_PIXELS = 4096
+# A ray's colour is a mean over the billboards of so many near cameras, weighted with 1 / (angle^2 + LEAST_ANGLE^2),
+# the angle at what is hit between the ray and the line of sight of the camera.
+BLENDED, LEAST_ANGLE_RAD = 6, math.radians(0.5)
+# A gain is one if it is above this, and above this many standard errors over the held-out photos.
+LEAST_GAIN_DB, STANDARD_ERRORS = 1.0, 2.0
+SEED = 7
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What speaks for a shape, over all held-out photos.
+
+    Args:
+        psnr: of the billboards, mean over the photos, dB.
+        field_psnr: of the field, on the same pixels.
+        gain_db: the difference.
+        error_db: its standard error; None with one photo.
+        shown: whether the gain is above the noise.
+        seconds: that it took.
+    """
+
+    psnr: float
+    field_psnr: float
+    gain_db: float
+    error_db: float | None
+    shown: bool
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def in_words(self) -> str:
+        """A sentence for people."""
+        compared = f"{self.field_psnr:.2f} dB against {self.psnr:.2f} dB of photos on billboards, without any shape"
+        if self.shown:
+            return f"shape: the field has {compared}"
+        return (
+            f"no shape is shown: the field has {compared}. These photos do not tell what is near and what is far (the "
+            "camera only turned, too few photos, a flat scene), or the field learned nothing: do not trust its depth"
+        )
+
+
+class Billboards:
+    """The model: photos, and a distance for each. Fitting takes about 0.02 s a photo.
+
+    Args:
+        frames: the training views, one at least; their cameras are those of the photos.
+        photos: (H, W, 3) uint8, one per frame.
+    """
+
+    def __init__(self, frames: Sequence[Frame], photos: Sequence[np.ndarray]):
+        began = time.perf_counter()
+        self._frames, self._photos = frames, photos
+        self._centres, self._axes = centres_of(frames), views_of(frames)
+        # Where all cameras stand in one place no length is known, and none is needed.
+        self._scale = float(np.median(np.linalg.norm(self._centres - focus_point(frames), axis=1))) or 1.0
+        self._mean = np.mean([photo.mean(axis=(0, 1)) for photo in photos], axis=0) / 255.0
+        generator = np.random.default_rng(SEED)
+        self._sampled = [_sample(*pair, generator) for pair in zip(frames, photos, strict=True)]
+        self.distances = np.array([self._fit(index) for index in range(len(frames))])
+        self.seconds = time.perf_counter() - began
+
+    def colours(self, frame: Frame, pixels: np.ndarray) -> np.ndarray:
+        """(N, 3) sRGB in [0, 1] of a view's pixels (N, 2); the mean of all photos where no billboard is hit."""
+        bearings, _ = frame.camera.bearings(pixels)
+        directions = bearings @ frame.world_from_cam[:3, :3].T
+        total, weights = np.zeros((len(pixels), 3)), np.zeros((len(pixels), 1))
+        for index in self._nearest(frame)[:BLENDED]:
+            rgb, hit, angle = self._seen(index, frame.centre, directions, self.distances[index])
+            weight = (hit / (angle**2 + LEAST_ANGLE_RAD**2))[:, None]
+            total, weights = total + weight * rgb, weights + weight
+        return np.where(weights > 0, total / np.maximum(weights, 1e-300), self._mean)
+
+    def _nearest(self, frame: Frame) -> list[int]:
+        """The training views that look at the same, the most similar ones first, without `frame` itself."""
+        away = np.linalg.norm(self._centres - frame.centre, axis=1) / self._scale
+        turned = np.arccos(np.clip(self._axes @ frame.world_from_cam[:3, 2], -1.0, 1.0))
+        order = np.argsort(away + turned, kind="stable").tolist()
+        return [index for index in order if self._frames[index].name != frame.name]
+
+    def _fit(self, index: int) -> float:
+        """The distance at which a photo looks most like its neighbours, where enough of their rays hit it."""
+        others = self._nearest(self._frames[index])[:FITTED_PHOTOS]
+        distances = self._scale * DISTANCES
+        errors, hits = np.zeros(len(distances)), np.zeros(len(distances))
+        for other in others:
+            directions, colours = self._sampled[other]
+            for number, distance in enumerate(distances):
+                rgb, hit, _ = self._seen(index, self._centres[other], directions, distance)
+                errors[number] += np.square(rgb - colours)[hit].sum()
+                hits[number] += hit.sum()
+        if not hits.any():
+            return float(distances[-1])
+        enough = hits >= ENOUGH_HITS * hits.max()
+        return float(distances[int(np.argmin(np.where(enough, errors / np.maximum(hits, 1.0), np.inf)))])
+
+    def _seen(
+        self, index: int, origin: np.ndarray, directions: np.ndarray, distance: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What rays see of a photo that hangs around its camera: colours (N, 3), which rays hit it, and the angles
+        between them and the camera's lines of sight, in radians."""
+        frame = self._frames[index]
+        # |from_camera + t * direction| = distance, from inside and on the far side.
+        from_camera = origin - frame.centre
+        along = directions @ from_camera
+        inside = along**2 - from_camera @ from_camera + distance**2
+        t = np.sqrt(np.maximum(inside, 0.0)) - along
+        points = origin + t[:, None] * directions
+        pixels, valid = frame.camera.project(apply(inverse(frame.world_from_cam), points))
+        hit = valid & (inside >= 0.0) & (t > 0.0)
+        hit &= (pixels >= 0.0).all(axis=-1) & (pixels <= (frame.camera.width, frame.camera.height)).all(axis=-1)
+        cosine = np.einsum("nd,nd->n", directions, points - frame.centre) / distance
+        return _colours_at(self._photos[index], pixels), hit, np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
+def _sample(frame: Frame, photo: np.ndarray, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """World directions and colours of some pixels of a photo."""
+    pixels = random_pixels(frame, np.ones(photo.shape[:2], dtype=bool), FITTED_PIXELS, generator)
+    bearings, valid = frame.camera.bearings(pixels)
+    return bearings[valid] @ frame.world_from_cam[:3, :3].T, _colours_at(photo, pixels[valid])
+
+
+def random_pixels(frame: Frame, used: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """(N, 2) centres of some of the pixels that count, N = `count` or all that there are."""
+    numbers = np.flatnonzero(used)
+    chosen = generator.choice(numbers, min(count, len(numbers)), replace=False)
+    return np.stack([chosen % frame.camera.width, chosen // frame.camera.width], axis=-1) + 0.5
+
+
+def _colours_at(photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """(N, 3) in [0, 1] between the centres of pixels; the border goes on outside."""
+    places = pixels.astype(np.float32) - 0.5
+    # OpenCV takes lists of places as pictures of at most 32767 rows.
+    parts = [
+        cv2.remap(photo, part[:, :1], part[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+        for part in np.array_split(places, max(1, -(-len(places) // 2**14)))
+    ]
+    return np.concatenate(parts) / 255.0
+
+
+def reduction(frame: Frame) -> float:
+    """By how much a view is made smaller for the billboards, 1 at least."""
+    return max(1.0, max(frame.camera.width, frame.camera.height) / LONGER_SIDE_PX)
+
+
+class ShapeEvidence:
+    """Compares a field with billboards, photo by photo.
+
+    Args:
+        billboards: fitted to the training photos.
+    """
+
+    def __init__(self, billboards: Billboards):
+        self._billboards = billboards
+        self._generator = np.random.default_rng(SEED + 1)
+        self._pairs: list[tuple[float, float]] = []
+        self._seconds = billboards.seconds
+
+    def add(self, frame: Frame, rendered: np.ndarray, photo: np.ndarray, used: np.ndarray) -> None:
+        """Compare on some pixels of one held-out photo, made as small as the billboards are.
+
+        Args:
+            frame: the view.
+            rendered: (H, W, 3) sRGB of the field.
+            photo: (H, W, 3) uint8.
+            used: (H, W) bool, the pixels that count; at least one.
+        """
+        began = time.perf_counter()
+        factor = reduction(frame)
+        small = downscale(photo, factor)
+        height, width = small.shape[:2]
+        frame = replace(frame, camera=frame.camera.resized(width, height))
+        counting = downscale(np.where(used, np.uint8(255), np.uint8(0)), factor) == 255
+        if not counting.any():
+            return
+        pixels = random_pixels(frame, counting, COMPARED_PIXELS, self._generator)
+        columns, rows = pixels.astype(int).T
+        truth = small[rows, columns] / 255.0
+        of_field = np.square(downscale(to_8_bit(rendered), factor)[rows, columns] / 255.0 - truth).mean()
+        of_billboards = np.square(self._billboards.colours(frame, pixels) - truth).mean()
+        self._pairs.append((psnr_of(float(of_field)), psnr_of(float(of_billboards))))
+        self._seconds += time.perf_counter() - began
+
+    def shape(self) -> Shape | None:
+        """What speaks for a shape; None where no photo could be compared."""
+        if not self._pairs:
+            return None
+        pairs = np.array(self._pairs)
+        gains = pairs[:, 0] - pairs[:, 1]
+        gain = float(gains.mean())
+        error = float(gains.std(ddof=1) / math.sqrt(len(gains))) if len(gains) > 1 else None
+        shown = gain > LEAST_GAIN_DB and gain > STANDARD_ERRORS * (error or 0.0)
+        field_psnr, psnr = (float(column.mean()) for column in pairs.T)
+        return Shape(psnr, field_psnr, gain, error, shown, self._seconds)

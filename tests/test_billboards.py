@@ -1,0 +1,121 @@
+"""The model without shape: right where shape cannot matter, and beaten where it does.
+
+Evidence: cameras that only turn see photos that are homographies of each other, whatever hangs at whatever distance
+(closed form); a wall at one distance from cameras that stand beside each other; and the spheres, with known geometry.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import SPHERES
+
+from nerfcli import scene as scenes
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import from_parts, rotation_from_vector
+from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, ShapeEvidence, random_pixels
+from nerfcli.evaluate.metrics import psnr_of, to_8_bit
+from nerfcli.evaluate.protocol import Extras, HeldOut, evaluate_model, over_white
+from nerfcli.render.model import load_model
+from nerfcli.train.photos import load_photos
+
+CAMERA = Camera.pinhole(80, 60, 70.0)
+
+
+def pattern(directions: np.ndarray) -> np.ndarray:
+    """(N, 3) smooth colours in [0, 1] of infinitely far directions."""
+    waves = np.array([[5.0, 1.0, 0.0], [0.0, 6.0, 2.0], [3.0, -4.0, 1.0]])
+    return 0.5 + 0.5 * np.sin(directions @ waves.T)
+
+
+def frame(name: str, rotation_vector: tuple[float, float, float], centre: tuple[float, float, float]) -> Frame:
+    pose = from_parts(rotation_from_vector(np.array(rotation_vector)), np.array(centre))
+    return Frame(name, CAMERA, pose, None)
+
+
+def far_photo(view: Frame) -> np.ndarray:
+    bearings, _ = view.camera.pixel_bearings()
+    colours = pattern(bearings @ view.world_from_cam[:3, :3].T)
+    return to_8_bit(colours.reshape(view.camera.height, view.camera.width, 3))
+
+
+def narrower(view: Frame) -> Frame:
+    """All of it lies within the views beside it."""
+    return replace(view, camera=Camera.pinhole(48, 40, 70.0))
+
+
+def turned(count: int) -> list[Frame]:
+    """From one place, in overlapping directions."""
+    angles = np.linspace(-0.4, 0.4, count)
+    return [frame(f"{i}", (0.05 * (-1) ** i, angle, 0.0), (1.0, 2.0, 3.0)) for i, angle in enumerate(angles)]
+
+
+def psnr_on(billboards: Billboards, view: Frame, photo: np.ndarray) -> float:
+    pixels = random_pixels(view, np.ones(photo.shape[:2], bool), COMPARED_PIXELS, np.random.default_rng(0))
+    columns, rows = pixels.astype(int).T
+    return psnr_of(float(np.square(billboards.colours(view, pixels) - photo[rows, columns] / 255.0).mean()))
+
+
+def test_photos_of_a_camera_that_only_turned_are_explained():
+    views = turned(9)
+    held_out, training = narrower(views[4]), [view for index, view in enumerate(views) if index != 4]
+    billboards = Billboards(training, [far_photo(view) for view in training])
+    # What is left is the interpolation between pixels, and their rounding.
+    assert psnr_on(billboards, held_out, far_photo(held_out)) > 45
+
+
+def test_a_field_of_a_camera_that_only_turned_shows_no_shape():
+    views = turned(9)
+    training = views[::2]
+    evidence = ShapeEvidence(Billboards(training, [far_photo(view) for view in training]))
+    for view in map(narrower, views[1::2]):
+        photo = far_photo(view)
+        # A good field: 35 dB.
+        noisy = photo / 255.0 + np.random.default_rng(1).normal(0.0, 10 ** (-35 / 20), photo.shape)
+        evidence.add(view, noisy, photo, np.ones(photo.shape[:2], bool))
+    shape = evidence.shape()
+    assert shape is not None
+    assert not shape.shown
+    assert "do not trust its depth" in shape.in_words()
+
+
+def test_the_distance_of_a_round_wall_is_found():
+    """A pattern on a sphere of radius 5 around the origin, seen from near its centre."""
+    views = [frame(f"{i}", (0.0, 0.1 * i, 0.0), (0.15 * i, 0.1 * (-1) ** i, 0.0)) for i in range(-3, 4)]
+
+    def photo(view: Frame) -> np.ndarray:
+        bearings, _ = view.camera.pixel_bearings()
+        directions = bearings @ view.world_from_cam[:3, :3].T
+        along = directions @ view.centre
+        t = np.sqrt(along**2 - view.centre @ view.centre + 25.0) - along
+        return to_8_bit(pattern((view.centre + t[:, None] * directions) / 5.0).reshape(60, 80, 3))
+
+    billboards = Billboards(views, [photo(view) for view in views])
+    middle = [billboards.distances[2], billboards.distances[3], billboards.distances[4]]
+    # They stand up to 0.3 from the centre, and distances are tried in steps of 14 %.
+    assert middle == pytest.approx([5.0, 5.0, 5.0], rel=0.2)
+
+
+def test_the_spheres_have_a_shape(spheres_run):
+    scene = scenes.load(SPHERES)
+    photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
+    held_out = [HeldOut(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames, factor=1, threads=1)]
+    metrics = evaluate_model(
+        load_model(spheres_run / "field.safetensors", "cpu"),
+        held_out,
+        on_image=lambda done, total: None,
+        extras=Extras(billboards=Billboards(scene.train_frames, photos)),
+    )
+    assert metrics["shape"]["shown"]
+    assert metrics["shape"]["gain_db"] > 5
+    assert metrics["shape"]["field_psnr"] == pytest.approx(metrics["mean"]["psnr"], abs=0.5)
+
+
+def test_one_training_view_and_a_view_that_none_has_seen_are_no_trouble():
+    views = turned(2)
+    billboards = Billboards(views[:1], [far_photo(views[0])])
+    away = replace(views[1], world_from_cam=from_parts(rotation_from_vector(np.array([0.0, np.pi, 0.0])), np.zeros(3)))
+    pixels = np.array([[0.5, 0.5], [40.0, 30.0]])
+    mean = far_photo(views[0]).mean(axis=(0, 1)) / 255.0
+    assert billboards.colours(away, pixels) == pytest.approx(np.broadcast_to(mean, (2, 3)))
