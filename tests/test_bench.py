@@ -5,6 +5,7 @@ import json
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from nerfcli.bench.machine import PeakMemory, is_busy, processor_name
 from nerfcli.bench.pareto import SAME_TIME, Measured, Spread, at_most, dominators, least_difference, near_best
 from nerfcli.bench.records import MEASURED, opened
 from nerfcli.bench.session import Session
+from nerfcli.bench.summary import longer_and_better
 from nerfcli.bench.sweep import (
     SHORTEST_TRAINING_SECONDS,
     RenderSetting,
@@ -207,6 +209,24 @@ def test_every_setting_has_one_name_and_says_how_to_ask_for_it():
 def test_settings_read_back_as_they_were_written():
     made = replace(TrainSettings(seed=3), log2_rows=12)
     assert TrainSettings.from_json(json.loads(json.dumps(made.to_json()))) == made
+
+
+def test_a_longer_training_that_is_better_needs_no_significance():
+    """Trainings of other sizes do; a longer one that came out worse is no gain."""
+
+    def point(name: str, group: str, seconds: float, psnr: float) -> dict[str, Any]:
+        return {"name": name, "group": group, "seconds": {"median": seconds}, "psnr": psnr}
+
+    points = [
+        point("this run", "run", 120.0, 30.4),
+        point("default", "default", 9.0, 24.2),
+        point("2 x time", "time", 18.0, 26.5),
+        point("4 x time", "time", 36.0, 26.1),
+        point("half", "time", 4.5, 20.0),
+        point("2^17 rows", "rows", 9.0, 24.9),
+        point("seed 1", "seed", 9.0, 25.5),
+    ]
+    assert longer_and_better(points) == ["default", "2 x time", "this run"]
 
 
 # Errors in closed form

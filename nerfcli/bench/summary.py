@@ -100,6 +100,7 @@ def _training(records: Records) -> dict[str, Any] | None:
     repeats = [point["psnr"] for point in points if point["group"] in ("default", "seed")]
     noise = least_difference(repeats)
     found = dominators([_by_psnr(point) for point in points if point["group"] != "seed"], noise=noise or 0.0)
+    found |= dict.fromkeys(longer_and_better(points))
     for point in points:
         seed = point["group"] == "seed"
         point["pareto"] = None if seed else found[point["name"]] is None
@@ -112,6 +113,19 @@ def _training(records: Records) -> dict[str, Any] | None:
         "points": points,
         "failed": [{"name": entry["point"], "reason": entry["reason"]} for entry in records.of_kind("failed")],
     }
+
+
+def longer_and_better(points: Sequence[dict[str, Any]]) -> list[str]:
+    """The trainings that differ from shorter ones in their length alone, and are better than all of these. That more
+    steps help is known beforehand: it takes no significance to believe it."""
+    same = [point for point in points if point["group"] in ("default", "time", "run")]
+    same.sort(key=lambda point: point["seconds"]["median"])
+    best, longer = -math.inf, []
+    for point in same:
+        if point["psnr"] > best:
+            best = point["psnr"]
+            longer.append(point["name"])
+    return longer[1:]
 
 
 def _training_point(entry: dict[str, Any]) -> dict[str, Any]:
