@@ -31,8 +31,8 @@ from nerfcli.media.images import downscale, read_image
 
 SAMPLES = Path(__file__).parent.parent / "sample_scenes"
 DESK_DOWNSCALE = 2
-# What the photos of `scales` are smaller by.
-SCALES = (1, 4)
+# What the photos of `scales` are smaller by, and how much finer the patterns are.
+SCALES, FINER = (1, 4), 4.0
 # Of the views of the balls.
 VIEWS, WIDTH, HEIGHT, SUBPIXELS, REACH, FOV_X = 48, 160, 120, 3, 4.4, 0.8
 EXPOSURE_SPREAD, WHITE_BALANCE_SPREAD = 0.3, 0.06
@@ -145,19 +145,6 @@ def focal(views: list[View], generator: np.random.Generator) -> tuple[list[View]
     return [view if view.test else replace(view, camera=wrong) for view in views], {"params": list(camera.params)}
 
 
-def scales() -> list[View]:
-    """The desk in photos of two sizes in turn, as from near and from four times as far away, among the held-out ones,
-    too: what is a pixel wide in one is a quarter of a pixel in the other."""
-    views = desk_views()
-    places = {view.name: i for held in (False, True) for i, view in enumerate(v for v in views if v.test == held)}
-    changed = []
-    for view in views:
-        factor = SCALES[places[view.name] % len(SCALES)]
-        camera = view.camera.resized(view.camera.width // factor, view.camera.height // factor)
-        changed.append(replace(view, camera=camera, pixels=downscale(view.pixels, factor)))
-    return changed
-
-
 # --- the balls --------------------------------------------------------------------------------------------------------
 
 
@@ -214,7 +201,12 @@ def surroundings(directions: np.ndarray) -> np.ndarray:
 
 
 def ball_views(
-    *, behind: Light | None = None, moving_behind: Light | None = None, gloss: float = 0.0, views: int = VIEWS
+    *,
+    behind: Light | None = None,
+    moving_behind: Light | None = None,
+    gloss: float = 0.0,
+    views: int = VIEWS,
+    finer: float = 1.0,
 ) -> list[View]:
     """Views of the balls, every 8th held out: RGBA; or in front of something far, fixed to the world or the camera.
 
@@ -222,8 +214,11 @@ def ball_views(
         behind, moving_behind: what is infinitely far by directions in the world, or by directions in the camera.
         gloss: how much of `room_light` the surfaces reflect.
         views: how many.
+        finer: how much finer the patterns are than those of sample_scenes/spheres.
     """
     tracer, camera, made = ball_tracer(), ball_camera(), []
+    balls = tuple(replace(ball, frequency=finer * ball.frequency) for ball in tracer.BALLS)
+    vars(tracer).update(BALLS=balls, BOX=replace(tracer.BOX, frequency=finer * tracer.BOX.frequency))
     fine = camera.resized(WIDTH * SUBPIXELS, HEIGHT * SUBPIXELS)
     bearings = fine.pixel_bearings()[0].reshape(fine.height, fine.width, 3)
     for index in range(views):
@@ -267,6 +262,19 @@ def surface_normals(tracer: ModuleType, points: np.ndarray) -> np.ndarray:
 def alpha() -> list[View]:
     """A matt object in RGBA: colours depend on the point alone, and behind it is nothing."""
     return ball_views()
+
+
+def scales() -> list[View]:
+    """The object with fine patterns in photos of two sizes in turn, among the held-out ones, too, as from near and from
+    four times as far away: what is some pixels wide in one is less than a pixel in the other."""
+    views = ball_views(finer=FINER)
+    places = {view.name: i for held in (False, True) for i, view in enumerate(v for v in views if v.test == held)}
+    changed = []
+    for view in views:
+        factor = SCALES[places[view.name] % len(SCALES)]
+        camera = view.camera.resized(view.camera.width // factor, view.camera.height // factor)
+        changed.append(replace(view, camera=camera, pixels=downscale(view.pixels, factor)))
+    return changed
 
 
 def glossy() -> list[View]:
@@ -337,12 +345,12 @@ MAKERS: dict[str, tuple[Callable[[], list[View]], Change | None]] = {
     "desk": (desk_views, None),
     **{name: (desk_views, change) for name, change in CHANGES.items()},
     "alpha": (alpha, None),
-    "scales": (scales, None),
     **{f"{name}-balls": (alpha, change) for name, change in CHANGES.items()},
     "glossy": (glossy, None),
     "unbounded": (unbounded, None),
     "turntable": (turntable, None),
     "few": (few, None),
+    "scales": (scales, None),
 }
 
 
