@@ -31,6 +31,7 @@ from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
 from nerfcli.scene import Scene
 from nerfcli.train import loop
+from nerfcli.train.components import Components
 from nerfcli.train.loop import Progress, train
 from nerfcli.train.photos import Drawn, PixelPool, load_photos
 from nerfcli.train.run_folder import (
@@ -212,6 +213,23 @@ def test_fields_of_other_kinds_train_and_resume_bit_for_bit(kind, views, tmp_pat
     assert load_model(tmp_path / "parts" / "field.safetensors", "cpu").field.settings.kind == kind
     with pytest.raises(UserError, match="was trained with another field"):
         fit(views, tmp_path / "parts", replace(settings, field="hash"), resume=True)
+
+
+def test_pixels_drawn_by_their_error_resume_bit_for_bit(views, tmp_path):
+    def stop(progress: Progress) -> None:
+        if progress.step == 5:
+            raise KeyboardInterrupt
+
+    settings = replace(FEW, steps=10, components=Components(pixels="error"))
+    straight = fit(views, tmp_path / "straight", settings)
+    with pytest.raises(KeyboardInterrupt):
+        fit(views, tmp_path / "parts", settings, on_progress=stop)
+    second = fit(views, tmp_path / "parts", settings, resume=True)
+    assert [progress.loss for progress in second] == [progress.loss for progress in straight[5:]]
+    assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
+    anywhere = fit(views, tmp_path / "anywhere", replace(settings, components=Components()))
+    assert [progress.loss for progress in anywhere[:2]] == [progress.loss for progress in straight[:2]]
+    assert anywhere[-1].loss != straight[-1].loss
 
 
 def test_resume_goes_on_to_a_larger_total(views, tmp_path):

@@ -17,7 +17,7 @@ from nerfcli.media.images import downscale, write_png
 from nerfcli.memory import resident_bytes
 from nerfcli.render.rays import frame_rays
 from nerfcli.scene import Scene
-from nerfcli.train.losses import colour_loss, over_background
+from nerfcli.train.losses import colour_losses, over_background
 from nerfcli.train.normalisation import box_frame, contracted_frame, object_frame
 from nerfcli.train.photos import Album, Photo, PixelPool, downscaled_camera, load_album, load_photos
 from nerfcli.train.room import IN_MEMORY, InFiles, Needs, Room, room_for
@@ -283,10 +283,10 @@ def test_colours_over_a_background():
     torch.testing.assert_close(over_background(rgba, background), expected)
 
 
-def test_colour_loss_is_quadratic_for_noise_and_linear_for_outliers():
+def test_the_loss_of_colours_is_quadratic_for_noise_and_linear_for_outliers():
     measured = torch.zeros(1, 3)
     for error, expected in ((0.0, 0.0), (0.02, 0.5 * 0.02**2 / 0.1), (0.8, 0.8 - 0.05)):
-        assert colour_loss(measured + error, measured).item() == pytest.approx(expected, rel=1e-5)
+        assert colour_losses(measured + error, measured).mean().item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_pixel_is_found_again_by_its_number():

@@ -88,7 +88,8 @@ def train(
     brightness and white balance of each photo), masks (ignore, empty: what their black means), points (a weight:
     surfaces at points of structure from motion), entropy (a weight: rays are opaque or clear), near (smaller gradients
     near cameras), distortion (a weight: the light of a ray in one place), antialias (true, false: details smaller
-    than a pixel fade out; for photos from near and far). --model auto trains a few times for a moment,
+    than a pixel fade out; for photos from near and far), pixels (anywhere, error: more of them where the photos are
+    explained worst). --model auto trains a few times for a moment,
     on 15 % of the budget, and keeps a component that is better on pixels that it has not seen by more than the noise;
     those named by --with and --without stay.
 

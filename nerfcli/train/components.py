@@ -17,6 +17,7 @@ BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
 EXPOSURES = ("none", "exif", "learned")
 # What is behind the black of a mask: something unknown, or nothing.
 MASKS = ("ignore", "empty")
+PIXELS = ("anywhere", "error")
 # Spherical harmonics up to this degree: 16 of them.
 MOST_DEGREES = 3
 
@@ -38,6 +39,7 @@ class Components:
         distortion: weight of `losses.distortion_loss`; 0.05 is best or as good as any on real and synthetic
             captures.
         antialias: whether details smaller than a pixel fade out of what it sees; see `kernels.hash_encode`.
+        pixels: which ones are drawn: from "anywhere", or half of them where the "error" is; see `error_map`.
     """
 
     background: str = "auto"
@@ -49,6 +51,7 @@ class Components:
     near: bool = True
     distortion: float = 0.05
     antialias: bool = False
+    pixels: str = "anywhere"
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -100,6 +103,7 @@ CHOICES = {
     "near": Choice("smaller gradients near cameras", False, True, (False, True)),
     "distortion": Choice("light of a ray in one place, weight", 0.0, 0.05, None),
     "antialias": Choice("details smaller than a pixel fade out", False, True, (False, True)),
+    "pixels": Choice("more pixels where the error is", "anywhere", "error", PIXELS),
 }
 assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
 

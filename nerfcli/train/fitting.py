@@ -14,7 +14,8 @@ from nerfcli.field.kinds import fresh_field
 from nerfcli.field.sizes import chosen_size
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
-from nerfcli.train.losses import colour_loss, distortion_loss, opacity_entropy
+from nerfcli.train.error_map import BEGINS, ErrorMap
+from nerfcli.train.losses import colour_losses, distortion_loss, opacity_entropy
 from nerfcli.train.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.train.parts import Parts
 from nerfcli.train.photos import Drawn, Pool
@@ -78,6 +79,7 @@ class Fitting:
         settings: TrainSettings,
         log_gains: Tensor | None = None,
         points: PointRays | None = None,
+        error_map: ErrorMap | None = None,
         size: FieldSettings | None = None,
     ):
         device = pool.colours.device
@@ -105,7 +107,7 @@ class Fitting:
             )
         self.field = fresh_field(size).to(device)
         gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
-        self.points = points
+        self.points, self.error_map = points, error_map
         self.parts = Parts(self.components, pool, log_gains=gains)
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.occupied = self._open_cells()
@@ -157,7 +159,8 @@ class Fitting:
         growth = 2.0 ** min(self.step / DOUBLING_STEPS, MOST_DOUBLINGS)
         wanted = min(settings.samples_per_step, growth * settings.first_samples_per_step)
         rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
-        drawn = self.pool.draw(rays, self.generator)
+        source = self.pool if self.error_map is None or self.furthest < BEGINS else self.error_map
+        drawn = source.draw(rays, self.generator)
         if self.points is None or fading(share) == 0.0:
             return drawn
         return self.points.added_to(drawn, self.generator)
@@ -195,7 +198,10 @@ class Fitting:
         rendered, transmittance, weights = kernels.composite(
             density, rgb, ends - starts, offsets=offsets, background=background
         )
-        loss = colour_loss(*self.parts.compared(rendered, transmittance, drawn, behind=background))
+        losses = colour_losses(*self.parts.compared(rendered, transmittance, drawn, behind=background))
+        if self.error_map is not None:
+            self.error_map.learn(drawn.numbers, losses.detach())
+        loss = (losses * drawn.weights if len(drawn.weights) else losses).mean()
         if components.distortion:
             loss = loss + components.distortion * distortion_loss(weights, starts, ends, offsets)
         if components.entropy:
@@ -285,6 +291,8 @@ class Fitting:
         }
         tensors.update({f"parts.{name}": value for name, value in self.parts.state_dict().items()})
         tensors.update(self.parts_optimiser.state())
+        if self.error_map is not None:
+            tensors["error_map"] = self.error_map.errors
         return tensors, {
             "field": self.field.settings.to_json(),
             "step": self.step,
@@ -304,6 +312,8 @@ class Fitting:
         self.optimiser.restore(tensors)
         self.parts.load_state_dict({name: tensors[f"parts.{name}"] for name in self.parts.state_dict()})
         self.parts_optimiser.restore(tensors)
+        if self.error_map is not None:
+            self.error_map.errors = tensors["error_map"]
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]

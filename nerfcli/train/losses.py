@@ -8,16 +8,17 @@ from nerfcli import kernels
 HUBER_DELTA = 0.1
 
 
-def colour_loss(rendered: Tensor, measured: Tensor) -> Tensor:
-    """Mean Huber loss of sRGB colours, delta 0.1: quadratic for noise, linear for what does not fit.
+def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
+    """Huber loss of sRGB colours, delta 0.1: quadratic for noise, linear for what does not fit.
 
     Args:
         rendered, measured: (R, 3).
 
     Returns:
-        Scalar, divided by delta so that its slope is at most 1.
+        (R,) the mean of the channels, divided by delta so that its slope is at most 1.
     """
-    return torch.nn.functional.huber_loss(rendered, measured, delta=HUBER_DELTA) / HUBER_DELTA
+    losses = torch.nn.functional.huber_loss(rendered, measured, delta=HUBER_DELTA, reduction="none")
+    return losses.mean(-1) / HUBER_DELTA
 
 
 def distortion_loss(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:

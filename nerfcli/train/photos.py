@@ -137,6 +137,7 @@ class Drawn(NamedTuple):
         colours: (N, 3 or 4) float32 in [0, 1].
         numbers: (N,) int64, counted through all photos.
         distances, trust: (K,) of the last K of them, those whose surface is known; see `point_depth.PointDepths`.
+        weights: (N,) what each counts in the loss; none where all count alike.
     """
 
     origins: Tensor
@@ -145,6 +146,7 @@ class Drawn(NamedTuple):
     numbers: Tensor
     distances: Tensor
     trust: Tensor
+    weights: Tensor
 
 
 class Pool(Protocol):
@@ -174,7 +176,7 @@ class PixelPool:
 
     Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
     pixels that the lens model has no direction for, which are left out; `footprint` is that of `pixel_footprint`;
-    `cones` (P,) are the widths of a pixel of each photo per distance.
+    `cones` (P,) are the widths of a pixel of each photo per distance, `sizes` (P, 2) heights and widths of the photos.
 
     Args:
         photos: one at least.
@@ -197,6 +199,7 @@ class PixelPool:
         counts = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
         self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
         self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
+        self.sizes = torch.tensor([photo.pixels.shape[:2] for photo in photos], device=device)
         self.frames = tuple(photo.frame for photo in photos)
         poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
         self.poses = torch.tensor(np.array(poses), dtype=torch.float32, device=device)
@@ -239,9 +242,12 @@ class PixelPool:
 
     def draw(self, count: int, generator: torch.Generator) -> Drawn:
         """`count` random pixels, with replacement."""
-        device = self.colours.device
-        chosen = torch.randint(self.usable_count, (count,), generator=generator, device=device)
-        return self.rays_of(chosen if self.usable is None else self.usable[chosen])
+        return self.rays_of(self.numbers(count, generator))
+
+    def numbers(self, count: int, generator: torch.Generator) -> Tensor:
+        """Those of `count` random pixels, with replacement."""
+        chosen = torch.randint(self.usable_count, (count,), generator=generator, device=self.colours.device)
+        return chosen if self.usable is None else self.usable[chosen]
 
     def rays_of(self, numbers: Tensor) -> Drawn:
         """The rays and colours of pixels (N,), counted through all photos."""
@@ -254,7 +260,7 @@ class PixelPool:
             photos=self.colours,
         )
         none = torch.zeros(0, device=numbers.device)
-        return Drawn(*rays, numbers, distances=none, trust=none)
+        return Drawn(*rays, numbers, distances=none, trust=none, weights=none)
 
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Which photo each pixel (N,) is of."""

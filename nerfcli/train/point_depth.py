@@ -59,7 +59,10 @@ class PointRays:
         """The pixels drawn, and known ones behind them. Their colours count like all others."""
         chosen = self.known.draw(max(1, len(drawn.numbers) // PIXELS_PER_POINT), generator)
         both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
-        return both._replace(distances=chosen.distances, trust=chosen.trust)
+        weights = drawn.weights
+        if len(weights):
+            weights = torch.cat([weights, torch.ones_like(chosen.distances)])
+        return both._replace(distances=chosen.distances, trust=chosen.trust, weights=weights)
 
 
 def point_depths(scene: Scene, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:

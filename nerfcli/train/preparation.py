@@ -14,6 +14,7 @@ from torch import Tensor
 from nerfcli.errors import UserError
 from nerfcli.scene import Scene
 from nerfcli.train.components import Components
+from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.train.extent import Extent, choose_extent
 from nerfcli.train.fitting import Fitting
@@ -68,6 +69,7 @@ class Prepared:
             settings=self.settings,
             log_gains=self.log_gains,
             points=self.points,
+            error_map=ErrorMap(self.pool) if self.settings.components.pixels == "error" else None,
         )
 
 

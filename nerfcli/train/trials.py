@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.train.components import Components
+from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.photos import Photo, PixelPool
@@ -111,6 +112,7 @@ class Trials:
             contraction=self._extent.contraction,
             settings=settings,
             log_gains=self._log_gains,
+            error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
         )
         took, halfway = 0.0, None
         while (share := fitting.step / steps if steps is not None else took / (seconds or math.inf)) < 1.0:
