@@ -66,7 +66,7 @@ def train(
     ] = 16,
     levels: Annotated[int, typer.Option(help="Tables of the field; other numbers than 8 are slow.", min=1)] = 8,
     width: Annotated[int, typer.Option(help="Neurons of its layers; other numbers than 32 are slow.", min=1)] = 32,
-    batch: Annotated[int, typer.Option(help="Samples of a step at the end of the training.", min=2**8)] = 2**16,
+    batch: Annotated[int, typer.Option(help="Most samples of a step; the first ones are smaller.", min=2**8)] = 2**16,
     holdout: Holdout = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint to the new total.")] = False,
     memory: Memory = None,
