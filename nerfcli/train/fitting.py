@@ -38,9 +38,9 @@ FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
 # Both beginnings are over at these shares of the budget at the latest, however few the steps.
 WARMUP_SHARE, CLOSING_SHARE = 0.1, 0.3
 # Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
-# Short trainings do not come to details: they learn more from twice as many rays.
+# Short trainings do not come to details, and learn more from more rays: their shares are those of so many steps.
 STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
-DETAILED_STEPS = 2000
+DETAILED_STEPS = 2500
 
 
 def scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> None:
@@ -166,8 +166,9 @@ class Fitting:
         return self.points.added_to(drawn, self.generator)
 
     def _stride(self, share: float) -> int:
-        by_share = next(stride for until, stride in STRIDES if share <= until)
-        return by_share if self.step >= DETAILED_STEPS else max(2, by_share)
+        """How many of the shortest steps along rays are taken as one."""
+        share = min(share, self.step / DETAILED_STEPS)
+        return next(stride for until, stride in STRIDES if share <= until)
 
     def smaller_steps(self) -> None:
         """Halve the learning rate from here on, as numbers became non-finite."""
