@@ -105,8 +105,8 @@ def convert(
 
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
-                      reality-capture, bundler, tum, kitti, npz, camera-path (of nerfstudio's viewer); recognised by
-                      their files
+                      reality-capture, bundler, tum, kitti, npz, camera-path (of nerfstudio's viewer), run (what
+                      nerfcli train wrote, with refined cameras); recognised by their files
     Formats written:  nerfcli (a scene folder as poses writes it), colmap, colmap-text, transforms, blender, llff,
                       opensfm, tum, kitti, npz (all of it), ply (points)
 
@@ -121,6 +121,7 @@ def convert(
       nerfcli convert photos-scene transforms.json --to transforms
       nerfcli convert fox/transforms.json fox/sparse/0 --to colmap
       nerfcli convert fern poses.txt --to kitti --allow-loss
+      nerfcli convert photos-scene-run refined-scene --to nerfcli
       nerfcli convert poses.txt capture.npz --to npz --intrinsics cameras.txt
       nerfcli convert transforms.json opencv.json --to transforms --axes opencv --pixel-center 0
       nerfcli convert scene/ metric.npz --to npz --world-up z --origin focus --distance "a.jpg b.jpg 1.25"

@@ -30,7 +30,8 @@ def info(
 
     \b
     Of a run, by arithmetic: bytes of weights, optimiser (gradients and moments) and what a step keeps; operations and
-    memory traffic per sample and per picture, for its field and for the other kinds at equal storage.
+    memory traffic per sample and per picture, for its field and for the other kinds at equal storage. Where training
+    refined cameras: how far they moved, as median and maximum.
 
     \b
     Examples:
@@ -101,7 +102,15 @@ def _describe_run(folder: Path) -> dict[str, Any]:
     from nerfcli.evaluate.protocol import METRICS
     from nerfcli.field.cost import field_bytes
     from nerfcli.render.model import load_model
-    from nerfcli.train.run_folder import FIELD, chosen_components, read_cameras, read_config, read_log
+    from nerfcli.train.camera_moves import camera_moves
+    from nerfcli.train.run_folder import (
+        FIELD,
+        chosen_components,
+        read_cameras,
+        read_config,
+        read_given_cameras,
+        read_log,
+    )
 
     config = read_config(folder)
     cameras = read_cameras(folder)
@@ -128,6 +137,10 @@ def _describe_run(folder: Path) -> dict[str, Any]:
             "contraction": model.contraction,
             "cost": costs_of_run(model, cameras["train"], config.get("settings", {}), log),
         }
+        if chosen_components(config).cameras != "fixed":
+            radius = 1.0 / model.training_from_scene.scale
+            given = read_given_cameras(folder)["train"]
+            content["cameras_moved"] = camera_moves(given, cameras["train"], radius=radius)
     if (folder / METRICS).exists():
         content["metrics"] = read_json(
             folder / METRICS, needed=("mean",), hint="measure again: nerfcli evaluate RUN --overwrite"

@@ -85,7 +85,8 @@ def train(
 
     Components, for --with and --without: background (auto, black, constant, random, sphere: what is behind the
     field), view (0 to 3: the degree to which colours depend on the direction), exposure (none, exif, learned:
-    brightness and white balance of each photo), masks (ignore, empty: what their black means), points (a weight:
+    brightness and white balance of each photo), cameras (fixed, poses, focal, all: what of the photos' cameras learns
+    with the field), masks (ignore, empty: what their black means), points (a weight:
     surfaces at points of structure from motion), entropy (a weight: rays are opaque or clear), near (smaller gradients
     near cameras), distortion (a weight: the light of a ray in one place), antialias (true, false: details smaller
     than a pixel fade out; for photos from near and far), pixels (anywhere, error: more of them where the photos are
@@ -105,6 +106,7 @@ def train(
       nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
       nerfcli train photos-scene --budget 5m --model auto
       nerfcli train photos-scene --without view --with distortion=0.01
+      nerfcli train photos-scene --with cameras=poses
       nerfcli train photos-scene --field voxels --field-memory 16MB
     """
     from nerfcli.train.components import Components, choose

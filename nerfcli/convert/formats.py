@@ -22,6 +22,7 @@ from nerfcli.cameras.formats.metashape import parse_metashape
 from nerfcli.cameras.formats.opensfm import losses_opensfm, parse_opensfm, write_opensfm
 from nerfcli.cameras.formats.ply import losses_ply, write_ply
 from nerfcli.cameras.formats.reality_capture import parse_reality_capture
+from nerfcli.cameras.formats.run_cameras import find_run, parse_run
 from nerfcli.cameras.formats.scene_json import SCENE_FILE, read_description
 from nerfcli.cameras.formats.trajectories import (
     losses_kitti,
@@ -206,6 +207,14 @@ FORMATS = (
         files=MODEL_FILES,
         write=write_colmap_text,
         losses=losses_colmap_text,
+    ),
+    Format(
+        "run",
+        "the cameras of a run, refined where training refined them (read)",
+        "cameras.json and config.json of a run",
+        find_run,
+        lambda path, given: parse_run(path),
+        pixels=UPRIGHT,
     ),
     Format(
         "camera-path",

@@ -6,6 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
+from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
 from nerfcli.field.kinds import settings_from_json
@@ -14,7 +15,7 @@ from nerfcli.scene import Scene
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.preparation import Begun, Prepared
-from nerfcli.train.run_folder import FIELD, STATE, chosen_components, read_config
+from nerfcli.train.run_folder import FIELD, STATE, chosen_components, read_config, write_cameras
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.watch import that_must_be_finite
 
@@ -64,19 +65,38 @@ class Checkpoints:
             log_exposure=prepared.log_exposure,
         )
 
+    def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+        """The training photos and those held out, with their cameras as they are now."""
+        given = (self._scene.train_frames, self._scene.test_frames)
+        refinement = self._fitting.parts.cameras
+        if refinement is None:
+            return given
+        return refinement.frames(*given, scale=self._prepared.extent.training_from_scene.scale)
+
+    def write_cameras(self) -> None:
+        """Write RUN/cameras.json."""
+        refined = self._fitting.parts.cameras is not None
+        given = {frame.name: frame for frame in self._scene.frames} if refined else None
+        write_cameras(self._run, *self.frames(), given=given)
+
     def write(self) -> None:
-        """Write RUN/field.safetensors and RUN/state.safetensors."""
+        """Write RUN/field.safetensors and RUN/state.safetensors, and the cameras that the field was trained with."""
         tensors, description = self._fitting.state()
         extent = self._prepared.extent.to_json()
         description |= {"format": STATE_FORMAT, "extent": extent, "totals": vars(self._totals)}
         writing = [
-            lambda: save_model(self._run / FIELD, self.model()),
+            self._write_field,
             lambda: save_tensors(self._run / STATE, tensors, description),
         ]
         # A kill may come between the two. The state is all that resuming needs, and never ahead of the field; the first
         # time it is written first, so that there is no field which one can neither go on from nor replace.
         for write in writing if (self._run / FIELD).exists() else reversed(writing):
             write()
+
+    def _write_field(self) -> None:
+        save_model(self._run / FIELD, self.model())
+        if self._fitting.parts.cameras is not None:
+            self.write_cameras()
 
 
 def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]) -> Begun:

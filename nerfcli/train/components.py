@@ -15,6 +15,7 @@ Value = bool | int | float | str
 # What may be behind all that the field holds.
 BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
 EXPOSURES = ("none", "exif", "learned")
+CAMERAS = ("fixed", "poses", "focal", "all")
 # What is behind the black of a mask: something unknown, or nothing.
 MASKS = ("ignore", "empty")
 PIXELS = ("anywhere", "error")
@@ -32,6 +33,8 @@ class Components:
         view: how colours depend on the direction they are seen from: the highest degree of the spherical harmonics
             that the colour network is told, 0 to 3. 0: not at all.
         exposure: gains of the photos, see `field.exposure`: "none", those that "exif" tells, or "learned" from there.
+        cameras: what of the training photos' cameras learns with the field: "poses"; "focal", the focal length of each
+            lens; "all", both and radial distortion; or nothing, "fixed". See `refinement`.
         masks: what their black means: "ignore", not to be looked at; or "empty", nothing is there, as with alpha.
         points: weight of `point_depth.point_depth_loss`.
         entropy: weight of `losses.opacity_entropy`.
@@ -45,6 +48,7 @@ class Components:
     background: str = "auto"
     view: int = MOST_DEGREES
     exposure: str = "none"
+    cameras: str = "fixed"
     masks: str = "ignore"
     points: float = 0.0
     entropy: float = 0.0
@@ -97,6 +101,7 @@ CHOICES = {
     "background": Choice("what is behind the field", "black", "sphere", BACKGROUNDS),
     "view": Choice("colour by direction, degree", 0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
     "exposure": Choice("brightness and white balance of photos", "none", "learned", EXPOSURES),
+    "cameras": Choice("poses and lenses of photos", "fixed", "poses", CAMERAS),
     "masks": Choice("the black of masks is empty space", "ignore", "empty", MASKS),
     "points": Choice("surfaces at points of structure from motion, weight", 0.0, 0.1, None),
     "entropy": Choice("rays are opaque or clear, weight", 0.0, 0.01, None),

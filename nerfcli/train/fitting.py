@@ -133,7 +133,7 @@ class Fitting:
         watch.state(self.state)
         self.furthest = max(self.furthest, share)
         self.field.refine(self.furthest)
-        drawn = self.draw(share)
+        drawn = self.parts.with_learning_rays(self.draw(share), share)
         rays = len(drawn.origins)
         edges = self.edges[:: self._stride(share)].contiguous()
         loss, samples = self._loss(drawn, edges=edges, share=share, watch=watch)
@@ -141,11 +141,12 @@ class Fitting:
         self.parts_optimiser.zero_grad()
         if samples > 0:
             loss.backward()
-        self._check_finite(loss, watch)
+        self._check_finite(loss, drawn, watch)
         rate = self.learning_rate(share)
         self.step += 1
         self.optimiser.step(self.step, rate)
         self.parts_optimiser.step(rate)
+        self.parts.step_cameras(drawn, share, factor=self.rate_factor)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False
@@ -189,9 +190,26 @@ class Fitting:
         jitter = torch.rand(len(origins), generator=self.generator, device=device)
         background = self.parts.behind(len(origins), self.generator)
         samples = self.field.visible_samples(
-            origins, directions, edges, jitter=jitter, occupied=self.occupied, deepest=DEEPEST, cones=self._cones(drawn)
+            origins.detach(),
+            directions.detach(),
+            edges,
+            jitter=jitter,
+            occupied=self.occupied,
+            deepest=DEEPEST,
+            cones=self._cones(drawn),
         )
         starts, ends, offsets = samples.starts, samples.ends, samples.offsets
+        if origins.requires_grad:
+            coordinates = kernels.sample_coordinates(
+                origins,
+                directions,
+                starts,
+                ends,
+                offsets=offsets,
+                contraction=self.field.settings.contraction,
+                known=samples.coordinates,
+            )
+            samples = samples._replace(coordinates=coordinates)
         rays = kernels.ray_indices(offsets)
         density, rgb = self.field.radiance_of_samples(samples, directions, rays, sink=self.optimiser.sink)
         if components.near:
@@ -228,6 +246,7 @@ class Fitting:
     @torch.no_grad()
     def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
         """What the model says of pixels now, and what the photos say, both (N, 3) sRGB; alpha on white."""
+        drawn = self.parts.refined(drawn)
         origins, directions = drawn.origins, drawn.directions
         middle = torch.full_like(origins[:, 0], 0.5)
         behind = torch.full_like(origins, 1.0 if self.pool.has_alpha else 0.0)
@@ -271,9 +290,11 @@ class Fitting:
         threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
         return self.occupancy.above(threshold)
 
-    def _check_finite(self, loss: Tensor, watch: Watch) -> None:
+    def _check_finite(self, loss: Tensor, drawn: Drawn, watch: Watch) -> None:
         total = loss.detach()
-        for name, gradient in {**self.optimiser.gradients(), **self.parts.gradients()}.items():
+        rays = {"origins of rays": drawn.origins.grad, "directions of rays": drawn.directions.grad}
+        of_rays = {name: gradient for name, gradient in rays.items() if gradient is not None}
+        for name, gradient in {**self.optimiser.gradients(), **self.parts.gradients(), **of_rays}.items():
             watch.values(f"gradient of {name}", gradient)
             total = total + gradient.sum()  # which is non-finite if any term is
         if self.optimiser.sink is not None:

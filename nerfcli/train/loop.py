@@ -28,7 +28,6 @@ from nerfcli.train.run_folder import (
     cut_log,
     describe_run,
     read_config,
-    write_cameras,
     write_sealed,
 )
 from nerfcli.train.sentinel import FAILURES, Sentinel
@@ -96,6 +95,7 @@ def train(
         _clear(run)
     _describe(scene, run, settings, prepared, resume=resume)
     checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
+    checkpoints.write_cameras()
     sentinel = Sentinel(fitting, prepared.pool, run=run, notify=notify)
     with held_back() as interrupts:
 
@@ -113,7 +113,7 @@ def train(
         checkpoints.write()
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before are in {run}/failure-*")
-    measure_waypoints(scene, run, prepared, notify=notify)
+    measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
 
 
 def _clear(run: Path) -> None:
@@ -128,7 +128,7 @@ def _clear(run: Path) -> None:
 
 
 def _describe(scene: Scene, run: Path, asked: TrainSettings, prepared: Prepared, *, resume: bool) -> None:
-    """Write RUN/config.json and RUN/cameras.json."""
+    """Write RUN/config.json."""
     described = describe_run(
         scene,
         asked,
@@ -139,7 +139,6 @@ def _describe(scene: Scene, run: Path, asked: TrainSettings, prepared: Prepared,
     if resume:
         described["selection"] = read_config(run).get("selection")
     write_sealed(run / CONFIG, described)
-    write_cameras(run, scene.train_frames, scene.test_frames)
 
 
 def _run(

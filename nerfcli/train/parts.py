@@ -1,4 +1,4 @@
-"""What is learned besides the field: what is infinitely far, and the exposures of the photos."""
+"""What is learned besides the field: what is infinitely far, the exposures of the photos, and their cameras."""
 
 from typing import Any
 
@@ -11,6 +11,7 @@ from nerfcli.field.exposure import Exposure
 from nerfcli.train.components import Components
 from nerfcli.train.losses import over_background
 from nerfcli.train.photos import Drawn, Pool
+from nerfcli.train.refinement import Refinement, rate_at
 
 # Learning rates as multiples of the field's. After 300 steps at 0.3, gains of photos are a tenth of the way to the true
 # ones, at 2 half of it, at 5 no further.
@@ -47,6 +48,7 @@ class Parts(nn.Module):
         if components.exposure != "none":
             self.exposure = Exposure(log_gains.to(device, torch.float32))
             self.exposure.requires_grad_(components.exposure == "learned")
+        self.cameras = None if components.cameras == "fixed" else Refinement(components.cameras, pool)
         self.is_random = kind == "random" or (kind == "auto" and pool.has_alpha)
         self._pool = pool
 
@@ -59,6 +61,30 @@ class Parts(nn.Module):
     def gradients(self) -> dict[str, Tensor]:
         """By name, those that there are."""
         return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
+
+    def refined(self, drawn: Drawn) -> Drawn:
+        """The same pixels, with the rays of the cameras as they are now."""
+        return drawn if self.cameras is None else self.cameras.refined(drawn)
+
+    def with_learning_rays(self, drawn: Drawn, share: float) -> Drawn:
+        """`refined`, with rays that collect gradients while cameras learn."""
+        refined = self.refined(drawn)
+        if self.cameras is None or rate_at(share) == 0.0:
+            return refined
+        return refined._replace(
+            origins=refined.origins.clone().requires_grad_(), directions=refined.directions.clone().requires_grad_()
+        )
+
+    def step_cameras(self, drawn: Drawn, share: float, *, factor: float) -> None:
+        """One step of the cameras against the gradients of rays of `with_learning_rays`.
+
+        Args:
+            drawn: those rays.
+            share: of the budget.
+            factor: of the rate.
+        """
+        if self.cameras is not None:
+            self.cameras.step(drawn, share, factor=factor)
 
     def behind(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) what rays are composited on: black or random colours.

@@ -150,12 +150,14 @@ class Drawn(NamedTuple):
 
 
 class Pool(Protocol):
-    """Where a training takes its pixels from."""
+    """Where a training takes its pixels from: photos with poses (P, 4, 4), training frame, and cameras."""
 
     colours: Tensor
     first_pixel: Tensor
     footprint: float
     cones: Tensor
+    poses: Tensor
+    cameras: tuple[Camera, ...]
 
     @property
     def has_alpha(self) -> bool:
@@ -201,6 +203,7 @@ class PixelPool:
         self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
         self.sizes = torch.tensor([photo.pixels.shape[:2] for photo in photos], device=device)
         self.frames = tuple(photo.frame for photo in photos)
+        self.cameras = tuple(photo.frame.camera for photo in photos)
         poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
         self.poses = torch.tensor(np.array(poses), dtype=torch.float32, device=device)
 

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ STATE = "state.safetensors"
 LOG = "log.jsonl"
 LOCK = ".train.lock"
 _SEAL = "blake2b"
+# In an entry of RUN/cameras.json: camera and pose as the scene had them.
+_GIVEN = "given"
 _MEND = f"train again with --overwrite, or restore the file; if you changed it yourself, take out its {_SEAL}"
 # What every line of the log has.
 _LOGGED = ("step", "seconds", "loss", "samples", "rays", "peak_memory_bytes")
@@ -93,15 +95,20 @@ def check_split(run: Path, config: dict[str, Any], test: Sequence[Frame]) -> Non
         )
 
 
-def write_cameras(run: Path, train: Sequence[Frame], test: Sequence[Frame]) -> None:
+def write_cameras(
+    run: Path, train: Sequence[Frame], test: Sequence[Frame], *, given: Mapping[str, Frame] | None = None
+) -> None:
     """The frames of both sets, full-size cameras and poses in the scene's frame.
 
     Rendering needs nothing else of the scene; evaluation finds the photos through it.
+
+    Args:
+        run: the folder.
+        train, test: frames as the field knows them.
+        given: by name, as the scene has them, where training has refined them.
     """
-    content = {
-        "train": [_frame_to_json(f, run) for f in train],
-        "test": [_frame_to_json(f, run) for f in test],
-    }
+    frames = {"train": train, "test": test}
+    content = {name: [_frame_to_json(frame, run, given or {}) for frame in frames[name]] for name in frames}
     write_sealed(run / CAMERAS, content)
 
 
@@ -111,10 +118,25 @@ def read_cameras(run: Path) -> dict[str, tuple[Frame, ...]]:
     Raises:
         UserError: the folder is not one that `train` wrote.
     """
+    return _read_frames(run, lambda entry: entry)
+
+
+def read_given_cameras(run: Path) -> dict[str, tuple[Frame, ...]]:
+    """The frames of "train" and "test" as the scene had them, before training refined them.
+
+    Raises:
+        UserError: see `read_cameras`.
+    """
+    return _read_frames(run, lambda entry: {**entry, **entry.get(_GIVEN, {})})
+
+
+def _read_frames(run: Path, chosen: Callable[[dict[str, Any]], dict[str, Any]]) -> dict[str, tuple[Frame, ...]]:
     path = run / CAMERAS
     try:
         content = _read_sealed(path)
-        return {name: tuple(_frame_from_json(entry, run) for entry in content[name]) for name in ("train", "test")}
+        return {
+            name: tuple(_frame_from_json(chosen(entry), run) for entry in content[name]) for name in ("train", "test")
+        }
     except FileNotFoundError as error:
         raise UserError(
             f"{run} is not a run: it has no {CAMERAS}", "give the folder that nerfcli train wrote"
@@ -216,15 +238,20 @@ def _write_log(run: Path, entries: Iterable[dict[str, Any]]) -> None:
         partial.write_text("".join(f"{json.dumps(entry)}\n" for entry in entries), encoding="utf-8")
 
 
-def _frame_to_json(frame: Frame, run: Path) -> dict[str, Any]:
+def _frame_to_json(frame: Frame, run: Path, given: Mapping[str, Frame]) -> dict[str, Any]:
+    before = given.get(frame.name)
     return {
         "name": frame.name,
-        "camera": frame.camera.to_json(),
-        "world_from_cam": frame.world_from_cam.tolist(),
+        **_view_to_json(frame),
+        **({} if before is None else {_GIVEN: _view_to_json(before)}),
         # Relative, so that scene and run can be moved together.
         "image": None if frame.image is None else os.path.relpath(frame.image, run),
         "mask": None if frame.mask is None else os.path.relpath(frame.mask, run),
     }
+
+
+def _view_to_json(frame: Frame) -> dict[str, Any]:
+    return {"camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
 
 
 def _frame_from_json(entry: dict[str, Any], run: Path) -> Frame:
@@ -249,7 +276,9 @@ def is_same_run(run: Path, scene: Scene, settings: TrainSettings) -> bool:
     for name in ("downscale", "contraction"):
         if wanted[name] is None:
             del wanted[name]
-    trained = {**TrainSettings().to_json(), **config.get("settings", {})}
+    defaults, named = TrainSettings().to_json(), config.get("settings", {})
+    components = {**defaults["components"], **named.get("components", {})}
+    trained = {**defaults, **named, "components": components}
     return config.get("scene_fingerprint") == fingerprint(scene) and all(
         trained.get(key) == value for key, value in wanted.items()
     )

@@ -8,7 +8,7 @@ to the copy, with half the learning rate.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerfcli.cameras.camera import Camera
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.kinds import settings_from_json
@@ -125,6 +126,7 @@ class Sentinel:
             **drawn._asdict(),
             "first_pixel": fitting.pool.first_pixel,
             "cones": fitting.pool.cones,
+            "poses": fitting.pool.poses,
             "after_draw": fitting.generator.get_state(),
         }
         pixels = [self._pool.place(int(drawn.numbers[ray])) for ray in bad.rays[:PIXELS_NAMED]]
@@ -142,6 +144,7 @@ class Sentinel:
             "pixels": [list(pixel) for pixel in pixels],
             "settings": fitting.settings.to_json(),
             "marching": vars(fitting.marching),
+            "cameras": [camera.to_json() for camera in fitting.pool.cameras],
             "state": description,
         }
         save_tensors(path, {**before, **{f"batch.{name}": value for name, value in batch.items()}}, content)
@@ -151,9 +154,11 @@ class Sentinel:
 class _SavedBatch:
     """A pool of pixels that has one batch to give."""
 
-    def __init__(self, tensors: dict[str, Tensor]):
+    def __init__(self, tensors: dict[str, Tensor], cameras: Sequence[dict[str, Any]]):
         self.colours, self.first_pixel = tensors["batch.colours"], tensors["batch.first_pixel"]
         self.cones = tensors["batch.cones"]
+        self.poses = tensors.get("batch.poses", torch.zeros(0, 4, 4))  # earlier versions refined no cameras
+        self.cameras = tuple(Camera.from_json(camera) for camera in cameras)
         self._drawn = Drawn(**{name: tensors[f"batch.{name}"] for name in Drawn._fields})
         self._after_draw = tensors["batch.after_draw"]
         self.footprint = math.nan  # the field's size is known
@@ -186,7 +191,7 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
     torch.set_num_threads(settings.threads)
     size = settings_from_json(description["state"]["field"])
     fitting = Fitting(
-        _SavedBatch(tensors),
+        _SavedBatch(tensors, description.get("cameras", ())),
         Marching(**description["marching"]),
         contraction=size.contraction,
         settings=settings,

@@ -4,15 +4,15 @@ What training cannot read, it cannot learn from, nor be stopped or steered by.
 """
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
 from nerfcli.atomic import cannot_write
+from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.render.model import Model, load_model, save_model
-from nerfcli.scene import Scene
 from nerfcli.train.exif_exposure import relative_log_exposures
 from nerfcli.train.heldout import HeldoutPixels
 from nerfcli.train.photos import load_album
@@ -45,24 +45,26 @@ def forget_waypoints(run: Path, *, after: int = -1) -> None:
         shutil.rmtree(run / FOLDER, ignore_errors=True)
 
 
-def measure_waypoints(scene: Scene, run: Path, prepared: Prepared, *, notify: Callable[[str], None]) -> None:
+def measure_waypoints(
+    held_out: Sequence[Frame], run: Path, prepared: Prepared, *, notify: Callable[[str], None]
+) -> None:
     """Add the PSNR of some held-out pixels to the entries of RUN/log.jsonl that stand for waypoints, and remove these.
 
     Held-out photos that cannot be read are told, and nothing is measured: the training is done without them.
     """
     settings, device = prepared.settings, prepared.settings.device
     steps = _kept(run)
-    if scene.test_frames and steps:
+    if held_out and steps:
         masks = settings.components.masks
         try:
             album = load_album(
-                scene.test_frames, factor=prepared.factor, threads=settings.threads, room=prepared.room, masks=masks
+                held_out, factor=prepared.factor, threads=settings.threads, room=prepared.room, masks=masks
             )
             pixels = HeldoutPixels(
                 album.photos,
                 prepared.extent.training_from_scene,
                 torch.device(device),
-                log_gains=relative_log_exposures(scene.test_frames, prepared.log_exposure),
+                log_gains=relative_log_exposures(held_out, prepared.log_exposure),
                 colours=album.colours,
                 room=prepared.room,
             )

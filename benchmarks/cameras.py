@@ -1,0 +1,232 @@
+"""Cameras that are wrong by a known amount: how near training brings them, what that gains, and what it costs.
+
+    python benchmarks/component_scenes.py scenes --only poses-balls --only focal-balls --only alpha
+    python benchmarks/cameras.py scenes -o cameras
+    python benchmarks/cameras.py scenes -o long --only poses-balls --steps 1500 --seeds 2
+
+Each scene is trained as it is, with cameras that learn, and with the true cameras, with the same steps and seeds.
+Errors of poses are root mean squares over the training photos against the truth: raw, and after the mean similarity,
+which no photo can tell, is taken out. Translations are shares of the cameras' distance from their middle; "picture" is
+how far what stands at the middle of the scene is from its place in the pictures. Held-out PSNR is that of whole photos
+and of their right halves, these raw and with the pose aligned on the left half (`nerfcli evaluate --align pose`).
+Seconds are of the processor.
+"""
+
+import csv
+import json
+import statistics
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from nerfcli import kernels, scene
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import apply, inverse, vector_from_rotation
+from nerfcli.evaluate.protocol import Extras, HeldOut, evaluate_model
+from nerfcli.render.model import load_model
+from nerfcli.scene import Scene
+from nerfcli.train.components import Components
+from nerfcli.train.gauge import without_mean
+from nerfcli.train.loop import Progress, train
+from nerfcli.train.photos import load_photos
+from nerfcli.train.run_folder import FIELD, read_cameras
+from nerfcli.train.settings import TrainSettings
+
+# Scene, downscale, and what is to learn. The last needs nothing: what is lost on it is the price.
+CASES = (
+    ("poses-balls", 1, "poses"),
+    ("focal-balls", 1, "focal"),
+    ("poses", 2, "poses"),
+    ("focal", 2, "focal"),
+    ("alpha", 1, "poses"),
+    ("alpha", 1, "focal"),
+)
+MIDDLE_POINTS, MIDDLE_SHARE = 200, 0.2
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One training: errors of its cameras, and held-out PSNR in dB."""
+
+    scene: str
+    cameras: str
+    seed: int
+    steps: int
+    rotation_deg: float
+    rotation_aligned_deg: float
+    translation_percent: float
+    translation_aligned_percent: float
+    picture_px: float
+    focal_percent: float
+    psnr: float
+    psnr_right_half: float
+    psnr_pose_aligned: float
+    cpu_seconds: float
+
+
+def with_truth(capture: Scene, folder: Path) -> Scene:
+    """The scene with the cameras that its photos were made with."""
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    poses, params = truth.get("world_from_cam", {}), truth.get("params")
+    frames = tuple(
+        replace(
+            frame,
+            world_from_cam=np.array(poses.get(frame.name, frame.world_from_cam)),
+            camera=frame.camera if params is None else replace(frame.camera, params=tuple(params)),
+        )
+        for frame in capture.frames
+    )
+    return replace(capture, frames=frames)
+
+
+def pose_errors(found: Sequence[Frame], true: Sequence[Frame]) -> tuple[float, float, float, float, float]:
+    """Rotation in degrees, raw and aligned; translation in %, raw and aligned; picture in pixels, aligned."""
+    after, truth = (np.array([frame.world_from_cam for frame in frames]) for frames in (found, true))
+    aligned = after
+    for _ in range(5):  # the mean is one to first order
+        aligned = without_mean(truth, aligned)
+    centre = truth[:, :3, 3].mean(axis=0)
+    reach = float(np.linalg.norm(truth[:, :3, 3] - centre, axis=1).mean())
+
+    def rms(values: np.ndarray) -> float:
+        return float(np.sqrt((values**2).sum(axis=-1).mean()))
+
+    def turns(poses: np.ndarray) -> float:
+        return float(np.degrees(rms(vector_from_rotation(np.swapaxes(truth[:, :3, :3], 1, 2) @ poses[:, :3, :3]))))
+
+    def moves(poses: np.ndarray) -> float:
+        return 100 * rms(poses[:, :3, 3] - truth[:, :3, 3]) / reach
+
+    ahead = truth[:, :3, 2]
+    # The point that all optical axes pass nearest to.
+    away = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+    middle = np.linalg.lstsq(away.sum(0), (away @ truth[:, :3, 3, None])[..., 0].sum(0), rcond=None)[0]
+    points = middle + MIDDLE_SHARE * reach * np.random.default_rng(0).uniform(-1, 1, (MIDDLE_POINTS, 3))
+    places = [
+        camera.project(apply(inverse(a), points))[0] - camera.project(apply(inverse(b), points))[0]
+        for camera, a, b in zip([frame.camera for frame in true], aligned, truth, strict=True)
+    ]
+    return turns(after), turns(aligned), moves(after), moves(aligned), rms(np.concatenate(places))
+
+
+def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downscale: int, samples: int) -> Trained:
+    """Train with cameras "fixed", "true" or refined, and measure."""
+    settings = TrainSettings(
+        budget_seconds=None,
+        steps=steps,
+        downscale=downscale,
+        seed=seed,
+        samples_per_step=samples,
+        components=Components(cameras="fixed" if choice == "true" else choice),
+    )
+    began = used = 0.0
+
+    def clock(progress: Progress) -> None:
+        nonlocal began, used
+        began = began or time.process_time()
+        used = time.process_time() - began
+
+    with tempfile.TemporaryDirectory() as folder:
+        run, capture = Path(folder), truth if choice == "true" else given
+        train(capture, run, settings, resume=False, notify=lambda text: None, on_progress=clock)
+        model, cameras = load_model(run / FIELD, "cpu"), read_cameras(run)
+    held_out = [
+        HeldOut(photo.frame, photo.pixels, photo.used)
+        for photo in load_photos(cameras["test"], factor=downscale, threads=1)
+    ]
+    mean = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras(align_poses=True))["mean"]
+    focal = [
+        a.camera.focal_px / b.camera.focal_px - 1 for a, b in zip(cameras["train"], truth.train_frames, strict=True)
+    ]
+    rotation, rotation_aligned, move, move_aligned, picture = pose_errors(cameras["train"], truth.train_frames)
+    return Trained(
+        given.root.name,
+        choice,
+        seed,
+        steps,
+        rotation,
+        rotation_aligned,
+        move,
+        move_aligned,
+        picture,
+        100 * float(np.abs(focal).mean()),
+        mean["psnr"],
+        mean["psnr_right_half"],
+        mean["psnr_pose_aligned"],
+        used,
+    )
+
+
+def print_table(trained: list[Trained]) -> None:
+    """A line per scene and choice: means over the seeds."""
+    table = Table(title=f"{trained[0].steps} steps")
+    heads = (
+        "scene",
+        "cameras",
+        "deg",
+        "aligned",
+        "move %",
+        "aligned",
+        "picture px",
+        "focal %",
+        "PSNR",
+        "right",
+        "aligned",
+        "CPU s",
+    )
+    for number, name in enumerate(heads):
+        table.add_column(name, justify="left" if number < 2 else "right")
+    numbers = [field.name for field in fields(Trained)][4:]
+    for key in dict.fromkeys((t.scene, t.cameras) for t in trained):
+        mine = [t for t in trained if (t.scene, t.cameras) == key]
+        means = [statistics.fmean(getattr(t, name) for t in mine) for name in numbers]
+        table.add_row(*key, *(f"{mean:.3f}" for mean in means[:6]), *(f"{mean:.2f}" for mean in means[6:]))
+    Console(width=120).print(table)
+
+
+def main(
+    scenes: Annotated[Path, typer.Argument(help="What component_scenes.py wrote.")],
+    output: Annotated[Path, typer.Option("-o", help="Where to write, without suffix.")],
+    only: Annotated[list[str] | None, typer.Option(help="Scenes; all that are there by default.")] = None,
+    choices: Annotated[
+        str, typer.Option(help="Of fixed, refined and true, separated by commas.")
+    ] = "fixed,refined,true",
+    seeds: Annotated[int, typer.Option(help="Trainings of each.")] = 1,
+    steps: Annotated[int, typer.Option(help="Of each training.")] = 800,
+    samples: Annotated[int, typer.Option(help="Samples of the last steps.")] = 2**14,
+) -> None:
+    """Compare trainings with wrong, refined and true cameras."""
+    torch.set_num_threads(1)
+    kernels.prepare(Console(stderr=True).print)
+    trained: list[Trained] = []
+    with output.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Trained)])
+        writer.writeheader()
+        for name, downscale, kind in CASES:
+            if (only and name not in only) or not (scenes / name).is_dir():
+                continue
+            given = scene.load(scenes / name)
+            truth = with_truth(given, scenes / name)
+            for seed in range(seeds):
+                for choice in choices.split(","):
+                    learned = kind if choice == "refined" else choice
+                    trained.append(
+                        fit(given, truth, learned, seed=seed, steps=steps, downscale=downscale, samples=samples)
+                    )
+                    writer.writerow(asdict(trained[-1]))
+                    file.flush()
+                    Console(stderr=True).print(trained[-1])
+    print_table(trained)
+
+
+if __name__ == "__main__":
+    typer.run(main)

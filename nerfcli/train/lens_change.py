@@ -1,0 +1,70 @@
+"""What refinement may change of a lens: its focal length by a factor, and the first two terms of its radial distortion.
+
+Resolution does not enter: the same change suits the photo and the smaller picture that is trained on.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera, parameter_names
+from nerfcli.cameras.lens import DISTORTIONS
+
+FOCAL = "focal"
+_FOCAL_NAMES = ("f", "fx", "fy")
+# Further terms tell little apart from the first two, and run away where few pixels look.
+_RADIAL_TERMS = 2
+
+
+def changeable(camera: Camera) -> tuple[str, ...]:
+    """What there is to change: "focal", and the names of the radial terms; nothing of a spherical camera."""
+    radial = [name for group in DISTORTIONS[camera.model] for name in group.get("radial", ())]
+    has_focal = any(name in _FOCAL_NAMES for name in parameter_names(camera.model))
+    return (*([FOCAL] if has_focal else []), *radial[:_RADIAL_TERMS])
+
+
+def changed(camera: Camera, names: Sequence[str], values: np.ndarray) -> Camera:
+    """The camera with a change.
+
+    focal length exp(values[focal]) times as long;  k + values[k] for a radial term k
+
+    Args:
+        camera: as it was.
+        names: of `changeable`.
+        values: one per name; zeros change nothing.
+
+    Raises:
+        UserError: no camera is like that.
+    """
+    change = dict(zip(names, values, strict=True))
+    factor = float(np.exp(change.get(FOCAL, 0.0)))
+    params = [
+        value * factor if name in _FOCAL_NAMES else value + change.get(name, 0.0)
+        for name, value in zip(parameter_names(camera.model), camera.params, strict=True)
+    ]
+    return replace(camera, params=tuple(params))
+
+
+def pixels_by_change(camera: Camera, names: Sequence[str], by_parameters: np.ndarray) -> np.ndarray:
+    """d pixel / d change (N, 2, K) of a camera, from its d pixel / d parameters (N, 2, P)."""
+    known = parameter_names(camera.model)
+    focal = [index for index, name in enumerate(known) if name in _FOCAL_NAMES]
+    columns = [
+        by_parameters[..., focal] @ np.array(camera.params)[focal]
+        if name == FOCAL
+        else by_parameters[..., known.index(name)]
+        for name in names
+    ]
+    return np.stack(columns, axis=-1)
+
+
+def bearings_by_change(camera: Camera, names: Sequence[str], pixels: np.ndarray) -> np.ndarray:
+    """d direction / d change (N, 3, K) of pixels (N, 2) that stay where they are; zero where there is no direction.
+
+    The direction moves so that its pixel stays: d direction / d change = - d direction / d pixel  d pixel / d change.
+    """
+    directions, _ = camera.bearings(pixels)
+    by_pixel, _ = camera.bearing_jacobian(pixels)
+    _, by_parameters, _ = camera.project_jacobian(directions)
+    return -by_pixel @ pixels_by_change(camera, names, by_parameters)

@@ -1,0 +1,308 @@
+"""Cameras that learn: derivatives against differences, what the gauge may not change, a known noise that goes away."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from examples import examples
+from hypothesis import given
+from hypothesis import strategies as st
+from lenses import HEIGHT, MODELS, WIDTH, random_camera
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.run_cameras import find_run, parse_run
+from nerfcli.cameras.rigid import (
+    Similarity,
+    apply,
+    inverse,
+    look_at,
+    rotation_from_vector,
+    transform_from_twist,
+)
+from nerfcli.field.checkpoint import load_tensors
+from nerfcli.scene import Scene
+from nerfcli.train.camera_moves import camera_moves
+from nerfcli.train.components import Components
+from nerfcli.train.extent import Extent
+from nerfcli.train.fitting import Fitting
+from nerfcli.train.gauge import mean_similarity, without_mean
+from nerfcli.train.lens_change import bearings_by_change, changeable, changed
+from nerfcli.train.loop import train
+from nerfcli.train.photos import PixelPool, load_photos
+from nerfcli.train.refinement import LAST_SHARE, Refinement, rate_at
+from nerfcli.train.run_folder import STATE, read_cameras, read_given_cameras
+from nerfcli.train.settings import TrainSettings
+from nerfcli.train.whitening import DAMPING, whitening
+
+seeds = st.integers(0, 2**32 - 1)
+FEW = TrainSettings(budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
+
+
+def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:
+    return np.array(
+        [look_at(rng.normal(size=3) * 3, rng.normal(size=3) * 0.2, np.array([0, 0, 1])) for _ in range(count)]
+    )
+
+
+def turned(scene: Scene, degrees: float) -> Scene:
+    """The scene with its training photos turned about random axes."""
+    rng = np.random.default_rng(7)
+
+    def turn(pose: np.ndarray) -> np.ndarray:
+        axis = rng.normal(size=3)
+        pose = pose.copy()
+        pose[:3, :3] = pose[:3, :3] @ rotation_from_vector(np.radians(degrees) * axis / np.linalg.norm(axis))
+        return pose
+
+    frames = [
+        f if f.name in scene.test_names else replace(f, world_from_cam=turn(f.world_from_cam)) for f in scene.frames
+    ]
+    return replace(scene, frames=tuple(frames))
+
+
+@pytest.fixture(scope="module")
+def small(spheres: Scene) -> Scene:
+    """Four photos, the last one held out."""
+    frames = spheres.frames[:4]
+    return replace(spheres, frames=frames, test_names=frozenset({frames[3].name}))
+
+
+def pool_of(scene: Scene) -> PixelPool:
+    photos = load_photos(scene.train_frames, factor=1, threads=1)
+    return PixelPool(photos, Similarity.identity(), torch.device("cpu"))
+
+
+def linear_loss(pool: PixelPool, refinement: Refinement, numbers: torch.Tensor, slopes: torch.Tensor) -> float:
+    """A loss that is linear in the rays: exactly what the gradients of rays are a gradient of."""
+    drawn = refinement.refined(pool.rays_of(numbers))
+    return float((torch.stack([drawn.origins, drawn.directions]).double() * slopes).sum())
+
+
+def test_pose_gradient_is_the_difference_of_a_loss(small):
+    """Central differences of a loss that is linear in the rays, from poses that have moved already."""
+    pool, generator = pool_of(small), torch.Generator().manual_seed(3)
+    numbers = pool.draw(300, generator).numbers
+    slopes = torch.randn(2, 300, 3, generator=generator, dtype=torch.float64)
+    refinement = Refinement("poses", pool)
+    poses = refinement.poses
+    assert poses is not None
+    twists = 0.1 * torch.randn(3, 6, generator=generator, dtype=torch.float64)
+    start = torch.from_numpy(transform_from_twist(twists.numpy()))
+    poses.motions.copy_(start)
+    drawn = refinement.refined(pool.rays_of(numbers))
+    found = poses.gradient(
+        drawn.directions.double(), pool.photo_of(numbers), by_origin=slopes[0], by_direction=slopes[1]
+    )
+    step = 1e-2  # float32 rays; the third derivative of a turn is about the first
+    for photo in range(3):
+        for axis in range(6):
+            losses = []
+            for sign in (1, -1):
+                twist = np.zeros((3, 6))
+                twist[photo, axis] = sign * step
+                poses.motions.copy_(start @ torch.from_numpy(transform_from_twist(twist)))
+                losses.append(linear_loss(pool, refinement, numbers, slopes))
+            wanted = (losses[0] - losses[1]) / (2 * step)
+            assert found[photo, axis].item() == pytest.approx(wanted, abs=1e-4 * found.abs().max().item() + 1e-3)
+
+
+def test_lens_gradient_is_the_difference_of_a_loss(small):
+    lens = Camera("RADIAL", 96, 72, (100.0, 48.0, 36.0, 0.05, -0.02))
+    scene = replace(small, frames=tuple(replace(frame, camera=lens) for frame in small.frames))
+    pool, generator = pool_of(scene), torch.Generator().manual_seed(3)
+    numbers = pool.draw(300, generator).numbers
+    slopes = torch.randn(2, 300, 3, generator=generator, dtype=torch.float64)
+    refinement = Refinement("all", pool)
+    lenses = refinement.lenses
+    assert lenses is not None
+    start = torch.tensor([[0.02, 0.01, -0.01]], dtype=torch.float64)
+    lenses.values.copy_(start)
+    turns = pool.poses[:, :3, :3].double()
+    found = lenses.gradient(numbers, pool.photo_of(numbers), turns=turns, by_direction=slopes[1])
+    for index in range(3):
+        losses = []
+        for sign in (1, -1):
+            lenses.values.copy_(start)
+            lenses.values[0, index] += sign * 1e-2
+            losses.append(linear_loss(pool, refinement, numbers, slopes))
+        wanted = (losses[0] - losses[1]) / 2e-2
+        assert found[0, index].item() == pytest.approx(wanted, abs=2e-3 * found.abs().max().item())
+
+
+def test_only_a_sphere_has_nothing_to_change():
+    rng = np.random.default_rng(0)
+    assert {m for m in MODELS if not changeable(random_camera(m, rng))} == {"EQUIRECTANGULAR"}
+
+
+@given(model=st.sampled_from([m for m in MODELS if m != "EQUIRECTANGULAR"]), seed=seeds)
+@examples(15)
+def test_bearings_of_a_changed_lens_move_as_the_derivative_says(model, seed):
+    rng = np.random.default_rng(seed)
+    camera = random_camera(model, rng)
+    names = changeable(camera)
+    pixels = rng.uniform(0.3, 0.7, (50, 2)) * (WIDTH, HEIGHT)
+    found = bearings_by_change(camera, names, pixels)
+    step = 1e-5
+    for index in range(len(names)):
+        change = np.zeros(len(names))
+        change[index] = step
+        (ahead, valid), (behind, also) = (changed(camera, names, sign * change).bearings(pixels) for sign in (1, -1))
+        _, inside = camera.bearings(pixels)
+        smooth = valid & also & inside
+        difference = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(found[smooth, :, index], difference[smooth], atol=1e-6)
+
+
+@given(seed=seeds)
+@examples(40)
+def test_taking_out_the_mean_leaves_cameras_as_they_stand_to_each_other(seed):
+    """Turns between cameras stay, distances between them by one common factor."""
+    rng = np.random.default_rng(seed)
+    before = random_poses(rng, 5)
+    after = before @ transform_from_twist(rng.normal(size=(5, 6)) * 0.05)
+    kept = without_mean(before, after)
+    np.testing.assert_allclose(
+        inverse(kept[0])[:3, :3] @ kept[1:, :3, :3], inverse(after[0])[:3, :3] @ after[1:, :3, :3], atol=1e-12
+    )
+    apart = [np.linalg.norm(poses[1:, :3, 3] - poses[0, :3, 3], axis=1) for poses in (kept, after)]
+    np.testing.assert_allclose(apart[0] / apart[1], (apart[0] / apart[1])[0], rtol=1e-12)
+
+
+@given(seed=seeds)
+@examples(40)
+def test_a_similarity_of_all_cameras_is_taken_out_whole(seed):
+    """To first order, and so wholly when it is done again and again."""
+    rng = np.random.default_rng(seed)
+    before = random_poses(rng, 6)
+    moved = Similarity(np.exp(0.1 * rng.normal()), rotation_from_vector(0.1 * rng.normal(size=3)), rng.normal(size=3))
+    kept = moved.apply_pose(before)
+    for _ in range(20):
+        kept = without_mean(before, kept)
+    np.testing.assert_allclose(kept, before, atol=1e-9)
+    rest = mean_similarity(before, kept)
+    assert rest.scale == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_cameras_in_one_place_have_no_scale(count):
+    before = np.repeat(random_poses(np.random.default_rng(0), 1), count, axis=0)
+    after = before @ transform_from_twist(np.full(6, 0.01))
+    assert mean_similarity(before, after).scale == pytest.approx(1.0, abs=1e-9)
+    np.testing.assert_allclose(without_mean(before, after), before, atol=1e-3)
+
+
+def test_whitened_steps_move_what_is_seen_alike():
+    """The closed form for independent parameters: one over their sizes, less the damping."""
+    sizes = np.array([1e-3, 1.0, 50.0])
+    jacobian = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 3)))[0] * sizes
+    np.testing.assert_allclose(
+        jacobian @ whitening(jacobian) @ (np.eye(3)), jacobian / sizes / np.sqrt(1 + DAMPING), rtol=6e-3
+    )
+
+
+def test_rates_rise_from_nothing_and_end_at_nothing():
+    shares = np.linspace(0, 1, 201)
+    rates = np.array([rate_at(share) for share in shares])
+    assert rates.max() == 1.0
+    assert (rates[[0, -1]] == 0).all()
+    assert (rates[shares >= LAST_SHARE] == 0).all()
+    assert np.abs(np.diff(rates)).max() < 0.1
+
+
+def test_cameras_that_have_not_moved_give_the_same_rays(small):
+    pool = pool_of(small)
+    drawn = pool.draw(100, torch.Generator().manual_seed(0))
+    refined = Refinement("poses", pool).refined(drawn)
+    assert torch.equal(refined.origins, drawn.origins)
+    torch.testing.assert_close(refined.directions, drawn.directions, atol=2e-7, rtol=0)
+
+
+def test_photos_find_back_into_a_field_that_knows_better(spheres, spheres_run):
+    """A trained field that is held still, and photos turned by half a degree: in 40 steps, what is at the middle of the
+    scene is twice as near to its place in the pictures."""
+    noisy = turned(spheres, 0.5)
+    tensors, description = load_tensors(spheres_run / STATE, "cpu")
+    extent = Extent.from_json(description["extent"])
+    photos = load_photos(noisy.train_frames, factor=1, threads=1)
+    pool = PixelPool(photos, extent.training_from_scene, torch.device("cpu"))
+    settings = TrainSettings(
+        budget_seconds=None, steps=40, samples_per_step=2**13, threads=2, components=Components(cameras="poses"),
+        learning_rate=1e-30, final_learning_rate=1e-30,
+    )  # fmt: skip
+    fitting = Fitting(pool, extent.marching, contraction=extent.contraction, settings=settings)
+    cameras = fitting.parts.cameras
+    assert cameras is not None
+    tensors |= {f"parts.{name}": value.clone() for name, value in fitting.parts.state_dict().items()}
+    fitting.restore(tensors, description)
+    truth = extent.training_from_scene.apply_pose(np.array([f.world_from_cam for f in spheres.train_frames]))
+    points = np.random.default_rng(0).normal(size=(50, 3)) * 0.2
+
+    def error_px() -> float:
+        assert cameras is not None
+        assert cameras.poses is not None
+        now = without_mean(truth, cameras.poses.poses())
+        squares = [
+            ((camera.project(apply(inverse(a), points))[0] - camera.project(apply(inverse(b), points))[0]) ** 2).sum(1)
+            for camera, a, b in zip(pool.cameras, truth, now, strict=True)
+        ]
+        return float(np.sqrt(np.mean(squares)))
+
+    before = error_px()
+    for step in range(40):
+        fitting.advance(0.15 + 0.3 * step / 40)
+    assert before > 0.5
+    assert error_px() < before / 2
+
+
+def fit(scene: Scene, run: Path, settings: TrainSettings, *, resume: bool = False) -> None:
+    train(scene, run, settings, resume=resume, notify=lambda text: None, on_progress=lambda progress: None)
+
+
+def test_resuming_goes_on_with_the_cameras_bit_for_bit(small, tmp_path):
+    settings = replace(FEW, components=Components(cameras="all"))
+    fit(small, tmp_path / "straight", settings)
+    # Shares count steps of the whole: half of the steps alone would be another schedule.
+    stopped: list[int] = []
+
+    def stop(progress) -> None:
+        stopped.append(progress.step)
+        if progress.step == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(small, tmp_path / "parts", settings, resume=False, notify=lambda text: None, on_progress=stop)
+    fit(small, tmp_path / "parts", settings, resume=True)
+    ours, theirs = (load_tensors(tmp_path / name / STATE, "cpu")[0] for name in ("straight", "parts"))
+    assert ours.keys() == theirs.keys()
+    assert "parts.cameras.poses.motions" in ours
+    for name, tensor in ours.items():
+        assert torch.equal(tensor, theirs[name]), name
+    assert (ours["parts.cameras.poses.motions"] != torch.eye(4)).any()
+    frames = [read_cameras(tmp_path / name)["train"] for name in ("straight", "parts")]
+    for one, other in zip(*frames, strict=True):
+        assert one.camera == other.camera
+        assert np.array_equal(one.world_from_cam, other.world_from_cam)
+
+
+def test_a_run_has_the_cameras_of_its_field_and_those_of_the_scene(small, tmp_path):
+    run = tmp_path / "run"
+    fit(small, run, replace(FEW, components=Components(cameras="all")))
+    refined, before = read_cameras(run), read_given_cameras(run)
+    for frame, old in zip(before["train"], small.train_frames, strict=True):
+        assert frame.camera == old.camera
+        assert np.array_equal(frame.world_from_cam, old.world_from_cam)
+    moves = camera_moves(before["train"], refined["train"], radius=1.0)
+    assert all(moves[name]["max"] > 0 for name in ("rotation_deg", "translation_percent", "focal_percent"))
+    # A held-out photo has the lens that training photos have told, and the pose that it had.
+    (held_out,) = refined["test"]
+    assert held_out.camera == refined["train"][0].camera != small.test_frames[0].camera
+    assert np.array_equal(held_out.world_from_cam, small.test_frames[0].world_from_cam)
+    # And `convert` reads them.
+    found = find_run(run)
+    assert found is not None
+    capture = parse_run(found)
+    assert [frame.split for frame in capture.frames] == ["train"] * 3 + ["test"]
+    assert capture.frames[0].camera == refined["train"][0].camera
+    assert np.array_equal(capture.frames[0].world_from_cam, refined["train"][0].world_from_cam)
