@@ -131,6 +131,11 @@ class HashField(Field):
         )
         return self._radiance_of_encoded(encoded, directions, rays)
 
+    @torch.no_grad()
+    def forget_directions(self, degree: int) -> None:
+        """Give the harmonics above `degree` no weight. Where they were 0 so far, the field stays what it was."""
+        self.weights[2][:, GEOMETRY + (degree + 1) ** 2 :] = 0.0
+
     def _radiance_of_encoded(self, encoded: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
         harmonics = spherical_harmonics(directions, self.settings.view_degree)
         return kernels.radiance(encoded, harmonics, rays, tuple(self.weights))

@@ -14,6 +14,7 @@ Value = bool | int | float | str
 
 # What may be behind all that the field holds.
 BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")
+LEARNED_BACKGROUNDS = ("constant", "sphere")
 EXPOSURES = ("none", "exif", "learned")
 CAMERAS = ("fixed", "poses", "focal", "all")
 # What is behind the black of a mask: something unknown, or nothing.

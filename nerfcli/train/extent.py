@@ -1,16 +1,23 @@
 """What of space a field covers, and how: chosen for a scene before anything is learned."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.render.model import Marching
 from nerfcli.scene import Scene
+from nerfcli.train.components import LEARNED_BACKGROUNDS
 from nerfcli.train.normalisation import box_frame, contracted_frame, object_frame
 from nerfcli.train.photos import Photo
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.triangulation import triangulate
+
+# What is infinitely far begins behind so many radii of the unit ball: what is nearer moves from photo to photo.
+BALLS_BEFORE_BACKGROUND = 1.5
 
 _IN_WORDS = {"none": "bounded scene", "l2": "unbounded scene", "linf": "unbounded scene (linf)"}
 
@@ -23,11 +30,13 @@ class Extent:
         contraction: one of `kernels.CONTRACTIONS`.
         training_from_scene: the similarity to the training frame.
         marching: the steps along rays there.
+        reach: the distance at which the last ray has left the ball that a background surrounds.
     """
 
     contraction: str
     training_from_scene: Similarity
     marching: Marching
+    reach: float = math.inf
 
     def __str__(self) -> str:
         return _IN_WORDS[self.contraction]
@@ -38,13 +47,24 @@ class Extent:
             "contraction": self.contraction,
             "training_from_scene": self.training_from_scene.to_json(),
             "marching": vars(self.marching),
+            "reach": self.reach,
         }
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> "Extent":
         """The extent that `to_json` described."""
         similarity = Similarity.from_json(content["training_from_scene"])
-        return Extent(content["contraction"], similarity, Marching(**content["marching"]))
+        reach = content.get("reach", math.inf)
+        return Extent(content["contraction"], similarity, Marching(**content["marching"]), reach)
+
+    def before(self, background: str) -> "Extent":
+        """The extent with a kind of background, see `Components`: the field ends where a learned one begins.
+
+        The fog of the start would hide it for good: the field would have to paint what is infinitely far.
+        """
+        if background not in LEARNED_BACKGROUNDS:
+            return self
+        return replace(self, marching=replace(self.marching, far=min(self.marching.far, self.reach)))
 
 
 def choose_extent(
@@ -73,4 +93,8 @@ def choose_extent(
     if len(scene.points) == 0 and (scene.depth_bounds is None or contraction == "none"):
         scene = replace(scene, points=triangulate(photos, threads=settings.threads))
         notify(f"the scene came without points; {len(scene.points)} found in its photos tell how far it reaches")
-    return Extent(contraction, *(box_frame(scene) if contraction == "none" else contracted_frame(scene)))
+    if contraction == "none":
+        return Extent(contraction, *box_frame(scene))
+    similarity, marching = contracted_frame(scene)
+    farthest = max(float(np.linalg.norm(similarity.apply(frame.centre))) for frame in scene.frames)
+    return Extent(contraction, similarity, marching, farthest + BALLS_BEFORE_BACKGROUND)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
-from nerfcli.train.components import Components
+from nerfcli.train.components import LEARNED_BACKGROUNDS, Components
 from nerfcli.train.losses import over_background
 from nerfcli.train.photos import Drawn, Pool
 from nerfcli.train.refinement import Refinement, rate_at
@@ -18,6 +18,8 @@ from nerfcli.train.refinement import Refinement, rate_at
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
 # From here on a photo's level says only that the light was at least that bright.
 SATURATED = 254.5 / 255
+# A ray that meets less than this has no colour of its own to speak of.
+LEAST_OPACITY = 1e-3
 
 
 class Parts(nn.Module):
@@ -36,13 +38,13 @@ class Parts(nn.Module):
         super().__init__()
         device = pool.colours.device
         kind = components.background
-        if kind in ("constant", "sphere") and pool.has_alpha:
+        if kind in LEARNED_BACKGROUNDS and pool.has_alpha:
             raise UserError(
                 f"--with background={kind}: these photos have alpha, which tells that nothing is behind",
                 "leave it out, or train on photos without alpha",
             )
         self.background: SphereBackground | None = None
-        if kind in ("constant", "sphere"):
+        if kind in LEARNED_BACKGROUNDS:
             self.background = (SphereBackground(1) if kind == "constant" else SphereBackground()).to(device)
         self.exposure: Exposure | None = None
         if components.exposure != "none":
@@ -110,9 +112,19 @@ class Parts(nn.Module):
         """
         if self.background is not None:
             rendered = rendered + transmittance[:, None] * self.background(drawn.directions)
+        measured = over_background(drawn.colours, behind)
         if self.exposure is None:
-            return rendered, over_background(drawn.colours, behind)
+            return rendered, measured
         photos = self._pool.photo_of(drawn.numbers)
-        rendered = self.exposure(rendered, photos)
-        measured = over_background(drawn.colours, self.exposure(behind, photos).detach())
-        return torch.where(measured < SATURATED, rendered, rendered.clamp_max(1.0)), measured
+        if not self._pool.has_alpha:
+            return _up_to_white(self.exposure(rendered, photos), drawn.colours), measured
+        # What is behind an object was put there by us: no photo exposed it.
+        opacity = 1.0 - transmittance[:, None]
+        own = (rendered - transmittance[:, None] * behind).clamp_min(0.0) / opacity.clamp_min(LEAST_OPACITY)
+        own = _up_to_white(self.exposure(own, photos), drawn.colours)
+        return opacity * own + transmittance[:, None] * behind, measured
+
+
+def _up_to_white(rendered: Tensor, colours: Tensor) -> Tensor:
+    """What a photo shows of colours (R, 3): no more than white where its own (R, 3 or 4) are white."""
+    return torch.where(colours[:, :3] < SATURATED, rendered, rendered.clamp_max(1.0))

@@ -1,28 +1,42 @@
 """Short trainings that differ in one thing, judged on blocks of the training photos that none of them sees.
 
+One training of the plainest model goes first. All others go on from where it stood, each with a change or with none:
+what they differ by is the change, not what a different start would have led to, and each takes a moment only.
+
 The held-out photos of the scene take no part in this: what is chosen by looking at them could not be measured on them.
 """
 
 import math
+import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.errors import UserError
+from nerfcli.field.background import SphereBackground
+from nerfcli.field.hash_field import HashField
 from nerfcli.train.components import Components
 from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.photos import Photo, PixelPool
+from nerfcli.train.room import IN_MEMORY, Room
 from nerfcli.train.settings import TrainSettings
+from nerfcli.train.signs import Signs, signs_of
 
 # Photos are judged by squares of this side: single pixels between known neighbours would judge interpolation.
 BLOCK_PX = 12
 BLOCK_SHARE = 0.06
 JUDGED_PIXELS = 8192
+# Of the whole schedule, what is over when the first training stops and the others go on.
+FORK_SHARE = 0.6
+# How a background that begins late is painted.
+PAINT_RATE, PAINT_STEPS = 0.3, 30
 # The choice of blocks and pixels: the same for all candidates of a scene, and not that of any training.
 SEED = 20_211
 
@@ -33,10 +47,11 @@ class Trial:
 
     Args:
         errors: (photos,) sums of squared differences of the judged pixels of each photo, sRGB.
-        halfway: the same after half of the schedule.
+        halfway: the same after half of its steps.
         counts: (photos,) values that were summed.
         seconds: it took.
         steps: it went.
+        log_gains: (photos, 3) that it found, where it looked for any.
     """
 
     errors: np.ndarray
@@ -44,19 +59,24 @@ class Trial:
     counts: np.ndarray
     seconds: float
     steps: int
+    log_gains: Tensor | None = None
 
     @property
     def psnr(self) -> float:
         """In dB over all judged pixels."""
-        return self._psnr(self.errors)
+        return -10.0 * math.log10(max(float(self.errors.sum() / self.counts.sum()), 1e-12))
 
-    @property
-    def psnr_halfway(self) -> float:
-        """The same after half of the schedule."""
-        return self._psnr(self.halfway)
 
-    def _psnr(self, errors: np.ndarray) -> float:
-        return -10.0 * math.log10(max(float(errors.sum() / self.counts.sum()), 1e-12))
+@dataclass(frozen=True)
+class Start:
+    """Where the first training stood when it stopped: its state, steps, seconds, and what its residuals tell."""
+
+    tensors: dict[str, Tensor]
+    description: dict[str, Any]
+    steps: int
+    seconds: float
+    psnr: float
+    signs: Signs
 
 
 class Trials:
@@ -66,7 +86,8 @@ class Trials:
         photos: those to train on.
         extent: of the field.
         settings: of the training that the trials are for; seed and components are given with each trial.
-        log_gains: see `Fitting`.
+        exif: (photos,) logarithms of the exposures that EXIF tells, relative to their mean.
+        colours, room: see `PixelPool`.
 
     Raises:
         UserError: masks leave nothing to judge by.
@@ -78,59 +99,120 @@ class Trials:
         extent: Extent,
         *,
         settings: TrainSettings,
-        log_gains: Tensor | None,
+        exif: np.ndarray,
+        colours: np.ndarray | None = None,
+        room: Room = IN_MEMORY,
     ):
         device = torch.device(settings.device)
         generator = np.random.default_rng(SEED)
         judged = [_blocks(photo.pixels.shape[:2], generator) for photo in photos]
         seen = [_without(photo, blocks) for photo, blocks in zip(photos, judged, strict=True)]
-        hidden = [_without(photo, ~blocks) for photo, blocks in zip(photos, judged, strict=True)]
-        self._pool = PixelPool(seen, extent.training_from_scene, device)
-        self._judged = PixelPool(hidden, extent.training_from_scene, device).draw(
-            JUDGED_PIXELS, torch.Generator(device=device).manual_seed(SEED)
-        )
+        self._pool = PixelPool(seen, extent.training_from_scene, device, colours=colours, room=room)
+        numbers = _drawn_from(photos, judged, generator)
+        if len(numbers) == 0:
+            raise UserError("no pixel is left to judge components by", "take the masks out, or choose --model default")
+        self._judged = self._pool.rays_of(torch.from_numpy(numbers).to(device))
         self._photos = self._pool.photo_of(self._judged.numbers).cpu().numpy()
-        self._num_photos = len(photos)
+        self._counts = np.bincount(self._photos, minlength=len(photos)) * 3
         self._extent = extent
         # Small steps all along: they learn more from a sample, which is what a short training has few of.
         self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
-        self._log_gains = log_gains
+        self._exif = torch.from_numpy(exif).to(torch.float32)[:, None].expand(-1, 3)
+        self._room = room
 
-    def run(self, components: Components, *, seed: int, steps: int | None, seconds: float | None = None) -> Trial:
-        """Train from the beginning to the end of a schedule, and judge.
+    def begin(self, components: Components, *, steps: int | None, seconds: float | None = None) -> Start:
+        """Train from the beginning to `FORK_SHARE` of a schedule.
 
         Args:
             components: what is in the model.
-            seed: of everything random; candidates with the same one draw the same pixels.
             steps: to go.
             seconds: instead of steps; how many were gone then is in the answer.
         """
+        fitting = self._fitting(components, seed=self._settings.seed, log_gains=None)
+        took = 0.0
+        while (share := fitting.step / steps if steps is not None else took / (seconds or math.inf)) < 1.0:
+            took += self._advance(fitting, FORK_SHARE * share)
+        drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
+        with torch.no_grad():
+            rendered, measured = fitting.compare(drawn)
+        signs = signs_of(rendered, measured, self._pool.photo_of(drawn.numbers), count=len(self._counts))
+        tensors, description = fitting.state()
+        psnr = -10.0 * math.log10(max(float(self._errors(fitting).sum() / self._counts.sum()), 1e-12))
+        copies = {name: tensor.clone() for name, tensor in tensors.items()}
+        return Start(copies, description, fitting.step, took, psnr, signs)
+
+    def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:
+        """Go on to the end of the schedule with these components, and judge.
+
+        Args:
+            start: what `begin` gave.
+            components: what is in the model from here on. What is new begins so that it changes nothing: new
+                harmonics without weight, exposures as the residuals have them.
+            seed: of everything random; candidates with the same one draw the same pixels.
+            steps: to go.
+        """
+        gains = {"exif": self._exif, "learned": start.signs.log_gains}.get(components.exposure)
+        fitting = self._fitting(components, seed=seed, log_gains=gains)
+        self._take_up(fitting, start)
+        if fitting.parts.background is not None:
+            self._paint(fitting.parts.background)
+        seconds, halfway = [], None
+        for done in range(steps):
+            if halfway is None and 2 * done >= steps:
+                halfway = self._errors(fitting)
+            seconds.append(self._advance(fitting, FORK_SHARE + (1.0 - FORK_SHARE) * done / steps))
+        errors = self._errors(fitting)
+        # A median: other work on the machine must not look like the price of a component.
+        took = statistics.median(seconds) * steps
+        exposure = fitting.parts.exposure
+        found = exposure.log_gains().detach().clone() if exposure is not None else None
+        return Trial(errors, errors if halfway is None else halfway, self._counts, took, steps, found)
+
+    def _fitting(self, components: Components, *, seed: int, log_gains: Tensor | None) -> Fitting:
         settings = replace(self._settings, components=components, seed=seed)
-        fitting = Fitting(
+        return Fitting(
             self._pool,
-            self._extent.marching,
+            self._extent.before(components.background).marching,
             contraction=self._extent.contraction,
             settings=settings,
-            log_gains=self._log_gains,
+            log_gains=log_gains,
             error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
         )
-        took, halfway = 0.0, None
-        while (share := fitting.step / steps if steps is not None else took / (seconds or math.inf)) < 1.0:
-            if halfway is None and share >= 0.5:
-                halfway = self._errors(fitting)
-            began = time.perf_counter()
-            fitting.advance(share)
-            took += time.perf_counter() - began
-        errors = self._errors(fitting)
-        counts = np.bincount(self._photos, minlength=self._num_photos) * 3
-        return Trial(errors, errors if halfway is None else halfway, counts, took, fitting.step)
+
+    def _take_up(self, fitting: Fitting, start: Start) -> None:
+        """Bring a fresh training to `start`, but for its random numbers and for what only its own model has."""
+        own, _ = fitting.state()
+        kept = {name: tensor for name, tensor in own.items() if name == "generator" or name.startswith("parts")}
+        of_field = {name: tensor.clone() for name, tensor in start.tensors.items() if not name.startswith("parts")}
+        fitting.restore({**of_field, **kept}, start.description)
+        if isinstance(fitting.field, HashField):
+            fitting.field.forget_directions(start.description["field"]["view_degree"])
+
+    def _paint(self, background: SphereBackground) -> None:
+        """Give each direction about the median colour of the pixels that look along it, as if nothing stood before it:
+        what the first training put there is cut away."""
+        generator = torch.Generator(device=self._pool.colours.device).manual_seed(SEED)
+        adam = torch.optim.Adam(background.parameters(), lr=PAINT_RATE)
+        for _ in range(PAINT_STEPS):
+            drawn = self._pool.draw(JUDGED_PIXELS, generator)
+            adam.zero_grad()
+            (background(drawn.directions) - drawn.colours[:, :3]).abs().sum().backward()
+            adam.step()
+        adam.zero_grad()
+
+    def _advance(self, fitting: Fitting, share: float) -> float:
+        """A step, and the seconds it took."""
+        began = time.perf_counter()
+        fitting.advance(share)
+        self._room.relieve()
+        return time.perf_counter() - began
 
     @torch.no_grad()
     def _errors(self, fitting: Fitting) -> np.ndarray:
         """(photos,) squared differences of the judged pixels, summed."""
         rendered, measured = fitting.compare(self._judged)
         errors = (rendered.clamp(0.0, 1.0) - measured).square().sum(-1).double().cpu().numpy()
-        return np.bincount(self._photos, errors, self._num_photos)
+        return np.bincount(self._photos, errors, len(self._counts))
 
 
 def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
@@ -139,6 +221,21 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
     chosen = generator.random((rows, columns)) < BLOCK_SHARE
     chosen.flat[generator.integers(chosen.size)] = True
     return np.kron(chosen, np.ones((BLOCK_PX, BLOCK_PX), bool))[: shape[0], : shape[1]]
+
+
+def _drawn_from(
+    photos: Sequence[Photo], blocks: Sequence[np.ndarray], generator: np.random.Generator
+) -> np.ndarray:
+    """Numbers, counted through all photos, of pixels in their blocks: as many of each photo, as far as it has them."""
+    drawn, first = [], 0
+    for photo, judged in zip(photos, blocks, strict=True):
+        places = np.flatnonzero(judged if photo.used is None else judged & photo.used)
+        places = generator.permutation(places)[: max(1, JUDGED_PIXELS // len(photos))]
+        rows, columns = np.divmod(places, judged.shape[1])
+        valid = photo.frame.camera.bearings(np.stack([columns, rows], axis=-1) + 0.5)[1]
+        drawn.append(first + places[valid])
+        first += judged.size
+    return np.concatenate(drawn)
 
 
 def _without(photo: Photo, hidden: np.ndarray) -> Photo:
