@@ -37,6 +37,7 @@ MAY_IMPORT = {
     "train": {"render", "field", "kernels", "scene", "cameras", "media"},
     "evaluate": {"render", "field", "scene", "cameras", "media"},
     "export": {"render", "field", "scene", "cameras", "media"},
+    "ablate": {"train"},
     "bench": {"evaluate", "train", "render", "field", "kernels", "scene", "cameras", "media", "pages"},
     "selftest": {"render", "field", "kernels", "cameras"},
     "report": {"train", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},

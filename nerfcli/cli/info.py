@@ -111,6 +111,7 @@ def _describe_run(folder: Path) -> dict[str, Any]:
         read_given_cameras,
         read_log,
     )
+    from nerfcli.train.selection import decisions_in_words
 
     config = read_config(folder)
     cameras = read_cameras(folder)
@@ -124,6 +125,7 @@ def _describe_run(folder: Path) -> dict[str, Any]:
         "unit_source": config.get("unit_source"),
         "settings": {k: v for k, v in config.get("settings", {}).items() if k != "components"},
         "components": chosen_components(config).to_json(),
+        "decisions": decisions_in_words(config),
         "versions": config.get("versions"),
     }
     if log:

@@ -27,6 +27,12 @@ Exclude = Annotated[
     list[str] | None,
     typer.Option("--without", metavar="NAME", help="A component to switch off; see below. Repeatable."),
 ]
+ModelChoice = Annotated[
+    str,
+    typer.Option(
+        "--model", help="auto: the scene decides on its components, in short trainings; default: what most scenes need."
+    ),
+]
 Require = Annotated[
     str | None,
     typer.Option(help="Numbers to reach, else exit code 7: psnr>=25,registered>=0.9.", show_default=False),
@@ -96,6 +102,22 @@ def field_kind(kind: str) -> str:
     if kind not in KINDS:
         raise typer.BadParameter(f"{kind!r}; choose {', '.join(KINDS)}", param_hint="--field")
     return kind
+
+
+def model_name(model: str) -> str:
+    """auto or default.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    if model not in ("auto", "default"):
+        raise typer.BadParameter(f"{model!r}; choose auto or default", param_hint="--model")
+    return model
+
+
+def named_components(included: list[str] | None, excluded: list[str] | None) -> tuple[str, ...]:
+    """The names in --with NAME[=VALUE] and --without NAME, each once."""
+    return tuple(sorted({text.partition("=")[0] for text in (*(included or ()), *(excluded or ()))}))
 
 
 def contraction_name(contraction: str) -> str | None:

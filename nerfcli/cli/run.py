@@ -11,8 +11,11 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Device,
     Downscale,
+    Exclude,
     Holdout,
+    Include,
     Json,
+    ModelChoice,
     Output,
     Overwrite,
     Quiet,
@@ -23,6 +26,8 @@ from nerfcli.cli.options import (
     device_name,
     downscale_factor,
     holdout_rule,
+    model_name,
+    named_components,
     seconds_from_text,
     thread_count,
 )
@@ -38,6 +43,9 @@ def run(
     intrinsics: Intrinsics = None,
     intrinsics_as: IntrinsicsAs = None,
     budget: Annotated[str, typer.Option(help="Training time: 90s, 5m, 1h.")] = "2m",
+    include: Include = None,
+    exclude: Exclude = None,
+    model: ModelChoice = "auto",
     downscale: Downscale = "auto",
     count: Annotated[int, typer.Option(help="Views of the orbit video.", min=2)] = 60,
     max_size: Annotated[
@@ -56,13 +64,15 @@ def run(
     """Do everything: poses, train, evaluate, renders of the held-out views, and an orbit video.
 
     Writes PHOTOS-scene/ and PHOTOS-scene-run/ beside the photos, or scene/ and run/ inside --output. Stages that are
-    complete are kept, so an interrupted run goes on where it stopped.
+    complete are kept, so an interrupted run goes on where it stopped. Components for --with and --without are those of
+    `nerfcli train --help`.
 
     \b
     Examples:
       nerfcli run photos/kitchen
       nerfcli run photos/kitchen -o kitchen --budget 5m
       nerfcli run photos/kitchen --intrinsics calibration/cameras.txt
+      nerfcli run photos/kitchen --with exposure --without view
       nerfcli run kitchen.mp4
       nerfcli run photos/kitchen --require "psnr>=25,registered>=0.9"
     """
@@ -76,6 +86,7 @@ def run(
     from nerfcli.memory import default_memory_limit
     from nerfcli.poses.settings import Limits, PoseSettings
     from nerfcli.render.pictures import DepthRequest
+    from nerfcli.train.components import Components, choose
     from nerfcli.train.settings import TrainSettings
 
     console = Console(quiet=quiet, json_lines=json)
@@ -97,6 +108,9 @@ def run(
         seed=seed,
         device=torch_device,
         threads=cores,
+        components=choose(Components(), included=include or (), excluded=exclude or ()),
+        model=model_name(model),
+        fixed=named_components(include, exclude),
     )
     depth = DepthRequest(convention="conditional", axis="z")
 

@@ -19,6 +19,7 @@ from nerfcli.cli.options import (
     Include,
     Json,
     Memory,
+    ModelChoice,
     Output,
     Overwrite,
     Quiet,
@@ -31,6 +32,8 @@ from nerfcli.cli.options import (
     field_kind,
     holdout_rule,
     memory_limit,
+    model_name,
+    named_components,
     seconds_from_text,
     thread_count,
 )
@@ -56,9 +59,7 @@ def train(
     exclude: Exclude = None,
     field: FieldKind = "hash",
     field_memory: FieldMemory = None,
-    model: Annotated[
-        str, typer.Option(help="default: the components most scenes need; auto: the scene decides, in short trainings.")
-    ] = "default",
+    model: ModelChoice = "auto",
     downscale: Downscale = "auto",
     contraction: Contraction = "auto",
     log2_rows: Annotated[
@@ -90,9 +91,9 @@ def train(
     surfaces at points of structure from motion), entropy (a weight: rays are opaque or clear), near (smaller gradients
     near cameras), distortion (a weight: the light of a ray in one place), antialias (true, false: details smaller
     than a pixel fade out; for photos from near and far), pixels (anywhere, error: more of them where the photos are
-    explained worst). --model auto trains a few times for a moment,
-    on 15 % of the budget, and keeps a component that is better on pixels that it has not seen by more than the noise;
-    those named by --with and --without stay.
+    explained worst). The scene decides on exposure, view and background, unless they are named by --with or --without:
+    short trainings on up to 15 % of the budget keep a component that is better by more than the noise, on pixels of the
+    training photos that were not seen. --model default skips that.
 
     Fields, for --field: hash (a multiresolution hash grid with two small networks: best for its time), voxels (a dense
     grid of density and spherical harmonics), mlp (one network on Fourier features: small, and slow). The finest detail
@@ -104,7 +105,7 @@ def train(
       nerfcli train photos-scene --budget 5m --resume
       nerfcli train photos-scene --holdout block:0.15 -o gap-run
       nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
-      nerfcli train photos-scene --budget 5m --model auto
+      nerfcli train photos-scene --budget 5m --model default
       nerfcli train photos-scene --without view --with distortion=0.01
       nerfcli train photos-scene --with cameras=poses
       nerfcli train photos-scene --field voxels --field-memory 16MB
@@ -114,10 +115,7 @@ def train(
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
-    if model not in ("default", "auto"):
-        raise typer.BadParameter(f"{model!r}; choose default or auto", param_hint="--model")
     console = Console(quiet=quiet, json_lines=json)
-    included, excluded = include or (), exclude or ()
     settings = TrainSettings(
         budget_seconds=None if budget is None else seconds_from_text(budget),
         steps=steps,
@@ -126,9 +124,9 @@ def train(
         seed=seed,
         device=device_name(device),
         threads=thread_count(threads),
-        components=choose(Components(), included=included, excluded=excluded),
-        model=model,
-        fixed=tuple(sorted({text.partition("=")[0] for text in (*included, *excluded)})),
+        components=choose(Components(), included=include or (), excluded=exclude or ()),
+        model=model_name(model),
+        fixed=named_components(include, exclude),
         first_samples_per_step=min(TrainSettings.first_samples_per_step, batch),
         samples_per_step=batch,
         levels=levels,

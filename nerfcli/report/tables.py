@@ -145,8 +145,8 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
         (
             run.label,
             f"{decision['component']}={str(decision['value']).lower()}",
-            f"{decision['gain_db']:+.2f} +- {decision['error_db']:.2f}",
-            f"{decision['cost']:+.0%}",
+            "" if decision["gain_db"] is None else f"{decision['gain_db']:+.2f} +- {decision['error_db']:.2f}",
+            "" if decision["cost"] is None else f"{decision['cost']:+.0%}",
             "yes" if decision["kept"] else "no",
             decision["why"],
         )

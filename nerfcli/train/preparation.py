@@ -21,7 +21,7 @@ from nerfcli.train.fitting import Fitting
 from nerfcli.train.photos import Album, PixelPool, load_album
 from nerfcli.train.point_depth import PointRays, point_depths
 from nerfcli.train.room import Room, needs_of, room_for
-from nerfcli.train.selection import SEARCH_SHARE, Selection, proposals, select
+from nerfcli.train.selection import SEARCH_SHARE, Facts, Selection, select
 from nerfcli.train.settings import TrainSettings, automatic_downscale
 from nerfcli.train.trials import Trials
 
@@ -46,7 +46,8 @@ class Prepared:
         pool: the training photos.
         selection: how the scene decided on the components; None where it was not asked.
         log_exposure: the mean of the training photos by EXIF; None where exposures are not asked for, or not known.
-        log_gains: (photos, 3) logarithms of their exposures relative to it, as far as EXIF tells; else 0.
+        log_gains: (photos, 3) logarithms of their exposures relative to it, as the trials found them or as far as EXIF
+            tells; else 0.
         points: pixels with a point of structure from motion, where the components ask for them.
     """
 
@@ -121,9 +122,12 @@ def prepare(
     if begun is not None:
         settings = replace(settings, components=begun.components)
     elif settings.model == "auto":
-        selection = _search(album, extent, settings, notify=notify)
+        selection = _search(scene, album, extent, settings, room=room, notify=notify)
         settings = replace(settings, components=selection.components)
+    extent = extent.before(settings.components.background)
     reference, gains = _exposures(scene, settings.components, notify=notify)
+    if selection is not None and selection.log_gains is not None:
+        gains = selection.log_gains
     points = None
     if settings.components.points:
         points = PointRays(point_depths(scene, pool, extent.training_from_scene), pool)
@@ -131,21 +135,24 @@ def prepare(
     return Prepared(settings, factor, room, extent, pool, selection, reference, gains, points)
 
 
-def _search(album: Album, extent: Extent, settings: TrainSettings, *, notify: Callable[[str], None]) -> Selection:
+def _search(
+    scene: Scene,
+    album: Album,
+    extent: Extent,
+    settings: TrainSettings,
+    *,
+    room: Room,
+    notify: Callable[[str], None],
+) -> Selection:
     """Let the scene decide on the components, and tell how it did."""
-    trials = Trials(album.photos, extent, settings=settings, log_gains=None)
-    candidates = proposals(
-        settings.components,
-        has_alpha=album.colours.shape[-1] == 4,
-        photos=len(album.photos),
-        fixed=settings.fixed,
-    )
+    exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
+    trials = Trials(album.photos, extent, settings=settings, exif=exif, colours=album.colours, room=room)
     budget, steps = settings.budget_seconds, settings.steps
-    notify(f"tries {len(candidates)} components in short trainings, for {SEARCH_SHARE:.0%} of the budget")
+    notify(f"asks the scene which components it needs, for up to {SEARCH_SHARE:.0%} of the budget")
     selection = select(
         trials,
         settings.components,
-        candidates,
+        Facts(settings.field, album.colours.shape[-1] == 4, bool(np.ptp(exif) > 0.0), settings.fixed),
         seconds=None if budget is None else SEARCH_SHARE * budget,
         steps=None if steps is None else round(SEARCH_SHARE * steps),
     )

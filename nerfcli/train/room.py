@@ -48,6 +48,8 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     photos = (4 if may_have_alpha else 3) * sum(sizes) + 12 * sum(of_cameras.values())
     if any(frame.mask is not None for frame in frames):
         photos += 9 * sum(sizes)
+    if settings.model == "auto":  # trials learn from a list of the pixels that they are not judged by
+        photos += 9 * sum(sizes) + 12 * sum(of_cameras.values())
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
     field_bytes = settings.field_memory_bytes or {"hash": 16 * settings.levels * 2**settings.log2_rows}.get(
         settings.field, _LARGEST_FIELD_BYTES

@@ -223,9 +223,7 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
     return np.kron(chosen, np.ones((BLOCK_PX, BLOCK_PX), bool))[: shape[0], : shape[1]]
 
 
-def _drawn_from(
-    photos: Sequence[Photo], blocks: Sequence[np.ndarray], generator: np.random.Generator
-) -> np.ndarray:
+def _drawn_from(photos: Sequence[Photo], blocks: Sequence[np.ndarray], generator: np.random.Generator) -> np.ndarray:
     """Numbers, counted through all photos, of pixels in their blocks: as many of each photo, as far as it has them."""
     drawn, first = [], 0
     for photo, judged in zip(photos, blocks, strict=True):

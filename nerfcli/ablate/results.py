@@ -1,0 +1,167 @@
+"""What an ablation found: differences to the chosen model with their intervals, and the files that tell them."""
+
+import csv
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from scipy.stats import t as student
+
+from nerfcli.ablate.variants import CHOSEN, Variant
+from nerfcli.atomic import atomic_path, write_json
+from nerfcli.errors import UserError
+
+RESULT, TABLE, RUNS = "ablation.json", "ablation.csv", "runs"
+FORMAT = "nerfcli ablation 1"
+# Of the intervals.
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One training: PSNR and SSIM as `nerfcli evaluate` has them, means over the held-out photos."""
+
+    variant: str
+    seed: int
+    psnr: float
+    ssim: float | None
+    seconds: float
+    steps: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """A variant against the chosen model.
+
+    Args:
+        name: of the variant.
+        psnr: the mean over its seeds, dB.
+        ssim: likewise; None where it is not known.
+        difference_db: the mean over the seeds that both have, of the variant minus the chosen model; None for the
+            chosen model itself and where nothing can be compared.
+        interval_db: half of the width of the 95 % interval of that mean, by Student's t over seeds; None for one seed.
+        seconds, steps: of a training, means.
+        seeds: how many.
+        verdict: in words.
+    """
+
+    name: str
+    psnr: float
+    ssim: float | None
+    difference_db: float | None
+    interval_db: float | None
+    seconds: float
+    steps: float
+    seeds: int
+    verdict: str
+
+
+def rows_of(measured: Sequence[Measured], variants: Sequence[Variant]) -> list[Row]:
+    """A row for each variant that was trained at least once, in the order of the variants."""
+    reference = {entry.seed: entry.psnr for entry in measured if entry.variant == CHOSEN}
+    rows = []
+    for variant in variants:
+        own = [entry for entry in measured if entry.variant == variant.name]
+        if not own:
+            continue
+        differences = [entry.psnr - reference[entry.seed] for entry in own if entry.seed in reference]
+        compared = bool(differences) and variant.name != CHOSEN
+        mean = statistics.fmean(differences) if compared else None
+        half = half_interval(differences) if compared else None
+        ssims = [entry.ssim for entry in own if entry.ssim is not None]
+        rows.append(
+            Row(
+                variant.name,
+                statistics.fmean(entry.psnr for entry in own),
+                statistics.fmean(ssims) if ssims else None,
+                mean,
+                half,
+                statistics.fmean(entry.seconds for entry in own),
+                statistics.fmean(entry.steps for entry in own),
+                len(own),
+                _verdict(variant, mean, half),
+            )
+        )
+    return rows
+
+
+def half_interval(differences: Sequence[float]) -> float | None:
+    """Half of the 95 % interval of the mean of normal differences, by Student's t; None for a single one.
+
+    t(0.975, n - 1) s / sqrt(n)
+    """
+    if len(differences) < 2:
+        return None
+    quantile = float(student.ppf(0.5 + CONFIDENCE / 2, len(differences) - 1))
+    return quantile * statistics.stdev(differences) / math.sqrt(len(differences))
+
+
+def _verdict(variant: Variant, difference: float | None, half: float | None) -> str:
+    if difference is None:
+        return ""
+    if half is None:
+        return "one seed: no verdict"
+    if abs(difference) <= half:
+        return "no difference shown"
+    if variant.adds is None:
+        return "better" if difference > 0 else "worse"
+    if variant.adds:
+        return "would help" if difference > 0 else "would hurt"
+    return "not needed: better without it" if difference > 0 else "needed: worse without it"
+
+
+def write_results(folder: Path, rows: Sequence[Row], measured: Sequence[Measured], about: dict[str, Any]) -> None:
+    """Write FOLDER/ablation.json and ablation.csv.
+
+    Args:
+        folder: of the ablation.
+        rows: of the table.
+        measured: every training.
+        about: what the ablation is of, plain values.
+    """
+    content = {
+        "format": FORMAT,
+        **about,
+        "rows": [asdict(row) for row in rows],
+        "trainings": [asdict(entry) for entry in measured],
+    }
+    write_json(folder / RESULT, content)
+    with atomic_path(folder / TABLE) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(Row.__dataclass_fields__))
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Raise if something else than an ablation stands at a place."""
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / RESULT).exists()):
+        raise UserError(f"{folder} is not an ablation, but something else", "choose another place with -o")
+
+
+def table_of(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+    """The cells of a table for people, as `COLUMNS` names them."""
+
+    def difference(row: Row) -> str:
+        if row.difference_db is None:
+            return ""
+        return f"{row.difference_db:+.2f}" + ("" if row.interval_db is None else f" +- {row.interval_db:.2f}")
+
+    return [
+        (
+            row.name,
+            f"{row.psnr:.2f}",
+            "-" if row.ssim is None else f"{row.ssim:.4f}",
+            difference(row),
+            f"{row.seconds:.0f}",
+            f"{row.steps:.0f}",
+            str(row.seeds),
+            row.verdict,
+        )
+        for row in rows
+    ]
+
+
+COLUMNS = ("model", "PSNR", "SSIM", "difference, dB", "seconds", "steps", "seeds", "verdict")
