@@ -186,6 +186,22 @@ def test_a_saturated_pixel_says_only_that_the_light_was_at_least_that_bright():
     assert (rendered.grad[1] > 0).all()
 
 
+def test_what_is_behind_an_object_is_not_exposed():
+    """Half of the light of a ray is the object's, of colour 0.3, the rest white: only the object's is multiplied."""
+    parts, drawn = parts_of(
+        replace(LEARNED, background="auto"), torch.tensor([[0.3, 0.3, 0.3, 0.5]] * 2), [math.log(4), 0.0]
+    )
+    behind, transmittance = torch.ones(2, 3), torch.full((2,), 0.5)
+    seen, measured = parts.compared(torch.full((2, 3), 0.5 * 0.3 + 0.5), transmittance, drawn, behind=behind)
+    own = [exposed(torch.tensor(0.3), torch.tensor(sign * math.log(2))).item() for sign in (1, -1)]
+    assert seen[:, 0].tolist() == pytest.approx([0.5 * colour + 0.5 for colour in own])
+    expected = drawn.colours[:, 3:] * drawn.colours[:, :3] + (1 - drawn.colours[:, 3:])
+    assert torch.equal(measured, expected)
+    # Nothing of its own: what is behind shows as it is.
+    clear, _ = parts.compared(behind, torch.ones(2), drawn, behind=behind)
+    assert clear.flatten().tolist() == pytest.approx([1.0] * 6)
+
+
 def test_behind_photos_with_alpha_nothing_is_learned():
     with pytest.raises(UserError, match="these photos have alpha"):
         parts_of(LEARNED, torch.rand(2, 4), [0.0, 0.0])

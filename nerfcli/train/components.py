@@ -11,6 +11,7 @@ from typing import Any
 from nerfcli.errors import UserError
 
 Value = bool | int | float | str
+Change = tuple[str, Value]
 
 # What may be behind all that the field holds.
 BACKGROUNDS = ("auto", "black", "constant", "random", "sphere")

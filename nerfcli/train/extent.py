@@ -1,6 +1,5 @@
 """What of space a field covers, and how: chosen for a scene before anything is learned."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -30,13 +29,14 @@ class Extent:
         contraction: one of `kernels.CONTRACTIONS`.
         training_from_scene: the similarity to the training frame.
         marching: the steps along rays there.
-        reach: the distance at which the last ray has left the ball that a background surrounds.
+        reach: the distance at which the last ray has left the ball that a background surrounds; None where the field
+            ends by itself.
     """
 
     contraction: str
     training_from_scene: Similarity
     marching: Marching
-    reach: float = math.inf
+    reach: float | None = None
 
     def __str__(self) -> str:
         return _IN_WORDS[self.contraction]
@@ -54,15 +54,14 @@ class Extent:
     def from_json(content: dict[str, Any]) -> "Extent":
         """The extent that `to_json` described."""
         similarity = Similarity.from_json(content["training_from_scene"])
-        reach = content.get("reach", math.inf)
-        return Extent(content["contraction"], similarity, Marching(**content["marching"]), reach)
+        return Extent(content["contraction"], similarity, Marching(**content["marching"]), content.get("reach"))
 
     def before(self, background: str) -> "Extent":
         """The extent with a kind of background, see `Components`: the field ends where a learned one begins.
 
         The fog of the start would hide it for good: the field would have to paint what is infinitely far.
         """
-        if background not in LEARNED_BACKGROUNDS:
+        if background not in LEARNED_BACKGROUNDS or self.reach is None:
             return self
         return replace(self, marching=replace(self.marching, far=min(self.marching.far, self.reach)))
 

@@ -3,16 +3,18 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from nerfcli.train.components import Value
+from nerfcli.train.components import Change, Value
 from nerfcli.train.trials import Trial
 
 # A gain counts if it is above this many standard errors, and above what nobody sees.
 STANDARD_ERRORS = 2.0
 LEAST_GAIN_DB = 0.05
+# What a model may lose that becomes simpler.
+MOST_LOSS_DB = 0.1
 # Photos in which there is next to nothing have hardly any error, and its logarithm is noise: this share of the mean
 # error is added to that of every photo.
 FLOOR = 0.1
@@ -62,42 +64,56 @@ def untried(component: str, value: Value, why: str) -> Decision:
     return Decision(component, value, None, None, None, None, None, False, why)
 
 
-def judge(
-    base: Sequence[Trial], tried: Sequence[tuple[str, Value, Sequence[Trial]]], *, by_time: bool
-) -> tuple[Decision, ...]:
-    """What paired trials say of their candidates.
+class Rule(Protocol):
+    """How trials of a change are judged; see `judge_one`."""
+
+    def __call__(self, base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision: ...
+
+
+def judge_one(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
+    """What paired trials say of something added to the model: it has to gain more than the noise.
 
     gain = mean over photos and seeds of 10 log10(MSE of base / MSE of candidate). Its variance is that of the mean over
-    photos, and that between seeds, pooled over all candidates as two seeds alone tell little. A gain that becomes less
-    by more than its error in the second half of the steps is taken for one that vanishes in a longer training.
+    photos, and that between seeds. A gain that becomes less by more than its error in the second half of the steps is
+    taken for one that vanishes in a longer training.
 
     Args:
-        base: trials without a change, one per seed.
-        tried: candidates with theirs, in the same order of seeds.
-        by_time: whether a candidate has to gain what its time would bring, too; where steps are what counts, the answer
-            must not depend on how fast the machine is.
+        base: trials without the change, one per seed.
+        change: what was tried.
+        tried: trials with it, in the same order of seeds.
+        by_time: whether it has to gain what its time would bring, too; where steps are what counts, the answer must not
+            depend on how fast the machine is.
     """
-    if not tried:
-        return ()
-    per_photo = np.array([[_gains(one, other) for one, other in zip(base, own, strict=True)] for _, _, own in tried])
-    seeds, photos = per_photo.shape[1:]
+    gains = np.array([_gains(one, other) for one, other in zip(base, tried, strict=True)])
+    seeds, photos = gains.shape
+    gain = float(gains.mean())
+    between_seeds = float(gains.mean(1).var(ddof=1)) / seeds if seeds > 1 else 0.0
+    between_photos = float(gains.mean(0).var(ddof=1)) / photos if photos > 1 else 0.0
+    error = math.sqrt(between_seeds + between_photos)
+    halves = [_gains(one, other, halfway=True).mean() for one, other in zip(base, tried, strict=True)]
+    trend = gain - float(np.mean(halves))
+    cost = sum(trial.seconds for trial in tried) / sum(trial.seconds for trial in base) - 1.0
     # What twice as many steps bring to the model as it is.
     slope_db = max(0.0, float(np.mean([_gains_by_steps(trial).mean() for trial in base])))
-    between_seeds = float(per_photo.mean(-1).var(axis=1, ddof=1).mean()) if seeds > 1 else 0.0
-    decisions = []
-    for (name, value, own), gains in zip(tried, per_photo, strict=True):
-        gain = float(gains.mean())
-        between_photos = float(gains.mean(0).var(ddof=1)) / photos if photos > 1 else 0.0
-        error = math.sqrt(between_seeds / seeds + between_photos)
-        halves = [_gains(one, other, halfway=True).mean() for one, other in zip(base, own, strict=True)]
-        trend = gain - float(np.mean(halves))
-        cost = sum(trial.seconds for trial in own) / sum(trial.seconds for trial in base) - 1.0
-        at_equal_time = gain - slope_db * math.log2(1.0 + cost) if by_time else gain
-        why = _against(gain, error, trend=trend, at_equal_time=at_equal_time)
-        kept = why is None
-        told = f"gains more than {LEAST_GAIN_DB:g} dB and {STANDARD_ERRORS:g} standard errors" if why is None else why
-        decisions.append(Decision(name, value, gain, error, trend, cost, at_equal_time, kept, told))
-    return tuple(decisions)
+    at_equal_time = gain - slope_db * math.log2(1.0 + cost) if by_time else gain
+    against = _against(gain, error, trend=trend, at_equal_time=at_equal_time)
+    why = against or f"gains more than {LEAST_GAIN_DB:g} dB and {STANDARD_ERRORS:g} standard errors"
+    return Decision(*change, gain, error, trend, cost, at_equal_time, against is None, why)
+
+
+def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
+    """What paired trials say of what is left out of the model: hardly anything must be lost, noise and trend included.
+
+    What the model has learned by means of it is gone at once, and a model that does not need it learns that again
+    within the trial. Arguments as of `judge_one`.
+    """
+    measured = judge_one(base, change, tried, by_time=by_time)
+    gain, error, trend = measured.gain_db or 0.0, measured.error_db or 0.0, measured.trend_db or 0.0
+    worst = gain + min(0.0, trend) - STANDARD_ERRORS * error
+    if worst > -MOST_LOSS_DB:
+        return replace(measured, kept=True, why=f"not needed: without it surely within {MOST_LOSS_DB:g} dB")
+    why = "needed: loses without it" if gain < -STANDARD_ERRORS * error else "may be needed"
+    return replace(measured, kept=False, why=why)
 
 
 def _against(gain: float, error: float, *, trend: float, at_equal_time: float) -> str | None:

@@ -6,16 +6,14 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from nerfcli.train.components import Components, Value
-from nerfcli.train.judgement import LEAST_GAIN_DB, Decision, judge, untried
+from nerfcli.train.components import Change, Components
+from nerfcli.train.judgement import LEAST_GAIN_DB, Decision, Rule, judge_one, judge_removal, untried
 from nerfcli.train.trials import Start, Trial, Trials
 
 # Steps of a trial against those of the training that it goes on from.
 STEPS_OF_START = 0.5
 SEEDS = 2
 NO_TIME, ONCE = "not tried, no time was left", "gains once, but no time was left to try it again"
-
-Change = tuple[str, Value]
 
 
 class Purse:
@@ -52,16 +50,15 @@ class Race:
     Args:
         trials, start: what they go on from.
         purse: pays for them.
-        plain: the model that has to be bettered.
+        asked: the model that has to be bettered.
     """
 
-    def __init__(self, trials: Trials, start: Start, purse: Purse, plain: Components):
-        self._trials, self._start, self._purse, self._plain = trials, start, purse, plain
+    def __init__(self, trials: Trials, start: Start, purse: Purse, asked: Components):
+        self._trials, self._start, self._purse, self._asked = trials, start, purse, asked
         self._length = max(1, round(STEPS_OF_START * start.steps))
         self._seconds_each = start.seconds * self._length / start.steps
         self.kept: list[Change] = []
         self.decisions: dict[Change, Decision] = {}
-        self.undecided: set[str] = set()
         # Trials of what is kept so far, one per seed; and of what gained once beside it.
         self._base: list[Trial] = []
         self._once: dict[Change, Trial] = {}
@@ -71,20 +68,27 @@ class Race:
         """Of the exposures that the model which won has found."""
         return self._base[0].log_gains if self._base else None
 
-    def run(self, candidates: Sequence[Change]) -> None:
-        """Fill `decisions`, `kept` and `undecided`."""
-        self.decisions = {change: untried(*change, NO_TIME) for change in candidates}
-        self.undecided = {name for name, _ in candidates}
-        if not candidates or not self._can_run(2):
+    def run(self, additions: Sequence[Change], removals: Sequence[Change]) -> None:
+        """Fill `decisions` and `kept`.
+
+        All additions with one seed; then the best of them with the others, and if it is kept, the rest once more beside
+        it; and so on. Removals last, as what is added may do their work.
+        """
+        self.decisions = {change: untried(*change, NO_TIME) for change in (*additions, *removals)}
+        if not self.decisions or not self._can_run(2):
             return
         self._base = [self._trial([], seed=0)]
-        self._try_once(candidates)
+        self._try_once(additions)
         while self._once:
             best = max(self._once, key=lambda change: self.decisions[change].gain_db or 0.0)
-            if self._is_confirmed(best):
+            if self._is_confirmed(best, judge_one):
                 for other in [other for other in self._once if other[0] == best[0]]:
                     self._drop(other, f"{best[0]}={best[1]} is better")
                 self._try_once(list(self._once))
+        for change in removals:
+            if self._can_run(1 + SEEDS - len(self._base) + SEEDS - 1):
+                self._once[change] = self._trial([change], seed=0)
+                self._is_confirmed(change, judge_removal)
 
     def _try_once(self, changes: Sequence[Change]) -> None:
         """Each with the first seed, beside what is kept: those that may gain are in `_once` then."""
@@ -95,24 +99,21 @@ class Race:
                     self._drop(change, ONCE)
                 continue
             trial = self._trial([change], seed=0)
-            decision = self._judged(self._base[:1], change, [trial])
+            decision = self._judged(judge_one, change, [trial])
             self.decisions[change] = replace(decision, kept=False)
             if (decision.gain_db or 0.0) > LEAST_GAIN_DB:
                 self._once[change] = trial
-            else:
-                self.undecided.discard(change[0])
 
-    def _is_confirmed(self, change: Change) -> bool:
-        """Whether a change that gained once gains with the other seeds, too; it then is in the model."""
+    def _is_confirmed(self, change: Change, rule: Rule) -> bool:
+        """Whether a change stands the other seeds, too; it then is in the model."""
         first = self._once.pop(change)
         if not self._can_run(SEEDS - len(self._base) + SEEDS - 1):
             self._drop(change, ONCE)
             return False
         self._base += [self._trial([], seed=seed) for seed in range(len(self._base), SEEDS)]
         own = [first, *(self._trial([change], seed=seed) for seed in range(1, SEEDS))]
-        decision = self._judged(self._base, change, own)
+        decision = self._judged(rule, change, own)
         self.decisions[change] = decision
-        self.undecided.discard(change[0])
         if decision.kept:
             self.kept.append(change)
             self._base = own
@@ -122,8 +123,8 @@ class Race:
         self._once.pop(change, None)
         self.decisions[change] = replace(self.decisions[change], kept=False, why=why)
 
-    def _judged(self, base: Sequence[Trial], change: Change, own: Sequence[Trial]) -> Decision:
-        (decision,) = judge(base, [(*change, own)], by_time=self._purse.is_time)
+    def _judged(self, rule: Rule, change: Change, own: Sequence[Trial]) -> Decision:
+        decision = rule(self._base[: len(own)], change, own, by_time=self._purse.is_time)
         others = ", ".join(name for name, _ in self.kept)
         return replace(decision, why=f"{decision.why} beside {others}") if others else decision
 
@@ -132,7 +133,7 @@ class Race:
 
     def _trial(self, changes: Sequence[Change], *, seed: int) -> Trial:
         before = self._purse.spent
-        components = replace(self._plain, **dict([*self.kept, *changes]))
+        components = replace(self._asked, **dict([*self.kept, *changes]))
         trial = self._trials.go_on(self._start, components, seed=seed, steps=self._length)
         self._purse.take(self._length)
         self._seconds_each = max(self._seconds_each, self._purse.spent - before)

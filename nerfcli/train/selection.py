@@ -1,9 +1,9 @@
-"""Which components a scene needs: each against the plainest model, in paired short trainings, with their noise.
+"""Which components a scene needs: each against the model as it is, in paired short trainings, with their noise.
 
-A change is kept only if it is better by more than the noise. Gain and noise are measured, not assumed: every candidate
-goes on from the same start with the same seeds and pixels as the model that it would change, and what the gains differ
-by between seeds and between photos is their error. What is kept first is in the model that the next one has to better:
-two components that mend the same fault are not both needed.
+A component is added only if it is better by more than the noise, and left out only if that surely loses nothing. Gain
+and noise are measured, not assumed: every candidate goes on from the same start with the same seeds and pixels as the
+model that it would change, and what the gains differ by between seeds and between photos is their error. What is kept
+first is in the model that the next one has to better: two components that mend the same fault are not both needed.
 """
 
 import math
@@ -13,18 +13,18 @@ from typing import Any
 
 from torch import Tensor
 
-from nerfcli.train.components import MOST_DEGREES, Components
+from nerfcli.train.components import Change, Components
 from nerfcli.train.judgement import Decision, untried
-from nerfcli.train.race import Change, Purse, Race
+from nerfcli.train.race import Purse, Race
 from nerfcli.train.signs import Signs
 from nerfcli.train.trials import Trials
 
 # Of the budget, for all trials together; and of those, for the training that they go on from.
 SEARCH_SHARE, START_SHARE = 0.15, 0.2
 # A search whose first training is shorter than this tells nothing, and is left out.
-FEWEST_STEPS = 80
+FEWEST_STEPS = 120
 # Photos whose brightness differs by less than this, in logarithms of light, are as well without exposures.
-LEAST_EXPOSURE_SPREAD = 0.03
+LEAST_EXPOSURE_SPREAD = 0.06
 
 
 @dataclass(frozen=True)
@@ -75,16 +75,8 @@ class Facts:
     fixed: tuple[str, ...] = ()
 
 
-def plainest(asked: Components, facts: Facts) -> Components:
-    """The model that has to be bettered: colours do not depend on the direction, unless the user wants them to.
-
-    Only a hash grid can be given harmonics when it is half trained; other fields keep what they have.
-    """
-    return asked if "view" in facts.fixed or facts.field != "hash" else replace(asked, view=0)
-
-
 def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Change], list[Decision]]:
-    """Changes that may help a scene, and those that nothing speaks for.
+    """Components that may help a scene, and those that nothing speaks for.
 
     Args:
         start: what is in the model already.
@@ -100,8 +92,6 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
     else:
         told = f"not tried, photos differ in brightness by {math.expm1(signs.exposure_spread):.1%} only"
         declined.append(untried("exposure", "learned", told))
-    if facts.field == "hash":
-        candidates.append(("view", MOST_DEGREES))
     if not facts.has_alpha:
         candidates.append(("background", "sphere"))
     open_ones = [(name, value) for name, value in candidates if getattr(start, name) != value]
@@ -109,6 +99,11 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
         [change for change in open_ones if change[0] not in facts.fixed],
         [decision for decision in declined if decision.component not in facts.fixed],
     )
+
+
+def removals(start: Components, facts: Facts) -> list[Change]:
+    """What may be left out of a half-trained model: only a hash grid can be, as its shape stays the same."""
+    return [("view", 0)] if start.view and "view" not in facts.fixed and facts.field == "hash" else []
 
 
 def select(
@@ -121,8 +116,8 @@ def select(
 ) -> Selection:
     """Find the components that a scene needs.
 
-    First all candidates with one seed; then the best of them with a second one, and if it is kept, the others that gain
-    once more, beside it; and so on.
+    Candidates race one another, see `race.Race`; beside those that are kept, what is in the model already is left out
+    if nothing is lost by that.
 
     Args:
         trials: of the scene.
@@ -132,21 +127,17 @@ def select(
         steps: of all trials together, where there is no limit of time.
 
     Returns:
-        `asked` and no decisions where there is too little to spend.
+        `asked` and no decisions where a first training of `FEWEST_STEPS` is too much.
     """
     purse = Purse(seconds, steps)
     first_steps = None if seconds is not None else round(START_SHARE * (steps or 0))
-    if first_steps is not None and first_steps < FEWEST_STEPS:
-        return Selection(asked, (), 0.0)
-    plain = plainest(asked, facts)
-    start = trials.begin(plain, steps=first_steps, seconds=None if seconds is None else START_SHARE * seconds)
+    start = trials.begin(asked, steps=first_steps, seconds=None if seconds is None else START_SHARE * seconds)
     purse.take(start.steps)
     if start.steps < FEWEST_STEPS:
         return Selection(asked, (), purse.spent)
-    candidates, declined = proposals(plain, start.signs, facts)
-    race = Race(trials, start, purse, plain)
-    race.run(candidates)
-    # What could not be decided stays as most scenes need it.
-    chosen = replace(plain, **({name: getattr(asked, name) for name in race.undecided} | dict(race.kept)))
+    candidates, declined = proposals(asked, start.signs, facts)
+    race = Race(trials, start, purse, asked)
+    race.run(candidates, removals(asked, facts))
+    chosen = replace(asked, **dict(race.kept))
     gains = race.log_gains if chosen.exposure == "learned" else None
     return Selection(chosen, (*race.decisions.values(), *declined), purse.spent, gains)

@@ -29,7 +29,8 @@ from nerfcli.train.room import IN_MEMORY, Room
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.signs import Signs, signs_of
 
-# Photos are judged by squares of this side: single pixels between known neighbours would judge interpolation.
+# Photos are judged by squares of this side, or of a quarter of a small photo's: single pixels between known neighbours
+# would judge interpolation.
 BLOCK_PX = 12
 BLOCK_SHARE = 0.06
 JUDGED_PIXELS = 8192
@@ -163,7 +164,7 @@ class Trials:
             seconds.append(self._advance(fitting, FORK_SHARE + (1.0 - FORK_SHARE) * done / steps))
         errors = self._errors(fitting)
         # A median: other work on the machine must not look like the price of a component.
-        took = statistics.median(seconds) * steps
+        took = statistics.median(seconds) * steps if seconds else 0.0
         exposure = fitting.parts.exposure
         found = exposure.log_gains().detach().clone() if exposure is not None else None
         return Trial(errors, errors if halfway is None else halfway, self._counts, took, steps, found)
@@ -217,10 +218,11 @@ class Trials:
 
 def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
     """(H, W) bool: the blocks of a photo that are judged, at least one."""
-    rows, columns = (-(-side // BLOCK_PX) for side in shape[:2])
+    block = max(1, min(BLOCK_PX, min(shape[:2]) // 4))
+    rows, columns = (-(-side // block) for side in shape[:2])
     chosen = generator.random((rows, columns)) < BLOCK_SHARE
     chosen.flat[generator.integers(chosen.size)] = True
-    return np.kron(chosen, np.ones((BLOCK_PX, BLOCK_PX), bool))[: shape[0], : shape[1]]
+    return np.kron(chosen, np.ones((block, block), bool))[: shape[0], : shape[1]]
 
 
 def _drawn_from(photos: Sequence[Photo], blocks: Sequence[np.ndarray], generator: np.random.Generator) -> np.ndarray:

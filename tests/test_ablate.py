@@ -1,0 +1,105 @@
+"""The ablation of a scene: which models are compared, their differences with intervals, and going on after a kill."""
+
+import csv
+import json
+import math
+
+import pytest
+from conftest import SPHERES
+from typer.testing import CliRunner
+
+from nerfcli.ablate.results import Measured, half_interval, rows_of
+from nerfcli.ablate.variants import CHOSEN, Capture, Variant, variants
+from nerfcli.cli import app
+from nerfcli.train.components import CHOICES, Components
+
+ALL = Capture(has_alpha=False, has_points=True, has_exif=True)
+
+
+def test_every_component_is_varied_but_those_that_change_what_is_measured():
+    found = variants(Components(), ALL)
+    assert {variant.name.partition("=")[0] for variant in found} == set(CHOICES) - {"masks"}
+    adds = {variant.name: variant.adds for variant in found}
+    assert adds["view=0"] is False
+    assert adds["near=false"] is False
+    assert adds["background=sphere"] is True
+    assert adds["exposure=exif"] is adds["exposure=learned"] is True
+    for variant in found:
+        name = variant.name.partition("=")[0]
+        changed = {key for key in CHOICES if getattr(variant.components, key) != getattr(Components(), key)}
+        assert changed == {name}
+
+
+def test_what_the_capture_cannot_have_is_not_tried():
+    found = {variant.name for variant in variants(Components(), Capture(True, False, False))}
+    assert not {"background=sphere", "points=0.1", "exposure=exif"} & found
+    assert [v.name for v in variants(Components(view=0), ALL, only=("view",))] == ["view=3"]
+
+
+def test_the_interval_is_students():
+    """Three differences 1, 2, 3: their deviation is 1, and t(0.975, 2) = 4.3027 (any table)."""
+    assert half_interval([1.0, 2.0, 3.0]) == pytest.approx(4.30265 / math.sqrt(3), rel=1e-5)
+    assert half_interval([1.0]) is None
+
+
+def test_differences_are_taken_seed_by_seed_and_get_a_verdict():
+    models = [Variant(CHOSEN, Components()), Variant("view=0", Components(view=0), False)]
+    models.append(Variant("entropy=0.01", Components(entropy=0.01), True))
+    psnr = {CHOSEN: (20.0, 22.0, 21.0), "view=0": (19.0, 21.1, 19.9), "entropy=0.01": (20.5, 21.5, 21.1)}
+    measured = [
+        Measured(name, seed, value, None, 60.0, 100)
+        for name, values in psnr.items()
+        for seed, value in enumerate(values)
+    ]
+    chosen, view, entropy = rows_of(measured, models)
+    assert (chosen.difference_db, chosen.verdict) == (None, "")
+    # Seeds differ by 2 dB; the differences -1, -0.9, -1.1 by 0.1.
+    assert view.difference_db == pytest.approx(-1.0)
+    assert view.interval_db == pytest.approx(0.1 * 4.30265 / math.sqrt(3), rel=1e-5)
+    assert view.verdict == "needed: worse without it"
+    assert entropy.verdict == "no difference shown"
+    assert rows_of(measured[:4], models)[1].verdict == "one seed: no verdict"
+
+
+def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    """Killed before its third training, the same command trains what is left, and no model twice."""
+    from nerfcli.train import loop
+
+    trained, real = [], loop.train
+
+    def train(scene, run, settings, **rest):
+        if len(trained) == 2:
+            raise KeyboardInterrupt
+        trained.append((settings.components.view, settings.seed))
+        real(scene, run, settings, **rest)
+
+    command = ["ablate", str(SPHERES), "-o", str(tmp_path / "out"), "--only", "view", "--seeds", "2", "--steps", "2"]
+    command += ["--downscale", "8", "--threads", "1", "--model", "default", "--quiet"]
+    monkeypatch.setattr(loop, "train", train)
+    assert CliRunner().invoke(app, command).exit_code == 130
+    assert json.loads((tmp_path / "out" / "ablation.json").read_text())["complete"] is False
+    monkeypatch.setattr(
+        loop, "train", lambda *a, **rest: (trained.append((a[2].components.view, a[2].seed)), real(*a, **rest))
+    )
+    done = CliRunner().invoke(app, command)
+    assert (done.exit_code, done.stdout.strip()) == (0, str(tmp_path / "out" / "ablation.csv"))
+    assert trained == [(3, 0), (0, 0), (3, 1), (0, 1)]
+    content = json.loads((tmp_path / "out" / "ablation.json").read_text())
+    assert content["complete"] is True
+    assert [(row["name"], row["seeds"]) for row in content["rows"]] == [(CHOSEN, 2), ("view=0", 2)]
+    with (tmp_path / "out" / "ablation.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[1]["difference_db"]) == pytest.approx(content["rows"][1]["difference_db"])
+
+
+def test_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    done = CliRunner().invoke(app, ["ablate", str(SPHERES), "-o", str(tmp_path), "--steps", "2"])
+    assert done.exit_code == 3
+    assert "is not an ablation" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_wrong_names_are_usage_errors(tmp_path):
+    for option in (["--only", "magic"], ["--model", "best"], ["--with", "magic"]):
+        assert CliRunner().invoke(app, ["ablate", str(SPHERES), "-o", str(tmp_path / "x"), *option]).exit_code == 2

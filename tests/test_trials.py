@@ -1,0 +1,115 @@
+"""Short trainings that go on from a common start, and what residuals tell before anything is tried."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nerfcli.field.background import SphereBackground
+from nerfcli.field.exposure import exposed
+from nerfcli.train.components import Components
+from nerfcli.train.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
+from nerfcli.train.photos import load_album
+from nerfcli.train.room import IN_MEMORY
+from nerfcli.train.settings import TrainSettings
+from nerfcli.train.signs import signs_of
+from nerfcli.train.trials import Start, Trials
+
+SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
+
+
+@pytest.fixture(scope="module")
+def trials(spheres) -> Trials:
+    album = load_album(spheres.train_frames, factor=4, threads=1, room=IN_MEMORY)
+    extent = choose_extent(spheres, album.photos, SETTINGS, fills_frame=False, notify=lambda text: None)
+    return Trials(album.photos, extent, settings=SETTINGS, exif=np.zeros(len(album.photos)), colours=album.colours)
+
+
+@pytest.fixture(scope="module")
+def start(trials) -> Iterator[Start]:
+    """Early in a schedule: cells that close within a few dozen steps would leave nothing to see."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nerfcli.train.trials.FORK_SHARE", 0.02)
+        patch.setattr("nerfcli.train.fitting.CLOSING_SHARE", 1e9)
+        yield trials.begin(Components(view=0), steps=20)
+
+
+def test_what_begins_late_changes_nothing_at_first(trials, start):
+    """Harmonics without weight, and gains of 1: no step further, every change has the errors of no change."""
+    same = trials.go_on(start, Components(view=0), seed=0, steps=0)
+    assert same.psnr == pytest.approx(start.psnr, abs=1e-4)  # levels that do not learn yet are told by a step
+    assert np.array_equal(trials.go_on(start, Components(view=3), seed=0, steps=0).errors, same.errors)
+    # Of exposures that EXIF tells to be equal.
+    exif = trials.go_on(start, Components(view=0, exposure="exif"), seed=0, steps=0)
+    assert exif.errors == pytest.approx(same.errors, rel=1e-3)
+
+
+def test_trials_with_the_same_seed_are_the_same_and_leave_their_start_alone(trials, start):
+    first, again = (trials.go_on(start, Components(view=0), seed=3, steps=4) for _ in range(2))
+    assert np.array_equal(first.errors, again.errors)
+    assert not np.array_equal(first.errors, trials.go_on(start, Components(view=0), seed=4, steps=4).errors)
+
+
+def test_blocks_that_judge_are_not_learned_from(trials):
+    drawn = trials._pool.draw(20_000, torch.Generator().manual_seed(0)).numbers
+    assert not set(drawn.tolist()) & set(trials._judged.numbers.tolist())
+
+
+def test_the_brightness_of_photos_is_found_among_highlights_and_noise():
+    """Known gains; a fifth of the pixels are highlights 3 times as bright, all have noise of 2 levels."""
+    generator = torch.Generator().manual_seed(0)
+    photos = torch.arange(9).repeat_interleave(400)
+    gains = torch.linspace(-0.4, 0.4, 9)[:, None] + torch.tensor([0.0, 0.1, -0.1])
+    gains = gains - gains.mean(0)
+    rendered = 0.2 + 0.3 * torch.rand(len(photos), 3, generator=generator)
+    measured = exposed(rendered, gains[photos])
+    lit = torch.rand(len(photos), generator=generator) < 0.2
+    measured[lit] = exposed(measured[lit], torch.tensor(math.log(3.0)))
+    measured = (measured + 2 / 255 * torch.randn(measured.shape, generator=generator)).clamp(0.0, 1.0)
+    signs = signs_of(rendered, measured, photos, count=9)
+    assert (signs.log_gains - gains).abs().max() < 0.03
+    assert signs.exposure_spread == pytest.approx(gains.mean(1).std().item(), abs=0.02)
+
+
+def test_photos_of_one_exposure_have_no_spread_and_an_empty_photo_is_left_alone():
+    generator = torch.Generator().manual_seed(0)
+    photos = torch.arange(8).repeat_interleave(400)
+    rendered = 0.2 + 0.3 * torch.rand(len(photos), 3, generator=generator)
+    measured = rendered + 0.05 * torch.randn(rendered.shape, generator=generator)
+    measured[photos == 5] = 1.0
+    signs = signs_of(rendered, measured.clamp(0.0, 1.0), photos, count=8)
+    assert signs.exposure_spread < 0.02
+    assert signs.log_gains[5].tolist() == [0.0] * 3
+
+
+def test_the_field_ends_where_a_background_begins(trials):
+    """Behind the unit ball as the farthest camera sees it; without a learned background the extent stays as it is."""
+    extent = replace(trials._extent, reach=2.0 + BALLS_BEFORE_BACKGROUND)
+    assert extent.before("sphere").marching.far == min(extent.marching.far, 3.5)
+    assert extent.before("auto") is extent
+    assert Extent.from_json(extent.to_json()).to_json() == extent.to_json()
+    assert extent.before("constant").before("constant").to_json() == extent.before("constant").to_json()
+    assert trials._extent.before("sphere") is trials._extent  # of photos with alpha: it ends by itself
+
+
+def test_a_background_that_begins_late_has_the_colours_of_its_directions(trials):
+    """Directions in one half of the sphere see one colour, in the other another: painted are both."""
+
+    class Sky:
+        colours = torch.zeros(1, 3)
+
+        def draw(self, count, generator):
+            directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+            colours = torch.where(directions[:, 2:] > 0, torch.tensor([0.2, 0.4, 0.9]), torch.tensor([0.5, 0.3, 0.1]))
+            return trials._judged._replace(directions=directions, colours=colours)
+
+    sky, background = Sky(), SphereBackground()
+    painter = object.__new__(Trials)
+    painter._pool = sky
+    painter._paint(background)
+    up, down = background(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])).detach()
+    assert up.tolist() == pytest.approx([0.2, 0.4, 0.9], abs=0.08)
+    assert down.tolist() == pytest.approx([0.5, 0.3, 0.1], abs=0.08)
