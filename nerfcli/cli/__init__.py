@@ -34,6 +34,8 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       nerfcli evaluate photos-scene-run/           -> photos-scene-run/metrics.json
       nerfcli render photos-scene-run/ --cameras orbit --depth conditional --video
       nerfcli report photos-scene-run/             -> photos-scene-run/report.html
+    What each component of the model is worth, for a paper or a doubt:
+      nerfcli ablate photos-scene/                 -> photos-scene-ablation/
     Cameras between formats, proved:
       nerfcli convert photos-scene/ transforms.json --to transforms
     Many captures:

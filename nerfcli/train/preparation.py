@@ -147,7 +147,7 @@ def _search(
     """Let the scene decide on the components, and tell how it did."""
     budget, steps = settings.budget_seconds, settings.steps
     if budget is None and round(SEARCH_SHARE * START_SHARE * (steps or 0)) < FEWEST_STEPS:
-        notify("there are too few steps to try components; those that most scenes need are taken")
+        notify("there are too few steps to try components; the default ones are taken")
         return Selection(settings.components, (), 0.0)
     exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
     trials = Trials(album.photos, extent, settings=settings, exif=exif, colours=album.colours, room=room)
@@ -162,7 +162,7 @@ def _search(
     for decision in selection.decisions:
         notify(decision.in_words())
     if not selection.decisions:
-        notify("the budget is too small to try components; those that most scenes need are taken")
+        notify("the budget is too small to try components; the default ones are taken")
     return selection
 
 

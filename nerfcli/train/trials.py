@@ -105,11 +105,8 @@ class Trials:
         room: Room = IN_MEMORY,
     ):
         device = torch.device(settings.device)
-        generator = np.random.default_rng(SEED)
-        judged = [_blocks(photo.pixels.shape[:2], generator) for photo in photos]
-        seen = [_without(photo, blocks) for photo, blocks in zip(photos, judged, strict=True)]
+        seen, numbers = _split(photos, room)
         self._pool = PixelPool(seen, extent.training_from_scene, device, colours=colours, room=room)
-        numbers = _drawn_from(photos, judged, generator)
         if len(numbers) == 0:
             raise UserError("no pixel is left to judge components by", "take the masks out, or choose --model default")
         self._judged = self._pool.rays_of(torch.from_numpy(numbers).to(device))
@@ -225,19 +222,24 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
     return np.kron(chosen, np.ones((block, block), bool))[: shape[0], : shape[1]]
 
 
-def _drawn_from(photos: Sequence[Photo], blocks: Sequence[np.ndarray], generator: np.random.Generator) -> np.ndarray:
-    """Numbers, counted through all photos, of pixels in their blocks: as many of each photo, as far as it has them."""
-    drawn, first = [], 0
-    for photo, judged in zip(photos, blocks, strict=True):
-        places = np.flatnonzero(judged if photo.used is None else judged & photo.used)
-        places = generator.permutation(places)[: max(1, JUDGED_PIXELS // len(photos))]
+def _split(photos: Sequence[Photo], room: Room) -> tuple[list[Photo], np.ndarray]:
+    """The photos without the blocks that are judged, and numbers of pixels of those blocks, counted through all photos:
+    as many of each photo, as far as it has them."""
+    generator = np.random.default_rng(SEED)
+    sizes = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
+    masks = room.array((sum(sizes),), bool)
+    seen, numbers = [], []
+    for photo, size, end in zip(photos, sizes, np.cumsum(sizes).tolist(), strict=True):
+        judged = _blocks(photo.pixels.shape[:2], generator)
+        used = masks[end - size : end].reshape(judged.shape)
+        np.logical_not(judged, out=used)
+        if photo.used is not None:
+            used &= photo.used
+            judged &= photo.used
+        seen.append(replace(photo, used=used))
+        places = generator.permutation(np.flatnonzero(judged))[: max(1, JUDGED_PIXELS // len(photos))]
         rows, columns = np.divmod(places, judged.shape[1])
         valid = photo.frame.camera.bearings(np.stack([columns, rows], axis=-1) + 0.5)[1]
-        drawn.append(first + places[valid])
-        first += judged.size
-    return np.concatenate(drawn)
-
-
-def _without(photo: Photo, hidden: np.ndarray) -> Photo:
-    used = ~hidden if photo.used is None else photo.used & ~hidden
-    return replace(photo, used=used)
+        numbers.append(end - size + places[valid])
+        room.relieve()
+    return seen, np.concatenate(numbers)
