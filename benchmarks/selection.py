@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels, scene
-from nerfcli.train.components import Components, differences
+from nerfcli.train.components import differences
 from nerfcli.train.preparation import prepare
 from nerfcli.train.selection import SEARCH_SHARE
 from nerfcli.train.settings import TrainSettings
@@ -36,7 +36,7 @@ NEEDED: dict[str, dict[str, object]] = {
 }
 NEEDS_VIEW = ("glossy",)
 SEARCH_STEPS = 1000
-COLUMNS = ("scene", "seed", "picked", "view", "right", "cpu_seconds", "decisions")
+COLUMNS = ["scene", "seed", "picked", "view", "right", "cpu_seconds", "decisions"]
 
 
 def search(name: str, seed: int, steps: int) -> dict[str, object]:
@@ -57,7 +57,8 @@ def search(name: str, seed: int, steps: int) -> dict[str, object]:
         )
     assert prepared.selection is not None
     changed = differences(prepared.selection.components)
-    view = changed.pop("view", Components().view)
+    changed.pop("view", None)
+    view = prepared.selection.components.view
     right = changed == NEEDED[name] and (view > 0 or name not in NEEDS_VIEW)
     return {
         "scene": name,

@@ -70,6 +70,7 @@ def test_a_gain_that_rests_on_a_few_photos_is_not_clear():
     errors[3] *= 0.1
     lucky = Trial(errors, base[0].halfway, base[0].counts, 1.0, 100)
     decision = judged(base, [lucky, lucky])
+    assert decision.gain_db is not None
     assert decision.gain_db > 3 * LEAST_GAIN_DB
     assert decision.error_db == pytest.approx(decision.gain_db, rel=1e-9)
     assert not decision.kept

@@ -16,7 +16,7 @@ from nerfcli.train.photos import load_album
 from nerfcli.train.room import IN_MEMORY
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.signs import signs_of
-from nerfcli.train.trials import Start, Trials
+from nerfcli.train.trials import Start, Trials, paint
 
 SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
 
@@ -106,10 +106,8 @@ def test_a_background_that_begins_late_has_the_colours_of_its_directions(trials)
             colours = torch.where(directions[:, 2:] > 0, torch.tensor([0.2, 0.4, 0.9]), torch.tensor([0.5, 0.3, 0.1]))
             return trials._judged._replace(directions=directions, colours=colours)
 
-    sky, background = Sky(), SphereBackground()
-    painter = object.__new__(Trials)
-    painter._pool = sky
-    painter._paint(background)
+    background = SphereBackground()
+    paint(background, Sky())  # type: ignore[arg-type]
     up, down = background(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])).detach()
     assert up.tolist() == pytest.approx([0.2, 0.4, 0.9], abs=0.08)
     assert down.tolist() == pytest.approx([0.5, 0.3, 0.1], abs=0.08)

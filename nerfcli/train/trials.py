@@ -24,7 +24,7 @@ from nerfcli.train.components import Components
 from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
-from nerfcli.train.photos import Photo, PixelPool
+from nerfcli.train.photos import Photo, PixelPool, Pool
 from nerfcli.train.room import IN_MEMORY, Room
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.signs import Signs, signs_of
@@ -153,7 +153,7 @@ class Trials:
         fitting = self._fitting(components, seed=seed, log_gains=gains)
         self._take_up(fitting, start)
         if fitting.parts.background is not None:
-            self._paint(fitting.parts.background)
+            paint(fitting.parts.background, self._pool)
         seconds, halfway = [], None
         for done in range(steps):
             if halfway is None and 2 * done >= steps:
@@ -186,18 +186,6 @@ class Trials:
         if isinstance(fitting.field, HashField):
             fitting.field.forget_directions(start.description["field"]["view_degree"])
 
-    def _paint(self, background: SphereBackground) -> None:
-        """Give each direction about the median colour of the pixels that look along it, as if nothing stood before it:
-        what the first training put there is cut away."""
-        generator = torch.Generator(device=self._pool.colours.device).manual_seed(SEED)
-        adam = torch.optim.Adam(background.parameters(), lr=PAINT_RATE)
-        for _ in range(PAINT_STEPS):
-            drawn = self._pool.draw(JUDGED_PIXELS, generator)
-            adam.zero_grad()
-            (background(drawn.directions) - drawn.colours[:, :3]).abs().sum().backward()
-            adam.step()
-        adam.zero_grad()
-
     def _advance(self, fitting: Fitting, share: float) -> float:
         """A step, and the seconds it took."""
         began = time.perf_counter()
@@ -211,6 +199,21 @@ class Trials:
         rendered, measured = fitting.compare(self._judged)
         errors = (rendered.clamp(0.0, 1.0) - measured).square().sum(-1).double().cpu().numpy()
         return np.bincount(self._photos, errors, len(self._counts))
+
+
+def paint(background: SphereBackground, pool: Pool) -> None:
+    """Give each direction about the median colour of the pixels that look along it, as if nothing stood before it.
+
+    What a field without a background put there is cut away when it gets one.
+    """
+    generator = torch.Generator(device=pool.colours.device).manual_seed(SEED)
+    adam = torch.optim.Adam(background.parameters(), lr=PAINT_RATE)
+    for _ in range(PAINT_STEPS):
+        drawn = pool.draw(JUDGED_PIXELS, generator)
+        adam.zero_grad()
+        (background(drawn.directions) - drawn.colours[:, :3]).abs().sum().backward()
+        adam.step()
+    adam.zero_grad()
 
 
 def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:
