@@ -139,10 +139,10 @@ def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downs
         run, capture = Path(folder), truth if choice == "true" else given
         train(capture, run, settings, resume=False, notify=lambda text: None, on_progress=clock)
         model, cameras = load_model(run / FIELD, "cpu"), read_cameras(run)
-    held_out = [
-        HeldOut(photo.frame, photo.pixels, photo.used)
-        for photo in load_photos(cameras["test"], factor=downscale, threads=1)
-    ]
+        held_out = [  # while the run is there: it says where the photos are from where it is
+            HeldOut(photo.frame, photo.pixels, photo.used)
+            for photo in load_photos(cameras["test"], factor=downscale, threads=1)
+        ]
     mean = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras(align_poses=True))["mean"]
     focal = [
         a.camera.focal_px / b.camera.focal_px - 1 for a, b in zip(cameras["train"], truth.train_frames, strict=True)
