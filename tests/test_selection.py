@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from nerfcli.train.components import Components
 from nerfcli.train.judgement import FLOOR, LEAST_GAIN_DB, MOST_LOSS_DB, Decision, judge_one, judge_removal
 from nerfcli.train.race import NO_TIME
-from nerfcli.train.selection import Facts, decisions_in_words, proposals, removals, select
+from nerfcli.train.selection import Facts, decisions_in_words, is_worth_a_search, proposals, removals, select
 from nerfcli.train.signs import Signs
 from nerfcli.train.trials import Start, Trial
 
@@ -208,6 +208,13 @@ def test_too_few_steps_are_not_spent():
     scripted = Scripted(lambda c: 1.0)
     chosen = chosen_by(scripted, steps=100)
     assert (chosen.components, chosen.decisions, scripted.asked) == (Components(), (), [])
+
+
+def test_short_trainings_are_not_searched_for():
+    assert not is_worth_a_search(9.0, None)
+    assert is_worth_a_search(60.0, None)
+    assert not is_worth_a_search(None, 3000)
+    assert is_worth_a_search(None, 5000)
 
 
 def test_a_decision_says_in_words_what_was_and_what_was_not_tried():

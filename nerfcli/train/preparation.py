@@ -21,7 +21,7 @@ from nerfcli.train.fitting import Fitting
 from nerfcli.train.photos import Album, PixelPool, load_album
 from nerfcli.train.point_depth import PointRays, point_depths
 from nerfcli.train.room import Room, needs_of, room_for
-from nerfcli.train.selection import FEWEST_STEPS, SEARCH_SHARE, START_SHARE, Facts, Selection, select
+from nerfcli.train.selection import SEARCH_SHARE, Facts, Selection, is_worth_a_search, select
 from nerfcli.train.settings import TrainSettings, automatic_downscale
 from nerfcli.train.trials import Trials
 
@@ -146,8 +146,8 @@ def _search(
 ) -> Selection:
     """Let the scene decide on the components, and tell how it did."""
     budget, steps = settings.budget_seconds, settings.steps
-    if budget is None and round(SEARCH_SHARE * START_SHARE * (steps or 0)) < FEWEST_STEPS:
-        notify("there are too few steps to try components; the default ones are taken")
+    if not is_worth_a_search(budget, steps):
+        notify("the training is too short to try components; the default ones are taken")
         return Selection(settings.components, (), 0.0)
     exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
     trials = Trials(album.photos, extent, settings=settings, exif=exif, colours=album.colours, room=room)

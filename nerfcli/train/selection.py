@@ -23,6 +23,8 @@ from nerfcli.train.trials import Trials
 SEARCH_SHARE, START_SHARE = 0.15, 0.2
 # A search whose first training is shorter than this tells nothing, and is left out.
 FEWEST_STEPS = 120
+# No machine goes so many steps in less time than this, and what an attempt takes would be missed elsewhere.
+LEAST_START_SECONDS = 0.3
 # Photos whose brightness differs by less than this, in logarithms of light, are as well without exposures.
 LEAST_EXPOSURE_SPREAD = 0.06
 
@@ -104,6 +106,13 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
 def removals(start: Components, facts: Facts) -> list[Change]:
     """What may be left out of a half-trained model: only a hash grid can be, as its shape stays the same."""
     return [("view", 0)] if start.view and "view" not in facts.fixed and facts.field == "hash" else []
+
+
+def is_worth_a_search(seconds: float | None, steps: int | None) -> bool:
+    """Whether a training of so long can spare what a search takes; see `select`."""
+    if seconds is not None:
+        return START_SHARE * SEARCH_SHARE * seconds >= LEAST_START_SECONDS
+    return round(START_SHARE * SEARCH_SHARE * (steps or 0)) >= FEWEST_STEPS
 
 
 def select(
