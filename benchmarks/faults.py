@@ -1,8 +1,7 @@
-"""What damage does: random corruptions of scene, run and image files, and random kills of poses, train and render.
+"""What damage does: random corruptions of scene, run and image files.
 
     python benchmarks/faults.py corruptions --count 500 -o corruptions.csv
     python benchmarks/faults.py corruptions --first 16 --count 1      one case again, alone
-    python benchmarks/faults.py kills --count 20 -o kills.csv
 
 Every corruption damages one file of a small capture or of its run; one command is run on it, in a child process.
 Verdicts: `refused` (exit codes 3, 4 or 5, two lines), `same` (the result is that of the whole files), `other input`
@@ -10,9 +9,6 @@ Verdicts: `refused` (exit codes 3, 4 or 5, two lines), `same` (the result is tha
 number; what comes out belongs to it); bad ones: `traceback`, `crash`, `hang`, `wrong`, and `lost` where a file of the
 user's has changed. A crash is told with its signal, the last lines of stderr and whether the kernel ran out of memory.
 What is bad is tried again in a fresh process, and its capture is kept beside the CSV.
-
-Kills: SIGKILL at random moments, the same command again (train with --resume where a state is there), until it is done;
-then every file that says something is compared with those of a command that nobody disturbed.
 """
 
 import csv
@@ -39,7 +35,6 @@ import typer
 from PIL import Image
 
 SPHERES = Path(__file__).parent.parent / "sample_scenes" / "spheres"
-DESK = SPHERES.with_name("desk") / "images"
 TRAIN = ("--steps", "6", "--threads", "1", "--quiet")
 RENDER = ("--cameras", "test", "--max-size", "24", "--threads", "1", "--quiet", "--depth-format", "npy")
 CPU_SECONDS_PER_CASE, MOST_SECONDS_PER_CASE, LOOK_EVERY_SECONDS = 60, 1800, 20
@@ -405,82 +400,6 @@ def show(table: Counter[tuple[str, str]]) -> None:
     typer.echo(f"{'':32s}" + "".join(f"{verdict:>13s}" for verdict in verdicts))
     for row in sorted({row for row, _ in table}):
         typer.echo(f"{row:32s}" + "".join(f"{table[row, verdict]:13d}" for verdict in verdicts))
-
-
-@app.command()
-def kills(
-    count: Annotated[int, typer.Option(help="Kills of each command.", min=1)] = 20,
-    seed: int = 0,
-    only: Annotated[str, typer.Option(help="Some of poses,train,render.")] = "poses,train,render",
-    output: Annotated[Path, typer.Option("-o", help="CSV with a line per kill.")] = Path("kills.csv"),
-) -> None:
-    """Kill commands at random moments and go on."""
-    draw = random.Random(seed)
-    with tempfile.TemporaryDirectory() as name, output.open("w", newline="") as file:
-        place, writer = Path(name), csv.writer(file)
-        writer.writerow(("command", "kill", "after_seconds", "done_before"))
-        make_capture(place / "capture")
-        photos = place / "photos"
-        photos.mkdir()
-        for path in sorted(DESK.iterdir())[:10]:
-            with Image.open(path) as picture:
-                picture.reduce(3).save(photos / f"{path.stem}.jpg", quality=95)
-        capture = place / "capture"
-        given = {
-            "poses": ("poses", photos, "--quality", "fast", "--threads", "1", "--seed", "1"),
-            "train": ("train", capture / "scene", "--steps", "600", "--threads", "1"),
-            "render": ("render", capture / "run", "--cameras", "orbit", "--count", "20", "--threads", "1"),
-        }
-        for name in only.split(","):
-            whole, part = place / f"{name}-whole", place / f"{name}-killed"
-            before = digests(photos) | digests(capture)
-            began = time.monotonic()
-            done = nerfcli(*given[name], "-o", whole)
-            seconds = time.monotonic() - began
-            finished = 0
-            for number in range(count):
-                moment = draw.uniform(0, 1.1 * seconds)
-                resume = ("--resume",) if name == "train" and (part / "state.safetensors").exists() else ()
-                code = killed_after(moment, (*given[name], "-o", part, *resume))
-                finished += code == 0
-                writer.writerow((name, number, f"{moment:.2f}", code == 0))
-                file.flush()
-                if code == 0:  # start afresh, so that the next kill has something to hit
-                    same = compared(name, whole, part)
-                    typer.echo(f"{name}: done after {number + 1} kills: {same}")
-                    shutil.rmtree(part)
-            resume = ("--resume",) if name == "train" and (part / "state.safetensors").exists() else ()
-            last = nerfcli(*given[name], "-o", part, *resume)
-            unchanged = before == digests(photos) | digests(capture)
-            typer.echo(
-                f"{name}: {count} kills within {seconds:.1f} s (exit {done.returncode}); finished by itself {finished} "
-                f"times; then exit {last.returncode}, {compared(name, whole, part)}; "
-                f"inputs {'unchanged' if unchanged else 'CHANGED'}"
-            )
-
-
-def killed_after(seconds: float, arguments: tuple[object, ...]) -> int:
-    """Start a command, kill its process alone after a time; its exit status, negative where it was killed."""
-    command = [sys.executable, "-m", "nerfcli", *map(str, arguments)]
-    environment = {**os.environ, "GOMP_SPINCOUNT": "1000"}
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        return process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()
-
-
-def compared(name: str, whole: Path, part: Path) -> str:
-    """Whether two results are the same, and which files differ; times and places of runs aside."""
-    told: dict[str, tuple[str, ...]] = {
-        "poses": ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin"),
-        "train": ("field.safetensors",),
-    }
-    one, other = digests(whole), digests(part)
-    names = told.get(name) or tuple(sorted(one.keys() | other.keys()))
-    differing = [file for file in names if one.get(file) != other.get(file) or file not in one]
-    return f"differing: {', '.join(differing)}" if differing else f"all of {len(names)} files the same"
 
 
 if __name__ == "__main__":
