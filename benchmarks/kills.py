@@ -55,7 +55,7 @@ class Given:
 
 
 def commands(place: Path) -> list[Given]:
-    """Poses of 12 small photos of the desk, 400 steps on spheres, 60 small pictures; and the captures for them."""
+    """Poses of 12 small photos of the desk, 200 steps on spheres, 60 small pictures; and the captures for them."""
     make_capture(place / "capture")
     photos, capture = place / "photos", place / "capture"
     photos.mkdir()
@@ -65,7 +65,7 @@ def commands(place: Path) -> list[Given]:
     views = ("--cameras", "orbit", "--count", "60", "--max-size", "48")
     return [
         Given("poses", ("poses", photos, "--quality", "fast", "--seed", "1"), (photos,)),
-        Given("train", ("train", capture / "scene", "--steps", "400"), (capture / "scene", capture / "photos")),
+        Given("train", ("train", capture / "scene", "--steps", "200"), (capture / "scene", capture / "photos")),
         Given("render", ("render", capture / "run", *views), (capture / "run",)),
     ]
 
@@ -173,8 +173,8 @@ def kills(
             beside = sorted(path.name for path in part.parent.iterdir() if path != part)
             typer.echo(
                 f"{given.name}: begins at {begins:.1f} s, takes {seconds:.1f} s; {told}; then exit "
-                f"{process.returncode} {said.strip()[-200:]}; differing: {wrong or 'none'}; beside it: {beside or 'nothing'}; "
-                f"inputs {'unchanged' if kept else 'CHANGED'}"
+                f"{process.returncode} {said.strip()[-200:]}; differing: {wrong or 'none'}; "
+                f"beside it: {beside or 'nothing'}; inputs {'unchanged' if kept else 'CHANGED'}"
             )
 
 

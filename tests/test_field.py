@@ -1,5 +1,7 @@
 """Encodings, activations and the field: closed forms, SciPy, quadrature; what stands on disk comes back bit for bit."""
 
+import hashlib
+import json
 import math
 from dataclasses import replace
 
@@ -300,6 +302,27 @@ def test_model_of_another_format_is_named(tmp_path):
         load_model(path, "cpu")
 
 
+@pytest.mark.parametrize("with_digest", [True, False])
+def test_checkpoints_whose_digest_stands_apart_or_is_missing_are_read(tmp_path, with_digest):
+    """As written by safetensors itself; the digest is that of an earlier version's file of the same content."""
+    tensors, text = {"a": torch.arange(3.0)}, json.dumps({"step": 3, "name": "küche"})
+    bytes_told = b"a torch.float32 (3,)" + tensors["a"].numpy().tobytes()
+    digest = hashlib.blake2b(text.encode() + bytes_told, digest_size=16).hexdigest()
+    path = tmp_path / "a.safetensors"
+    save_file(tensors, path, metadata={"description": text, **({"blake2b": digest} if with_digest else {})})
+    assert load_tensors(path, "cpu")[1] == {"step": 3, "name": "küche"}
+    save_file({"a": torch.ones(3)}, path, metadata={"description": text, "blake2b": digest})
+    with pytest.raises(UserError, match="is damaged"):
+        load_tensors(path, "cpu")
+
+
+def test_the_same_content_is_the_same_file(tmp_path):
+    files = [tmp_path / f"{number}.safetensors" for number in range(12)]
+    for path in files:
+        save_tensors(path, awkward_tensors(), {"step": 3, "name": "küche"})
+    assert len({path.read_bytes() for path in files}) == 1
+
+
 def test_a_bit_that_flips_anywhere_in_a_checkpoint_is_noticed(tmp_path):
     path = tmp_path / "a.safetensors"
     save_tensors(path, {"a": torch.arange(40.0), "flags": torch.tensor([True, False])}, {"step": 3, "name": "küche"})
@@ -313,6 +336,6 @@ def test_a_bit_that_flips_anywhere_in_a_checkpoint_is_noticed(tmp_path):
             again, told = load_tensors(path, "cpu")
         except UserError:
             continue
-        # Where nothing says so, nothing is lost: spaces that fill up the header, the name of the digest itself.
+        # Where nothing says so, nothing is lost: spaces that fill up the header.
         assert told == description
         assert {name: tensor.tolist() for name, tensor in again.items()} == {n: t.tolist() for n, t in tensors.items()}

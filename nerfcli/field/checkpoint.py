@@ -12,17 +12,22 @@ from torch import Tensor, uint8
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import NON_FINITE, UserError
 
-# Of the file's metadata. The format has no checksum: a bit that flips on a disk would be a slightly other field.
-_DESCRIPTION, _DIGEST = "description", "blake2b"
+# Of the file's metadata. The format has no checksum: a bit that flips on a disk would be a slightly other field. Digest
+# and description are one entry, as safetensors writes several in any order, and the same field shall be the same file.
+_ENTRY = "description"
+_DIGEST = "blake2b"  # an entry of its own in files of earlier versions; the first ones have none
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
-    """Write tensors and their description with a digest of both; the file appears whole or not at all."""
+    """Write tensors and their description with a digest of both; the file appears whole or not at all.
+
+    The same content gives the same bytes.
+    """
     content = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    text = json.dumps(description, allow_nan=False)
+    digest = _digest(content, json.dumps(description, allow_nan=False))
     with atomic_path(path) as partial:
         try:
-            save_file(content, partial, metadata={_DESCRIPTION: text, _DIGEST: _digest(content, text)})
+            save_file(content, partial, metadata={_ENTRY: json.dumps([digest, description])})
             partial.chmod(0o644)  # safetensors makes files that only their owner can read
         except SafetensorError as error:  # a full disk comes as this, not as OSError
             raise OSError(str(error)) from error
@@ -37,9 +42,11 @@ def load_tensors(path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, 
     try:
         with safe_open(path, framework="pt", device="cpu") as file:
             metadata = file.metadata() or {}
-            text = metadata[_DESCRIPTION]
+            entry = metadata[_ENTRY]
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        description = json.loads(text)
+        told = json.loads(entry)
+        sealed = isinstance(told, list)
+        digest, description = told if sealed else (metadata.get(_DIGEST), told)
     except FileNotFoundError as error:
         raise UserError(
             f"{path} does not exist", "train first (nerfcli train SCENE), or give the folder that train wrote"
@@ -49,8 +56,7 @@ def load_tensors(path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, 
             f"{path} is not a readable checkpoint: {error}",
             "train again with --overwrite, or restore the file",
         ) from error
-    # Files of earlier versions have no digest.
-    if _DIGEST in metadata and metadata[_DIGEST] != _digest(tensors, text):
+    if (sealed or digest is not None) and digest != _digest(tensors, json.dumps(description) if sealed else entry):
         raise UserError(
             f"{path} is damaged: its content is not what was written",
             "train again with --overwrite, or restore the file; the disk may have more damage",
