@@ -8,6 +8,7 @@ What survives needs a test, or a reason why no test can tell. The list of mutant
 """
 
 import csv
+import importlib.util
 import multiprocessing
 import os
 import re
@@ -60,11 +61,22 @@ def run_tests(tree: Path, group: Group, log: Path) -> None:
     os.setpgid(0, 0)
     os.chdir(tree)
     sys.path[:0] = [str(tree), str(tree / "tests")]
+    keep_machine_code(tree / "nerfcli" / "kernels" / "numba_cpu")
     selected = ("-k", group.selected) if group.selected else ()
     with log.open("w") as file, redirect_stdout(file), redirect_stderr(file):
         code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=line", *selected, *group.tests])
         file.flush()
     os._exit(int(code))
+
+
+def keep_machine_code(kernels: Path) -> None:
+    """Vouch for what is compiled: what the mutant is in has been taken away, and the rest is not compiled each time."""
+    spec = importlib.util.spec_from_file_location("machine_code", kernels / "machine_code.py")
+    assert spec is not None
+    assert spec.loader is not None
+    machine_code = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(machine_code)  # by itself: the package would discard all at once
+    machine_code.note_sources(machine_code.sources(), kernels / "__pycache__")
 
 
 def verdict_of(mutant: Mutant, group: Group) -> tuple[str, float]:

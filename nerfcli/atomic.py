@@ -6,7 +6,9 @@ command or a full disk leaves nothing behind that a later one would take for a r
 
 import json
 import os
+import re
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EDQUOT, EFBIG, ENOSPC
@@ -14,6 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.errors import UserError
+
+# What a process that was killed leaves: half a result, or a whole one that it had just put aside.
+_LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|old)-(?P<process>\d+)(\D.*)?", re.DOTALL)
 
 
 @contextmanager
@@ -46,6 +51,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
     with _write_errors_told(path):
         try:
+            clear_leftovers(path.parent)
             partial.mkdir(parents=True)
             yield partial
             replace_folder(partial, path)
@@ -62,6 +68,7 @@ def replace_folder(complete: Path, path: Path) -> None:
     old = path.with_name(f".{path.name}.old-{os.getpid()}")
     with _write_errors_told(path):
         try:
+            clear_leftovers(path.parent)
             if path.exists():
                 os.replace(path, old)
             try:
@@ -72,6 +79,41 @@ def replace_folder(complete: Path, path: Path) -> None:
                 raise
         finally:
             shutil.rmtree(old, ignore_errors=True)
+
+
+def clear_leftovers(folder: Path) -> None:
+    """Remove what killed processes left in a folder: half results; and whole ones that they had put aside to replace
+    them, which are put back where their place is empty. What belongs to a process that lives is left alone."""
+    found = [match for match in map(_LEFTOVER.fullmatch, _names(folder)) if match and not _lives(int(match["process"]))]
+    for match in found:
+        path, place = folder / match.string, folder / match["name"]
+        with suppress(OSError):  # another command is doing the same, or it is in nobody's way
+            if match["kind"] == "old" and not place.exists():
+                os.replace(path, place)
+            elif path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)
+    except OSError:  # there is none yet
+        return []
+
+
+def _lives(process: int) -> bool:
+    """Whether there is a process with this number on this machine; True where one cannot ask."""
+    if sys.platform == "win32":
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # somebody else's
+        return True
+    return True
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -1,7 +1,9 @@
 """Shared fixtures, the trained run that several files look at, and the one table of tolerances."""
 
 import fcntl
+import json
 import os
+import shutil
 from pathlib import Path
 
 # Threads of two test processes on two cores must not spin while they wait; to be said before torch is imported.
@@ -10,10 +12,15 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 import pytest
 import torch
 from examples import MANY
+from fog import fog, foggy_cells
 from hypothesis import settings
 
 from nerfcli import scene
+from nerfcli.atomic import write_json
+from nerfcli.render.model import save_model
 from nerfcli.train.loop import train
+from nerfcli.train.normalisation import object_frame
+from nerfcli.train.run_folder import append_log, describe_run, write_cameras
 from nerfcli.train.settings import TrainSettings
 
 # Relative tolerance of a chain of some dozen operations, per dtype. A looser one in a test carries its reason.
@@ -59,4 +66,43 @@ def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) 
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not run.exists():
             train(spheres, run, training, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
+    return run
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """A scene of a few views in a place with a space and letters beyond ASCII."""
+    folder = tmp_path / "Küche 2" / "spheres"
+    for split, names in (("train", range(4)), ("test", range(1))):
+        (folder / split).mkdir(parents=True)
+        listed = json.loads((SPHERES / f"transforms_{split}.json").read_text())
+        listed["frames"] = listed["frames"][: len(names)]
+        (folder / f"transforms_{split}.json").write_text(json.dumps(listed))
+        for index in names:
+            shutil.copy(SPHERES / split / f"r_{index:03d}.png", folder / split)
+    return folder
+
+
+@pytest.fixture
+def finished(capture: Path) -> Path:
+    """A run of `capture` whose field is fog; nothing was trained."""
+    run = capture.with_name("spheres-run")
+    loaded = scene.load(capture)
+    settings = TrainSettings(budget_seconds=None, steps=7)
+    similarity, _ = object_frame(loaded)
+    run.mkdir()
+    write_json(run / "config.json", describe_run(loaded, settings, factor=8, contraction="none"))
+    write_cameras(run, loaded.train_frames, loaded.test_frames)
+    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    save_model(run / "field.safetensors", fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32))
+    entry = {
+        "step": 7,
+        "seconds": 2.0,
+        "samples": 100,
+        "rays": 10,
+        "loss": 0.1,
+        "samples_per_second": 50,
+        "peak_memory_bytes": 9,
+    }
+    append_log(run, entry)
     return run

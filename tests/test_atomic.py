@@ -2,10 +2,13 @@
 
 import json
 import math
+import os
+import subprocess
+import sys
 
 import pytest
 
-from nerfcli.atomic import atomic_folder, atomic_path, read_json, write_json
+from nerfcli.atomic import atomic_folder, atomic_path, clear_leftovers, read_json, replace_folder, write_json
 from nerfcli.errors import BAD_INPUT, UserError
 
 
@@ -122,3 +125,47 @@ def test_json_of_ours_that_is_damaged_is_told(content, tmp_path):
         read_json(path, needed=("mean",), hint="measure again")
     write_json(path, {"mean": 1})
     assert read_json(path, needed=("mean",), hint="measure again") == {"mean": 1}
+
+
+# What killed processes leave
+
+
+@pytest.fixture(scope="module")
+def dead() -> int:
+    """The number of a process that has ended."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        pass
+    return process.pid
+
+
+def test_leftovers_of_the_dead_are_cleared_and_those_of_the_living_stay(tmp_path, dead):
+    (tmp_path / f".predictions.partial-{dead}").mkdir()
+    (tmp_path / f".predictions.partial-{dead}" / "a.png").write_text("half")
+    (tmp_path / f".field.partial-{dead}.safetensors").write_text("half")
+    (tmp_path / f".rgb.partial-{dead}.gif-x7f").mkdir()
+    kept = {f".field.partial-{os.getpid()}.safetensors", ".theirs.partial-x", f"field.partial-{dead}", ".git"}
+    for name in kept:
+        (tmp_path / name).write_text("not ours")
+    clear_leftovers(tmp_path)
+    assert set(names(tmp_path)) == kept
+    clear_leftovers(tmp_path / "nowhere")
+
+
+def test_a_result_that_was_put_aside_comes_back_where_its_place_is_empty(tmp_path, dead):
+    """A kill between the two renames of `replace_folder`, and one after them."""
+    for name in ("lost", "replaced"):
+        (tmp_path / f".{name}.old-{dead}").mkdir()
+        (tmp_path / f".{name}.old-{dead}" / "old.txt").write_text("old")
+    (tmp_path / "replaced").mkdir()
+    (tmp_path / "new").mkdir()
+    replace_folder(tmp_path / "new", tmp_path / "another")
+    assert names(tmp_path) == ["another", "lost", "replaced"]
+    assert names(tmp_path / "lost") == ["old.txt"]
+    assert names(tmp_path / "replaced") == []
+
+
+def test_the_next_folder_clears_what_the_last_left(tmp_path, dead):
+    (tmp_path / f".run.partial-{dead}").mkdir()
+    with atomic_folder(tmp_path / "run"):
+        pass
+    assert names(tmp_path) == ["run"]

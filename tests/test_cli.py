@@ -18,11 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 import typer.main
-from conftest import SPHERES
-from fog import fog, foggy_cells
+from commands import error_of, listing, nerfcli, started
 from PIL import Image
 from typer.exceptions import TyperException
-from typer.testing import CliRunner, Result
 
 from nerfcli import cli, scene
 from nerfcli.atomic import write_json
@@ -31,12 +29,8 @@ from nerfcli.cli.options import seconds_from_text, thread_count
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TOO_FEW_PHOTOS
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
-from nerfcli.render.model import save_model
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
-from nerfcli.train.normalisation import object_frame
-from nerfcli.train.run_folder import append_log, describe_run, write_cameras
-from nerfcli.train.settings import TrainSettings
 
 COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench")
 WITHOUT_INPUT = ("selftest",)
@@ -46,72 +40,12 @@ README = Path(__file__).parent.parent / "README.md"
 QUICK = ("--steps", "1", "--downscale", "8", "--threads", "2")
 
 
-def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:
-    """Run a command in this process; a bug keeps its traceback."""
-    result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments], input=stdin)
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
-
-
-def error_of(result: Result) -> tuple[str, str]:
-    """Error and hint of a failed command, which are all that it said besides notes."""
-    lines = [line for line in result.stderr.splitlines() if line.startswith(("Error:", "Hint:"))]
-    assert len(lines) == 2, result.stderr
-    assert "Traceback" not in result.stderr
-    return lines[0], lines[1]
-
-
-def listing(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder with its content, hidden ones too."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def write_photos(folder: Path, count: int) -> Path:
     folder.mkdir(parents=True)
     for index in range(count):
         pixels = np.random.default_rng(index).integers(0, 256, (48, 64, 3)).astype(np.uint8)
         Image.fromarray(pixels).save(folder / f"photo {index}.jpg", quality=95)
     return folder
-
-
-@pytest.fixture
-def capture(tmp_path: Path) -> Path:
-    """A scene of a few views in a place with a space and letters beyond ASCII."""
-    folder = tmp_path / "Küche 2" / "spheres"
-    for split, names in (("train", range(4)), ("test", range(1))):
-        (folder / split).mkdir(parents=True)
-        listed = json.loads((SPHERES / f"transforms_{split}.json").read_text())
-        listed["frames"] = listed["frames"][: len(names)]
-        (folder / f"transforms_{split}.json").write_text(json.dumps(listed))
-        for index in names:
-            shutil.copy(SPHERES / split / f"r_{index:03d}.png", folder / split)
-    return folder
-
-
-@pytest.fixture
-def finished(capture: Path) -> Path:
-    """A run of `capture` whose field is fog; nothing was trained."""
-    run = capture.with_name("spheres-run")
-    loaded = scene.load(capture)
-    settings = TrainSettings(budget_seconds=None, steps=7)
-    similarity, _ = object_frame(loaded)
-    run.mkdir()
-    write_json(run / "config.json", describe_run(loaded, settings, factor=8, contraction="none"))
-    write_cameras(run, loaded.train_frames, loaded.test_frames)
-    cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    save_model(run / "field.safetensors", fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32))
-    entry = {
-        "step": 7,
-        "seconds": 2.0,
-        "samples": 100,
-        "rays": 10,
-        "loss": 0.1,
-        "samples_per_second": 50,
-        "peak_memory_bytes": 9,
-    }
-    append_log(run, entry)
-    return run
 
 
 # Help, examples, README
@@ -740,14 +674,6 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 
 
 # Processes of their own
-
-
-def started(*arguments: str | Path) -> subprocess.Popen[str]:
-    """The command as a terminal starts it; a suite that runs in the background hands on that Ctrl-C is ignored."""
-    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    program += "from nerfcli.cli import main; main()"
-    command = [sys.executable, "-c", program, *map(str, arguments)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(capture):

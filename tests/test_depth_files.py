@@ -2,9 +2,6 @@
 
 import json
 import math
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +13,7 @@ import pytest
 import tifffile
 from depth_maps import ALL, FLOATS, FULL_META, META, plain_depth
 from examples import examples
+from full_disk import files_of_at_most
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -150,17 +148,6 @@ def test_what_is_no_depth_map_is_not_written(suffix, tmp_path):
     with pytest.raises(ValueError, match="JSON compliant"):
         ALL[suffix](tmp_path / f"a{suffix}", plain_depth(), replace(META, background_distance=math.inf))
     assert list(tmp_path.iterdir()) == []
-
-
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """What a full disk is to a writer: the system refuses to write on."""
-    old = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, old)
 
 
 @pytest.mark.parametrize("suffix", ALL)

@@ -220,12 +220,22 @@ def test_a_dying_worker_is_told_with_its_last_words(tmp_path: Path, monkeypatch:
 
 def test_deaths_are_explained():
     log = "*** Aborted at 1 ***\nF1120 bundle.cc:9] Check failed: x > 0\n    @ 0x7f (libc.so)\n"
-    aborted = supervise.explain_death(-6, "matching photos (3 of 10 done)", log)
+    aborted = supervise.explain_death(-6, "matching photos (3 of 10 done)", log, 10**9)
     assert aborted.message == (
         "structure from motion died (SIGABRT) while matching photos (3 of 10 done): "
         "F1120 bundle.cc:9] Check failed: x > 0"
     )
-    assert supervise.explain_death(-9, "finding features", "").exit_code == OUT_OF_MEMORY
+    assert supervise.explain_death(-9, "finding features", "", 10**9).exit_code == OUT_OF_MEMORY
+
+
+@pytest.mark.parametrize(
+    ("log", "free_bytes"),
+    [("", 40_960), ("RuntimeError: SQL error: database or disk is full\n", 10**9), ("No space left on device", 10**9)],
+)
+def test_a_full_disk_is_told_even_where_no_log_could_be_written(log: str, free_bytes: int):
+    told = supervise.explain_death(1, "finding features (3 of 10 done)", log, free_bytes)
+    assert "cannot write on while finding features (3 of 10 done): the disk is full" in told.message
+    assert "the same command goes on from there" in told.hint
 
 
 def test_a_scene_never_takes_the_place_of_the_photos(tmp_path: Path):

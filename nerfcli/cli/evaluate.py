@@ -146,7 +146,7 @@ def evaluate_run(
 
     import torch
 
-    from nerfcli.atomic import write_json
+    from nerfcli.atomic import clear_leftovers, write_json
     from nerfcli.evaluate.ledger import leak_ledger, told
     from nerfcli.evaluate.perceptual import find_perceptual
     from nerfcli.evaluate.protocol import METRICS, PROTOCOL, Extras, evaluate_model
@@ -156,6 +156,7 @@ def evaluate_run(
     torch.set_num_threads(threads)
     config, cameras = read_config(run), read_cameras(run)
     check_split(run, config, cameras["test"])
+    clear_leftovers(run)
     model = load_model(run / FIELD, device)
     checkpoint = hashlib.sha256((run / FIELD).read_bytes()).hexdigest()
     path = run / METRICS

@@ -175,6 +175,7 @@ def train_scene(
         UserError: see `nerfcli.train.loop.train`; or a different run stands at `run`.
     """
     from nerfcli import scene as scenes
+    from nerfcli.atomic import clear_leftovers
     from nerfcli.cameras.orientation import rescaling_told
     from nerfcli.evaluate.protocol import METRICS
     from nerfcli.exclusive import exclusive
@@ -199,6 +200,7 @@ def train_scene(
     with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
         if is_kept():  # by one that has just ended
             return
+        clear_leftovers(run)
         if overwrite:
             (run / METRICS).unlink(missing_ok=True)  # they belong to the field that goes
         _fit(scene, run, settings, memory_bytes=memory_bytes, resume=resume, console=console)

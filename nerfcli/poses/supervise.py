@@ -2,12 +2,14 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
+from errno import ENOSPC
 from pathlib import Path
 
 import nerfcli
@@ -26,6 +28,8 @@ _GO_ON = "what is complete is kept, and the same command goes on from there"
 _LESS_MEMORY = "use smaller photos (--max-size), fewer features (--max-features) or fewer threads (--threads)"
 # Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
 _LOOK_EVERY_SECONDS = 0.1
+# With less, SQLite and pycolmap cannot write the next part.
+_FULL_DISK_BYTES = 2_000_000
 
 
 def run_worker(
@@ -89,11 +93,21 @@ def run_worker(
         return
     if guard.reached is not None:
         raise _limit_reached(guard.reached, limits, stage)
-    raise explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"))
+    free_bytes = shutil.disk_usage(job_path.parent).free
+    raise explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"), free_bytes)
 
 
-def explain_death(returncode: int, stage: str, log: str) -> UserError:
-    """The error for a worker that ended with `returncode` while at `stage`, with the last words of its log."""
+def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> UserError:
+    """The error for a worker that ended with `returncode` while at `stage`, with the last words of its log.
+
+    Args:
+        free_bytes: on the disk that it wrote to. Where that is full, the log may be empty.
+    """
+    if free_bytes < _FULL_DISK_BYTES or "disk is full" in log or os.strerror(ENOSPC) in log:
+        return UserError(
+            f"structure from motion cannot write on while {stage}: the disk is full ({free_bytes / 1e6:.1f} MB free)",
+            f"free space on the disk, or choose another one with -o; {_GO_ON}",
+        )
     if returncode == -signal.SIGKILL:
         return UserError(
             f"structure from motion was killed while {stage}, most likely for want of memory",

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerfcli.atomic import atomic_folder
+from nerfcli.atomic import atomic_folder, clear_leftovers
 from nerfcli.exclusive import exclusive
 from nerfcli.poses.job import database_path
 from nerfcli.scene import SCENE_FILE
@@ -38,6 +38,8 @@ def workspace(scene_dir: Path) -> Iterator[Workspace]:
     """
     folder = scene_dir / "work"
     with exclusive(folder / _LOCK, f"nerfcli poses is at work on {scene_dir}") as lock:
+        for place in (scene_dir, folder):
+            clear_leftovers(place)
         yield Workspace(folder, lock)
 
 

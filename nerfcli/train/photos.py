@@ -108,6 +108,12 @@ def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room
 def _load_photo(frame: Frame, factor: float, masks: str) -> Photo:
     if frame.image is None:
         raise UserError(f"{frame.name} has no photo", "this camera can be rendered, but not trained on or evaluated")
+    if not frame.image.exists():
+        raise UserError(
+            f"the photo {frame.image.resolve()} is not there",
+            "put it back; or, where photos or run were moved, put a link to the photos' folder in its place: "
+            "a run looks for them where they were as seen from itself",
+        )
     pixels = read_image(frame.image)
     height, width = pixels.shape[:2]
     if (width, height) != (frame.camera.width, frame.camera.height):

@@ -1,9 +1,8 @@
 """The hot operations on CPU threads, compiled by Numba for the processor they run on, cached on disk."""
 
-from pathlib import Path
-
 import torch
 
+from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
 from nerfcli.kernels.numba_cpu.depth import light_ends, mixture_quantile
@@ -38,9 +37,12 @@ __all__ = [
 ]
 
 
+machine_code.discard_outdated(machine_code.sources(), machine_code.folder())
+
+
 def is_compiled() -> bool:
-    """Whether an earlier process has left compiled kernels in the cache beside the code."""
-    return any((Path(__file__).parent / "__pycache__").glob("*.nbi"))
+    """Whether an earlier process has left compiled kernels on disk."""
+    return machine_code.is_there()
 
 
 def warm_up() -> None:

@@ -1,0 +1,67 @@
+"""Compiled kernels on disk, and that they are those of the sources as they stand.
+
+Numba compiles a kernel again when the file that it stands in has changed, but not for what it calls in other files.
+Where sources were replaced in place, as `git pull` does, old machine code then worked on buffers of a new shape: a
+segmentation fault, or wrong numbers. So all of it goes as soon as one of the sources is another.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+import numba
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+
+# The digest of the sources, beside the machine code.
+_NOTE = "sources.blake2b"
+
+
+@numba.njit(cache=True)
+def _nothing() -> None:
+    """Never called: it knows where Numba keeps what is compiled in this folder."""
+
+
+def folder() -> Path:
+    """Where the machine code of these kernels is: beside them or, where nothing can be written there, at the user's."""
+    return Path(_nothing.stats.cache_path)
+
+
+def is_there() -> bool:
+    """Whether an earlier process has left compiled kernels."""
+    return any(folder().glob("*.nbi"))
+
+
+def sources() -> list[Path]:
+    """The files that the machine code is made of."""
+    here = Path(__file__).parent
+    return [*here.glob("*.py"), *here.parent.glob("*.py")]
+
+
+def discard_outdated(made_of: Iterable[Path], compiled: Path) -> None:
+    """Remove the machine code in a folder unless it was made of these very sources."""
+    made_of = list(made_of)
+    try:
+        if (compiled / _NOTE).read_text() == _digest(made_of):
+            return
+    except (OSError, ValueError):  # nobody knows what it was made of
+        pass
+    for pattern in ("*.nbi", "*.nbc"):
+        for path in compiled.glob(pattern):
+            path.unlink(missing_ok=True)
+    note_sources(made_of, compiled)
+
+
+def note_sources(made_of: Iterable[Path], compiled: Path) -> None:
+    """Note that the machine code in a folder is made of these sources."""
+    with suppress(UserError), atomic_path(compiled / _NOTE) as partial:  # else nothing compiled can be kept there, too
+        partial.write_text(_digest(made_of))
+
+
+def _digest(made_of: Iterable[Path]) -> str:
+    content = hashlib.blake2b()
+    for path in sorted(made_of):
+        content.update(path.name.encode() + b"\0" + path.read_bytes())
+    return content.hexdigest()

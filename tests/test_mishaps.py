@@ -1,0 +1,149 @@
+"""What happens around a command: a full disk, Ctrl-C, another command on the same folder, photos that have gone.
+
+Each ends with its exit code and a line or two, and everything that was there is as it was.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import error_of, listing, nerfcli, started
+from full_disk import files_of_at_most
+
+from nerfcli import atomic, scene
+from nerfcli.errors import BAD_INPUT, INTERRUPTED
+from nerfcli.exclusive import exclusive
+from nerfcli.train.run_folder import LOCK
+
+ONE_STEP = ("--steps", "1", "--downscale", "8", "--threads", "2")
+FEW = ("--cameras", "test", "--max-size", "16", "--threads", "2")
+
+# Of commands that write: their words, with the capture and a run of it, and the bytes that a file may have.
+Words = Callable[[Path, Path], tuple[Any, ...]]
+WRITERS: dict[str, tuple[Words, int]] = {
+    "train": (lambda capture, run: ("train", capture, "-o", run.with_name("new"), *ONE_STEP), 50_000),
+    "render": (lambda capture, run: ("render", run, *FEW), 300),
+    "evaluate": (lambda capture, run: ("evaluate", run, "--threads", "2"), 300),
+    "predictions": (lambda capture, run: ("evaluate", run, "--save-predictions", "png"), 80),
+    "report": (lambda capture, run: ("report", run), 5000),
+    "convert": (lambda capture, run: ("convert", capture, run.with_name("a.npz"), "--to", "npz"), 300),
+}
+
+
+def with_leftovers(folder: Path, before: dict[str, bytes]) -> dict[str, bytes]:
+    """What has come into a folder or changed, aside from locks and what the same command takes up again."""
+    kept = ("unfinished", LOCK, "new/")
+    return {
+        name: content
+        for name, content in listing(folder).items()
+        if before.get(name) != content and not any(mark in name for mark in kept)
+    }
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_told_and_what_was_there_is_as_it_was(name, finished, capture):
+    words, size = WRITERS[name]
+    before = listing(capture.parent)
+    with files_of_at_most(size):
+        result = nerfcli(*words(capture, finished))
+    assert result.exit_code == BAD_INPUT, result.stderr
+    error, hint = error_of(result)
+    assert error.startswith("Error: cannot write ")
+    assert "free space on the disk" in hint
+    assert result.stdout == ""
+    assert with_leftovers(capture.parent, before) == {}
+    assert before.items() <= listing(capture.parent).items()
+    assert not list(capture.parent.rglob("*partial*"))
+
+
+@pytest.fixture
+def interrupted_when_written(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Ctrl-C as the first result is about to get its name; which one that is."""
+    met: list[str] = []
+    replace = os.replace
+
+    def replace_and_interrupt(source: Any, target: Any) -> None:
+        if not met:
+            met.append(str(target))
+            signal.raise_signal(signal.SIGINT)
+        replace(source, target)
+
+    monkeypatch.setattr(atomic.os, "replace", replace_and_interrupt)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
+    yield met
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "train"])
+def test_ctrl_c_ends_a_command_in_one_line(name, finished, capture, interrupted_when_written):
+    before = listing(capture.parent)
+    result = nerfcli(*WRITERS[name][0](capture, finished))
+    assert interrupted_when_written
+    assert (result.exit_code, result.stdout) == (INTERRUPTED, "")
+    lines = result.stderr.splitlines()
+    assert lines[-1] == "Interrupted; what was complete is kept."
+    assert not any(word in result.stderr for word in ("Traceback", "Error:"))
+    assert with_leftovers(capture.parent, before) == {}
+    assert before.items() <= listing(capture.parent).items()
+    assert not list(capture.parent.rglob("*partial*"))
+
+
+@pytest.mark.slow
+def test_a_reader_that_goes_away_loses_nothing(finished, capture):
+    """As `| true`: the results are complete, and nobody complains."""
+    process = started("render", finished, *FEW, "--quiet")
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    with process:
+        assert process.stderr.read() == ""
+    assert process.returncode == 0
+    assert list((finished / "renders").glob("*/render.json"))
+
+
+def test_a_second_training_of_a_run_is_refused_while_the_first_is_at_work(capture):
+    run = capture.with_name("new")
+    with exclusive(run / LOCK, "nerfcli train is at work"):
+        result = nerfcli("train", capture, "-o", run, *ONE_STEP)
+    assert result.exit_code == BAD_INPUT
+    assert error_of(result) == (
+        f"Error: another nerfcli train is at work on {run}",
+        "Hint:  wait until it is done, or choose another folder with -o",
+    )
+    assert [path.name for path in run.iterdir()] == [LOCK]
+
+
+def test_a_run_that_was_moved_without_its_photos_says_which_and_how_to_mend_it(finished, capture):
+    moved = capture.parent / "elsewhere" / "run"
+    shutil.copytree(finished, moved)
+    result = nerfcli("evaluate", moved)
+    assert result.exit_code == BAD_INPUT
+    error, hint = error_of(result)
+    missing = moved.parent / "spheres" / "test" / "r_000.png"
+    assert error == f"Error: the photo {missing} is not there"
+    assert "put a link to the photos' folder in its place" in hint
+    (moved.parent / "spheres").symlink_to(capture)  # as it says
+    assert nerfcli("evaluate", moved).exit_code == 0
+
+
+def test_what_a_killed_evaluation_left_goes_with_the_next(finished):
+    with subprocess.Popen([sys.executable, "-c", ""]) as dead:
+        pass
+    left = finished / f".predictions.partial-{dead.pid}"
+    left.mkdir()
+    (left / "half.png").write_bytes(b"half")
+    assert nerfcli("evaluate", finished, "--threads", "2").exit_code == 0
+    assert not left.exists()
+
+
+def test_a_scene_is_read_while_it_is_trained_on(capture):
+    """Two commands on one scene take no lock of it: it is only read."""
+    with exclusive(capture.with_name("new") / LOCK, "nerfcli train is at work"):
+        assert len(scene.load(capture).frames) == 5
+        assert nerfcli("info", capture).exit_code == 0
