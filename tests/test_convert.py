@@ -9,8 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from commands import error_of, listing, nerfcli
 from PIL import Image
-from test_cli import check_that_it_parses, error_of, listing, nerfcli
+from test_cli import check_that_it_parses
 from test_scale import photos_of, sheet_of_markers
 from views import BROWN, FISHEYE, PANORAMA, PINHOLE, PRISM, RADIAL, RATIONAL, SQUARE, capture_of
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from commands import error_of, nerfcli
 from PIL import Image
-from test_cli import error_of, nerfcli
 from views import BROWN, PINHOLE, capture_of
 
 from nerfcli.cameras import rigid

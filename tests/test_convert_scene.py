@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from commands import error_of, listing, nerfcli
 from PIL import Image
-from test_cli import error_of, listing, nerfcli
 from test_convert import LIMIT_PX, farthest_px, npz_of
 from test_scale import photos_of, sheet_of_markers
 from views import BROWN, PINHOLE, PRISM, SQUARE, capture_of

@@ -13,9 +13,10 @@ import numpy as np
 import pycolmap
 import pytest
 from captures import CAMERAS, ring
+from commands import error_of, nerfcli
 from corner import CENTRES, FOCAL_PX, NAMES, write_capture
 from PIL import Image
-from test_cli import USAGE, error_of, nerfcli, write_photos
+from test_cli import USAGE, write_photos
 from test_pose_stages import model, rows
 from test_poses import similarity
 

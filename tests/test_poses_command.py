@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 import typer
-from test_cli import USAGE, error_of, nerfcli, write_photos
+from commands import error_of, nerfcli
+from test_cli import USAGE, write_photos
 
 from nerfcli.cli import poses as poses_command
 from nerfcli.cli.options import bytes_from_text

@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import error_of, nerfcli
 from PIL import Image
-from test_cli import capture as capture
-from test_cli import error_of, nerfcli
-from test_cli import finished as finished
 
 from nerfcli.cli.views import file_fps
 from nerfcli.errors import BAD_INPUT

@@ -26,7 +26,9 @@ def _nothing() -> None:
 
 def folder() -> Path:
     """Where the machine code of these kernels is: beside them or, where nothing can be written there, at the user's."""
-    return Path(_nothing.stats.cache_path)
+    place = _nothing.stats.cache_path
+    assert place is not None  # it has cache=True
+    return Path(place)
 
 
 def is_there() -> bool:

@@ -1,0 +1,111 @@
+"""nerfcli.render.occupancy: which cells are taken for empty, against a field whose density is known."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfcli.field.contraction import training_points
+from nerfcli.render.occupancy import DECAY, Occupancy
+
+SIDE = 4
+EVERYTHING = slice(None)
+
+
+@dataclass(frozen=True)
+class Size:
+    """Of a field: all that the grid asks it for."""
+
+    contraction: str
+
+
+class Ramp:
+    """Density x + 10 y + 100 z of the unit cube; notes where it was asked."""
+
+    def __init__(self, contraction: str = "none"):
+        self.settings = Size(contraction)
+        self.asked = torch.zeros(0, 3)
+
+    def density(self, coordinates: Tensor) -> Tensor:
+        self.asked = torch.cat([self.asked, coordinates])
+        return coordinates @ torch.tensor([1.0, 10.0, 100.0])
+
+
+class Even:
+    """The same density everywhere."""
+
+    def __init__(self, density: float):
+        self.settings = Size("none")
+        self._density = density
+
+    def density(self, coordinates: Tensor) -> Tensor:
+        return torch.full((len(coordinates),), self._density)
+
+
+def refreshed(grid: Occupancy, field: Any, *, cells: slice = EVERYTHING, step: float = 0.5, growth: float = 0.0):
+    generator = torch.Generator().manual_seed(1)
+    grid.refresh(field, cells=cells, shortest_step=step, growth=growth, generator=generator)
+    return grid
+
+
+@pytest.fixture
+def grid() -> Occupancy:
+    return Occupancy(SIDE, torch.device("cpu"))
+
+
+def test_a_cell_is_asked_at_a_random_point_of_its_own(grid):
+    """Indexed [z, y, x]; each point lies inside its cell, and not in a corner of it."""
+    field = Ramp()
+    refreshed(grid, field)
+    x, y, z = (field.asked * SIDE).floor().to(torch.int64).T
+    assert torch.equal((z * SIDE + y) * SIDE + x, torch.arange(SIDE**3))
+    inside = field.asked * SIDE % 1
+    assert 0.4 < inside.mean() < 0.6
+    assert inside.std() > 0.2  # of a uniform one, 0.29
+    expected = field.asked @ torch.tensor([1.0, 10.0, 100.0]) * 0.5
+    torch.testing.assert_close(grid.optical_depth.view(-1), expected)
+
+
+def test_the_length_of_a_step_grows_with_the_distance_from_the_origin(grid):
+    """Closed form: growth r max(1, r), at least the shortest step; r from the origin of the training frame."""
+    field = Ramp("l2")
+    refreshed(grid, field, step=0.3, growth=0.25)
+    radius = training_points(field.asked, "l2").norm(dim=-1)
+    length = torch.where(radius > 1, 0.25 * radius**2, 0.25 * radius).clamp_min(0.3)
+    assert (radius < 1).any()
+    assert (length == 0.3).any()
+    density = field.asked @ torch.tensor([1.0, 10.0, 100.0])
+    torch.testing.assert_close(grid.optical_depth.view(-1), density * length)
+
+
+def test_cells_are_a_maximum_that_decays(grid):
+    refreshed(grid, Even(8.0))
+    for density, expected in ((0.0, 4 * DECAY), (0.0, 4 * DECAY**2), (20.0, 10.0), (1.0, 10 * DECAY)):
+        refreshed(grid, Even(density))
+        torch.testing.assert_close(grid.optical_depth, torch.full((SIDE,) * 3, expected))
+    assert 0 < DECAY < 1
+
+
+def test_only_the_chosen_cells_are_looked_at(grid):
+    refreshed(grid, Even(2.0), cells=slice(1, None, 8))
+    known = grid.optical_depth.view(-1).isfinite()
+    assert torch.equal(known.nonzero()[:, 0], torch.arange(1, SIDE**3, 8))
+    # What nobody has looked at counts as full, and what holds as much as the threshold as empty.
+    assert torch.equal(grid.above(1.0).view(-1), ~known)
+    assert grid.above(1 - 1e-6).all()
+
+
+def test_a_cell_with_nan_is_looked_into(grid):
+    refreshed(grid, Even(math.nan))
+    assert grid.above(1e9).all()
+
+
+def test_state_round_trip(grid):
+    refreshed(grid, Ramp())
+    other = Occupancy(SIDE, torch.device("cpu"))
+    other.restore(grid.state())
+    assert torch.equal(other.above(20.0), grid.above(20.0))
+    assert not other.above(20.0).all()
