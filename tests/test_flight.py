@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from examples import examples
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -47,6 +47,7 @@ def steps_of(path: np.ndarray, radian: float) -> np.ndarray:
 
 
 @given(seed=seeds, count=st.integers(2, 12))
+@example(seed=2088, count=12)  # 0.2 % too long where the length was measured at 8192 places
 @few
 def test_a_flight_passes_through_its_poses_in_order_at_constant_speed(seed, count):
     """A step is the larger one of distance and turn; none is longer, and chords of curves are hardly shorter."""

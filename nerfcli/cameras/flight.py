@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from nerfcli.cameras import rigid
 
 # Samples of the whole curve, and at least of each of its pieces, from which its length is measured; with them the speed
-# is constant to about 1e-3 where pieces are many, and to 1e-5 where they are few.
-_CURVE_SAMPLES = 8192
+# is constant to about 1e-4 where pieces are many, and to 1e-6 where they are few.
+_CURVE_SAMPLES = 32768
 _PIECE_SAMPLES = 64
 
 # What all turning counts beside all moving on the way.
