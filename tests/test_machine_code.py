@@ -1,9 +1,12 @@
 """nerfcli.kernels.numba_cpu.machine_code: compiled kernels belong to the sources as they stand."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
+from nerfcli.errors import UserError
 from nerfcli.kernels import numba_cpu
 from nerfcli.kernels.numba_cpu.machine_code import discard_outdated, folder, is_there
 
@@ -61,3 +64,13 @@ def test_it_is_looked_for_where_numba_keeps_it():
     assert is_there()
     assert list(folder().glob("visible._visible-*.nbi"))
     assert (folder() / "sources.blake2b").is_file()
+
+
+def test_no_room_for_what_is_compiled_is_told(monkeypatch):
+    def full(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(numba_cpu, "visible_samples", full)
+    with pytest.raises(UserError, match=r"compiled kernels cannot be kept in .*: No space left on device") as caught:
+        numba_cpu.warm_up()
+    assert "NUMBA_CACHE_DIR" in caught.value.hint

@@ -16,7 +16,7 @@ import pytest
 from commands import error_of, listing, nerfcli, started
 from full_disk import files_of_at_most
 
-from nerfcli import atomic, scene
+from nerfcli import atomic, kernels, scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED
 from nerfcli.exclusive import exclusive
 from nerfcli.train.run_folder import LOCK
@@ -49,6 +49,7 @@ def with_leftovers(folder: Path, before: dict[str, bytes]) -> dict[str, bytes]:
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_full_disk_is_told_and_what_was_there_is_as_it_was(name, finished, capture):
     words, size = WRITERS[name]
+    kernels.prepare(lambda text: None)  # they are written beside the program
     before = listing(capture.parent)
     with files_of_at_most(size):
         result = nerfcli(*words(capture, finished))

@@ -2,6 +2,7 @@
 
 import torch
 
+from nerfcli.errors import UserError
 from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
@@ -46,7 +47,21 @@ def is_compiled() -> bool:
 
 
 def warm_up() -> None:
-    """Run every kernel once on a ray of two samples, which compiles it or loads it from the cache."""
+    """Run every kernel once on a ray of two samples, which compiles it or loads it from the cache.
+
+    Raises:
+        UserError: what was compiled cannot be kept.
+    """
+    try:
+        _run_all()
+    except OSError as error:
+        raise UserError(
+            f"compiled kernels cannot be kept in {machine_code.folder()}: {error.strerror or error}",
+            "free space there, or say with NUMBA_CACHE_DIR=FOLDER where there is some",
+        ) from error
+
+
+def _run_all() -> None:
     offsets = torch.tensor([0, 2])
     direction, jitter = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1)
     occupied = torch.ones(2, 2, 2, dtype=torch.bool)
