@@ -99,6 +99,9 @@ def test_uncontract_is_the_inverse_of_contract_across_magnitudes():
     # The contracted radius 2 - 1/r carries r with a relative error of r * eps.
     torch.testing.assert_close(uncontract(kernels.contract(points)), points, rtol=1e-10, atol=0)
     assert torch.equal(uncontract(torch.zeros(1, 3)), torch.zeros(1, 3))
+    assert torch.equal(
+        kernels.contract(torch.tensor([[1e38, 0.0, 0.0]])), torch.tensor([[2.0, 0.0, 0.0]])
+    )  # no overflow
     assert uncontract(torch.tensor([[2.0, 2.0, 2.0]])).norm().item() == pytest.approx(1e6, rel=1e-6)
 
 

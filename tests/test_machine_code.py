@@ -67,7 +67,7 @@ def test_it_is_looked_for_where_numba_keeps_it():
 
 
 def test_no_room_for_what_is_compiled_is_told(monkeypatch):
-    def full(*arguments: object) -> None:
+    def full(*arguments: object, **named: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(numba_cpu, "visible_samples", full)
