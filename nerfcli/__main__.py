@@ -1,5 +1,23 @@
-"""`python -m nerfcli`: the program, where the command is not on the path."""
+"""Where the program starts: the command `nerfcli`, and `python -m nerfcli` where that is not on the path.
 
-from nerfcli.cli import main
+Importing what a command needs takes longer than many commands: Ctrl-C meanwhile ends as it does later, in one line.
+"""
 
-main()
+import sys
+
+from nerfcli.errors import INTERRUPTED
+
+
+def start() -> None:
+    """Run the command line."""
+    try:
+        from nerfcli.cli import main
+
+        main()
+    except KeyboardInterrupt:
+        sys.stderr.write("Interrupted; nothing was begun.\n")
+        raise SystemExit(INTERRUPTED) from None
+
+
+if __name__ == "__main__":
+    start()

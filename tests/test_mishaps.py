@@ -148,3 +148,21 @@ def test_a_scene_is_read_while_it_is_trained_on(capture):
     with exclusive(capture.with_name("new") / LOCK, "nerfcli train is at work"):
         assert len(scene.load(capture).frames) == 5
         assert nerfcli("info", capture).exit_code == 0
+
+
+def test_ctrl_c_while_the_program_is_imported_ends_in_one_line():
+    program = """
+import sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "nerfcli.cli":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupting())
+from nerfcli.__main__ import start
+start()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert ended.returncode == INTERRUPTED
+    assert ended.stderr.splitlines() == ["Interrupted; nothing was begun."]
