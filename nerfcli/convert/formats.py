@@ -211,7 +211,7 @@ FORMATS = (
     Format(
         "run",
         "the cameras of a run, refined where training refined them (read)",
-        "cameras.json and config.json of a run",
+        "cameras.json of a run",
         find_run,
         lambda path, given: parse_run(path),
         pixels=UPRIGHT,
