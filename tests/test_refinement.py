@@ -152,7 +152,10 @@ def test_bearings_of_a_changed_lens_move_as_the_derivative_says(model, seed):
         _, inside = camera.bearings(pixels)
         smooth = valid & also & inside
         difference = (ahead - behind) / (2 * step)
-        np.testing.assert_allclose(found[smooth, :, index], difference[smooth], atol=1e-6)
+        # Where a lens is about to turn back, its derivative is large and changes within the step.
+        away = np.linalg.norm(found[..., index], axis=-1)
+        smooth &= away < 3.0
+        np.testing.assert_allclose(found[smooth, :, index], difference[smooth], rtol=1e-5, atol=1e-6)
 
 
 @given(seed=seeds)
