@@ -206,6 +206,28 @@ def test_median_crossing_in_a_later_interval_and_through_a_gap():
     assert median.item() == pytest.approx(5.0 + math.log(2) - 0.2, rel=1e-14)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_gradient_of_a_median_that_lies_on_an_edge(dtype):
+    """Half of all light has ended just where the first of two equal slabs does: -1 / density by the first, 0 by the
+    second. By the smaller of place and length, and of the places in both slabs, it was a part of that."""
+    density = torch.full((2,), math.log(2), dtype=dtype, requires_grad=True)
+    starts = torch.tensor([1.0, 2.0], dtype=dtype)
+    median = depth.quantile(density, starts, starts + 1, offsets=torch.tensor([0, 2]), share=0.5)
+    (gradient,) = torch.autograd.grad(median.sum(), density)
+    assert median.item() == pytest.approx(2.0, rel=1e-6)
+    assert gradient.tolist() == pytest.approx([-1 / math.log(2), 0.0], rel=1e-6)
+
+
+def test_gradient_of_the_mean_of_a_far_thin_surface():
+    """Closed form: minus the variance of a thin interval, length^2 / 12. It is 1e8 times smaller than the distance, and
+    was the rounding of that."""
+    density = torch.tensor([0.5], requires_grad=True)
+    start, length = torch.tensor([200.0]), 2.0**-12
+    mean = depth.light_ends(density, start, start + length, offsets=torch.tensor([0, 1]), shares=()).mean
+    (gradient,) = torch.autograd.grad(mean.sum(), density)
+    assert gradient.item() == pytest.approx(-(length**2) / 12, rel=1e-3)
+
+
 def test_undefined_depths_are_nan_and_only_those():
     # Ray 0 is empty, ray 1 has opacity 0.1, ray 2 is opaque.
     offsets = torch.tensor([0, 0, 1, 2])

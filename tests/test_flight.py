@@ -140,16 +140,17 @@ def test_two_poses_are_joined_by_a_line_and_by_the_turn_about_one_axis():
 
 
 @given(seed=seeds)
+@example(seed=268435457)  # drawn without a bound, its ways were 1 : 5094, and the shorter one four steps long
 @few
 def test_a_flight_passes_a_pose_along_the_bisector(seed):
     """Closed form: with centripetal times the velocity at a pose is along the sum of the ways' unit vectors."""
     rng = np.random.default_rng(seed)
-    moves = rng.normal(size=(2, 3)) * 10.0 ** rng.uniform(-1, 1, (2, 1))
-    centres = np.stack([-moves[0], np.zeros(3), moves[1]])
-    path = fly(rigid.from_parts(np.broadcast_to(np.eye(3), (3, 3, 3)), centres), 20001)[:, :3, 3]
+    u, v = (way / np.linalg.norm(way) for way in rng.normal(size=(2, 3)))
+    before, after = 10.0 ** rng.uniform(-0.75, 0.75, 2)  # a step is at most 1/120 of the shorter way
+    centres = np.stack([-before * u, np.zeros(3), after * v])
+    path = fly(rigid.from_parts(np.broadcast_to(np.eye(3), (3, 3, 3)), centres), 4001)[:, :3, 3]
     nearest = int(np.linalg.norm(path, axis=1).argmin())
     direction = path[nearest + 1] - path[nearest - 1]
-    u, v = moves / np.linalg.norm(moves, axis=1, keepdims=True)
     bisector = (u + v) / np.linalg.norm(u + v)
     if np.linalg.norm(u + v) > 0.5:  # a sharper turn is bent too narrowly for this step
         np.testing.assert_allclose(direction / np.linalg.norm(direction), bisector, rtol=0, atol=5e-2)

@@ -1,6 +1,8 @@
 """The selftest passes here, and catches operations that are written as textbooks write them."""
 
 import json
+import math
+from dataclasses import replace
 from decimal import Decimal, getcontext
 
 import pytest
@@ -11,9 +13,9 @@ from nerfcli import cli, kernels
 from nerfcli.errors import GATE_NOT_MET
 from nerfcli.kernels import depth, numba_cpu, reference
 from nerfcli.render import sampling
-from nerfcli.selftest import depths, exact, learning, light, lookup, measure, space, suite, textbook
+from nerfcli.selftest import depths, exact, exact_depths, learning, light, lookup, measure, space, suite, textbook
 from nerfcli.selftest.measure import MET, NOT_HERE, NOT_MET, Errors, Precision, Row, by_formula, largest_error
-from nerfcli.selftest.rays import Intervals
+from nerfcli.selftest.rays import Intervals, Ray
 
 SINGLE = Precision("float32", torch.float32, "cpu")
 COMPILED = Precision("compiled", torch.float32, "cpu", compiled=True)
@@ -48,7 +50,15 @@ def test_every_kernel_has_rows_in_every_arithmetic_that_it_is_made_for(all_rows)
     depths = ("light_ends", "optical_depth_before", "mixture_quantile")
     for operation in ("composite", "distortion", "hash_encode", "pixel_rays", "visible_samples", *depths):
         assert {(operation, name) for name in ("float64", "float32", "compiled")} <= tried
-    assert {("hash_encode", "float16"), ("hash_encode", "bfloat16"), ("composite", "bfloat16")} <= tried
+    assert {("hash_encode", "float16"), ("composite", "bfloat16")} <= tried
+    assert {(operation, "bfloat16") for operation in ("hash_encode", *depths)} <= tried
+
+
+def test_a_depth_has_a_gradient_or_says_why_not(all_rows):
+    for row in all_rows:
+        if row.operation in ("light_ends", "mixture_quantile", "optical_depth_before", "line_integral"):
+            assert row.errors is not None
+            assert (row.errors.gradient is None) == bool(row.no_gradient), row
 
 
 def test_weights_by_one_minus_exp_are_caught(monkeypatch):
@@ -86,13 +96,33 @@ def test_the_spread_of_a_far_thin_surface_was_once_the_rounding_of_its_distance(
     assert [row.case for row in rows if row.case.startswith("spread")] == [
         "spread of depth, of shells and fog; 1 to 15 intervals"
     ]
+    # And the gradient of its mean was the rounding of its distance.
+    assert "mean depth, of next to no light and of none; 1 to 15 intervals" in [row.case for row in rows]
+
+
+def test_the_gradients_of_depths_are_difference_quotients_in_sixty_digits():
+    """Independent of the closed forms: (depth(density + h) - depth(density - h)) / 2 h, of the exact values."""
+    ray = Ray("slabs", [0.7, 1e-9, 2.5, 1.25], [1.0, 1.5, 2.0, 2.25], [1.5, 1.75, 2.25, 3.25])
+    answer, h = exact_depths.light_ends(ray).depths, 2.0**-16
+    for k, sigma in enumerate(ray.density):
+        if sigma < h:
+            continue
+        up, down = (
+            exact_depths.light_ends(replace(ray, density=[*ray.density[:k], sigma + s * h, *ray.density[k + 1 :]]))
+            for s in (1, -1)
+        )
+        for name, found in answer.items():
+            quotient = (up.depths[name].value - down.depths[name].value) / (2 * h)
+            defined = math.isfinite(found.value)  # what is undefined has no gradient
+            assert found.gradient[k] == pytest.approx(quotient if defined else 0.0, rel=1e-7, abs=1e-9), name
+            assert found.size[k] >= abs(found.gradient[k]) * (1 - 1e-12)
 
 
 def test_optical_depth_by_subtraction_and_half_precision_are_caught(monkeypatch):
     monkeypatch.setattr(
         reference, "optical_depth_before", lambda *given: textbook.optical_depth_before(*given[:2], offsets=given[2])
     )
-    assert failed(depths.rows((SINGLE,))) == {"optical_depth_before"}
+    assert failed(depths.rows((SINGLE,))) == {"optical_depth_before", "light_ends"}
     interpolated, pixel_rays = reference.hash_encode, reference.pixel_rays
 
     def in_half(points, table, resolutions, **sink):

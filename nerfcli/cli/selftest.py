@@ -25,6 +25,7 @@ _FORMULAS = (
     "gradient",
     "bound",
 )
+_VALUE_ONLY = "value only"
 _STYLES = {"met": "green", "not met": "bold red", "does not occur": "dim"}
 
 
@@ -111,7 +112,15 @@ def _cells(row: "Row") -> tuple[str, ...]:
     bound = "" if row.bounds is None else _number(row.bounds.value)
     milliseconds = "" if row.seconds is None else f"{1e3 * row.seconds:.1f}"
     case = row.case if row.errors else f"{row.case}: {row.reason}"
-    shown = (*_pair(row.errors), bound, row.verdict, *_pair(row.textbook), milliseconds)
+    error, gradient = _pair(row.errors)
+    shown = (
+        error,
+        _VALUE_ONLY if row.no_gradient else gradient,
+        bound,
+        row.verdict,
+        *_pair(row.textbook),
+        milliseconds,
+    )
     return (numbers, case, row.operation, row.precision, *shown)
 
 

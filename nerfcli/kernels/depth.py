@@ -16,12 +16,14 @@ from nerfcli.kernels.reference import interval_weights, optical_depth_before, ra
 
 # Below this optical depth the mean place is taken from its series, whose next term is then 5e-14.
 SERIES_BELOW = 0.25
-# The same for the variance, whose closed form loses 12 / x^2 units of precision to cancellation; next term 1e-16.
+# The same for the variance, whose closed form loses 12 / x^2 units of precision to cancellation; next term 9e-20, and
+# 3e-16 of the slope.
 VARIANCE_SERIES_BELOW = 1.0
 # (2n - 1) B_2n / (2n)! with the Bernoulli numbers B, for n = 1, 2, ...
 VARIANCE_SERIES = (
     *(1 / 12, -1 / 240, 1 / 6048, -1 / 172800, 1 / 5322240, -691 / 118879488000, 1 / 5748019200),
     *(-3617 / 711374856192000, 43867 / 300534953951232000, -174611 / 42255666457804800000),
+    *(77683 / 671480954256752640000, -236364091 / 73644527683988855193600000),
 )
 
 # Halvings of the bracket of `mixture_quantile`: to 1e-12 of the farthest sample.
@@ -118,24 +120,32 @@ def conditional(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
     return torch.where(defined, moment(weights, means, offsets) / torch.where(defined, total, 1.0), torch.nan)
 
 
-def spread(weights: Tensor, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor) -> Tensor:
-    """Standard deviation (R,) of the distance where light ends, given that it ends; NaN where none does.
+def mean_and_spread(
+    weights: Tensor, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Mean (R,) of the distance where light ends, given that it ends, and its standard deviation (R,); NaN where none
+    does.
 
-    Variance = sum_i w_i (variance_i + (mean_i - mean)^2) / sum_i w_i: around the mean, so that nothing cancels. Places
-    count from where the heaviest interval starts: a far, thin surface would be narrower than its distance's last digit.
-    Differentiable where it is defined and above 0.
+    mean = `conditional`,  variance = sum_i w_i (variance_i + (mean_i - mean)^2) / sum_i w_i: around the mean, so that
+    nothing cancels. Places count from the mean place of the heaviest interval, for the spread and for the gradients of
+    both: a far, thin surface would be narrower than its distance's last digit, and move by less with its density.
+    Differentiable where they are defined and the spread is above 0.
     """
     total, lengths, rays = sum_along_rays(weights, offsets), ends - starts, ray_indices(offsets)
     defined = total > 0
     total = torch.where(defined, total, 1.0)
-    anchors = max_weight(weights.detach(), starts.detach(), offsets)
-    places = starts - torch.where(defined, anchors, 0.0)[rays] + lengths * mean_fraction(density * lengths)
+    inside = lengths * mean_fraction(density * lengths)
+    first, further = (
+        torch.where(defined, max_weight(weights.detach(), x.detach(), offsets), 0.0)[rays] for x in (starts, inside)
+    )
+    places = (starts - first) + (inside - further)
     middle = sum_along_rays(weights * places, offsets) / total
     apart = interval_variances(density, lengths) + (places - middle[rays]).square()
     variance = sum_along_rays(weights * apart, offsets) / total
     wide = variance > 0
     root = torch.where(wide, torch.where(wide, variance, 1.0).sqrt(), 0.0)
-    return torch.where(defined, root, torch.nan)
+    mean = conditional(weights, starts + inside, offsets).detach() + (middle - middle.detach())
+    return mean, torch.where(defined, root, torch.nan)
 
 
 def max_weight(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
@@ -155,12 +165,22 @@ def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, 
     lies between 0 and 1. Differentiable where defined; the value jumps where the crossing moves over empty space.
     """
     target = -math.log1p(-share)
-    lengths = ends - starts
+    lengths, rays = ends - starts, ray_indices(offsets)
     before = optical_depth_before(density, lengths, offsets)
-    reached = before + density * lengths >= target
-    inside = (target - before) / torch.where(density > 0, density, 1.0)
-    inside = torch.minimum(inside.clamp_min(0.0), lengths)
-    return _nearest(torch.where(reached, starts + inside, torch.inf), offsets)
+    # Behind an interval is in front of the next, to the last bit: else rounding could find neither to be crossed.
+    behind = before + density * lengths
+    behind = torch.cat([torch.where(rays[1:] == rays[:-1], before[1:], behind[:-1]), behind[-1:]])
+    numbers = torch.arange(len(density), device=density.device)
+    first = torch.full((len(offsets) - 1,), len(density), device=density.device)
+    first = first.scatter_reduce(0, rays, torch.where(behind >= target, numbers, len(density)), "amin")
+    found = first < len(density)
+    crossed = first[found]
+    inside = (target - before[crossed]) / torch.where(density > 0, density, 1.0)[crossed]
+    # Rounding may lead out of a thin interval: the value stays in it, with the gradient of the crossing.
+    bounded = torch.minimum(inside, lengths[crossed])
+    places = starts[crossed] + inside + (bounded - inside).detach()
+    result = torch.full((len(offsets) - 1,), torch.nan, dtype=density.dtype, device=density.device)
+    return result.masked_scatter(found, places)
 
 
 def light_ends(
@@ -184,8 +204,7 @@ def light_ends(
     lengths = ends - starts
     weights, transmittance = interval_weights(density, lengths, offsets)
     means = interval_means(density, starts, ends)
-    mean = conditional(weights, means, offsets)
-    width = spread(weights, density, starts, ends, offsets=offsets)
+    mean, width = mean_and_spread(weights, density, starts, ends, offsets=offsets)
     total = opacity(sum_along_rays(density * lengths, offsets))
     columns = [quantile(density, starts, ends, offsets=offsets, share=share) for share in shares]
     quantiles = torch.stack(columns, dim=-1) if columns else density.new_empty(len(offsets) - 1, 0)

@@ -4,6 +4,7 @@ import itertools
 import math
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,13 +14,16 @@ from nerfcli.kernels import depth as depth_reference
 from nerfcli.kernels import reference
 from nerfcli.kernels.depth import LightEnds
 from nerfcli.render.transmission import line_integral
-from nerfcli.selftest import exact, textbook
+from nerfcli.selftest import exact, exact_depths, textbook
+from nerfcli.selftest.exact_depths import SHARES, quantile_name
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
-from nerfcli.selftest.rays import Intervals, Ray, depth_rays, even, fog, lit
+from nerfcli.selftest.rays import MEANINGLESS, Intervals, Ray, depth_rays, even, fog, lit
 
-FAR = 300.0
 # Rays of the depths are either cut a few times or finely.
 FEW = 15
+GRADIENT_BOUND = 3
+_SHARES = {quantile_name(share): share for share in SHARES}
+VALUE_ONLY = "the compiled kernel has none: where one is wanted, plain torch gives both"
 
 
 def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
@@ -28,11 +32,10 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
         yield _before_row(precision)
         if not precision.compiled:
             yield _integral_row(precision)
-        if precision.dtype != torch.bfloat16:
-            rays = [_single(ray) for ray in depth_rays()]
-            yield from _depth_rows([ray for ray in rays if len(ray.density) <= FEW], precision, cut="1 to 15")
-            yield from _depth_rows([ray for ray in rays if len(ray.density) > FEW], precision, cut="100 or 256")
-            yield _mixture_row(precision)
+        rays = [_rounded(ray, precision) for ray in depth_rays()]
+        yield from _depth_rows([ray for ray in rays if len(ray.density) <= FEW], precision, cut="1 to 15")
+        yield from _depth_rows([ray for ray in rays if len(ray.density) > FEW], precision, cut="100 or 256")
+        yield _mixture_row(precision)
 
 
 # The depths, by what is hard about them: name of the group, cases, columns.
@@ -40,48 +43,108 @@ _DEPTHS: tuple[tuple[str, tuple[int, ...], tuple[str, ...]], ...] = (
     ("opacity and transmittance from 1e-12 to opaque", (2, 3), ("opacity", "transmittance")),
     ("mean depth, of next to no light and of none", (5, 23), ("conditional",)),
     ("spread of depth, of shells and fog", (23,), ("spread",)),
-    ("median and quantiles, not reached and inside intervals", (6,), ("median", "quantile:0.05", "quantile:0.95")),
+    ("mean depth of the interval that stops most light", (5,), ("max-weight",)),
+    (
+        "median and quantiles, not reached and inside intervals (no gradient where they jump over a gap)",
+        (6,),
+        tuple(quantile_name(share) for share in SHARES),
+    ),
 )
 
 
+@dataclass(frozen=True)
+class _Measured:
+    """The largest error of a ray's depths, and what it may be."""
+
+    errors: Errors
+    bounds: Errors
+
+
 def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[Row]:
-    wanted = [exact.light_ends(ray, far=FAR) for ray in rays]
+    if precision.dtype == torch.bfloat16:
+        rays = [ray for ray in rays if _bound(ray, precision) <= MEANINGLESS]
+    if not rays:
+        return
+    wanted = [exact_depths.light_ends(ray) for ray in rays]
     density, starts, ends, offsets = _packed(rays, precision)
+    density.requires_grad_(not precision.compiled)
     module = kernels if precision.compiled else depth_reference
     start = time.perf_counter()
-    seen = module.light_ends(density, starts, ends, offsets=offsets, shares=exact.SHARES)
+    seen = _columns(module.light_ends(density, starts, ends, offsets=offsets, shares=SHARES))
+    slopes = _gradients(seen, density)
     seconds = time.perf_counter() - start
     plain = textbook.depth(density, starts, ends, offsets=offsets)
+    plain_slopes = _gradients(plain, density)
+
     for name, cases, columns in _DEPTHS:
-        allowed = [_depth_bound(*pair, precision, wide="spread" in columns) for pair in zip(rays, wanted, strict=True)]
 
         def nearest(
-            answers: dict[str, Tensor], columns: tuple[str, ...] = columns, allowed: list[float] = allowed
-        ) -> tuple[float, float]:
-            """Error and bound of the ray that comes nearest to its bound, or is farthest beyond."""
-            shown = [column for column in columns if column in answers]
-            errors = [
-                max(largest_error(answers[c][i : i + 1], [one[c]], tiny=precision.tiny) for c in shown)
-                for i, one in enumerate(wanted)
-            ]
-            ratios = [error / bound for error, bound in zip(errors, allowed, strict=True)]
-            worst = ratios.index(max(ratios))
-            return errors[worst], allowed[worst]
+            values: dict[str, Tensor], slopes: dict[str, Tensor], columns: tuple[str, ...] = columns
+        ) -> _Measured:
+            """Errors and bounds of the rays that come nearest to their bounds, or are farthest beyond."""
+            shown = [column for column in columns if column in values]
+            return _nearest(rays, wanted, columns=shown, values=values, slopes=slopes, offsets=offsets, at=precision)
 
-        error, bound = nearest(_columns(seen))
+        ours = nearest(seen, slopes)
         yield Row(
             hard_cases=cases,
             case=f"{name}; {cut} intervals",
             operation="light_ends",
             precision=precision.name,
-            errors=Errors(error),
-            bounds=Errors(bound),
-            reason="of the ray nearest to its bound: u (16 + (n + 2) (1 + tau)), of a spread times 1 + the mean, from "
-            "where most light ends, over the spread; compiled 16 u",
+            errors=ours.errors,
+            bounds=ours.bounds,
+            reason="of the ray nearest to its bound: b = u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread times "
+            "1 + the mean, from where most light ends, over the spread; of a gradient by density 3 b relative to its "
+            "terms: weights, their sum, and the sums of the backward pass",
+            no_gradient=VALUE_ONLY if precision.compiled else "",
             formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
-            textbook=None if precision.compiled else Errors(nearest({**plain, "conditional": plain["mean"]})[0]),
+            textbook=None
+            if precision.compiled or not plain.keys() & set(columns)
+            else nearest(plain, plain_slopes).errors,
             seconds=seconds,
         )
+
+
+def _nearest(
+    rays: list[Ray],
+    wanted: list[exact_depths.LightEnds],
+    *,
+    columns: list[str],
+    values: dict[str, Tensor],
+    slopes: dict[str, Tensor],
+    offsets: Tensor,
+    at: Precision,
+) -> _Measured:
+    found: list[list[tuple[float, float]]] = [[], []]
+    parts = offsets.tolist()
+    for i, (ray, answer) in enumerate(zip(rays, wanted, strict=True)):
+        for column in columns:
+            bound, depth = _bound(ray, at), answer.depths[column]
+            if column in _SHARES and not exact_depths.is_settled(ray, _SHARES[column], within=bound):
+                continue
+            if column == "spread" and depth.value > 0:
+                bound *= 1 + abs(answer.depths["conditional"].value - answer.anchor) / depth.value
+            found[0].append((largest_error(values[column][i : i + 1], [depth.value], tiny=at.tiny), bound))
+            if column in slopes and GRADIENT_BOUND * bound <= MEANINGLESS:
+                slope = slopes[column][parts[i] : parts[i + 1]]
+                error = largest_error(slope, depth.gradient, tiny=at.tiny, scale=depth.size)
+                found[1].append((error, GRADIENT_BOUND * bound))
+    value, gradient = (max(pairs, key=lambda pair: pair[0] / pair[1], default=None) for pairs in found)
+    assert value is not None
+    return _Measured(
+        Errors(value[0], gradient[0] if gradient else None), Errors(value[1], gradient[1] if gradient else None)
+    )
+
+
+def _gradients(columns: dict[str, Tensor], density: Tensor) -> dict[str, Tensor]:
+    """The gradient of the sum of each column by density, where it is asked for; what is undefined counts nothing."""
+    if not density.requires_grad:
+        return {}
+    sums = {name: torch.where(values.isnan(), 0.0, values).sum() for name, values in columns.items()}
+    return {
+        name: torch.autograd.grad(total, density, retain_graph=True)[0] if total.requires_grad else density * 0.0
+        for name, total in sums.items()
+    }
 
 
 def _packed(rays: list[Ray], precision: Precision) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -97,26 +160,25 @@ def _offsets(counts: list[int], precision: Precision) -> Tensor:
     return torch.tensor([0, *itertools.accumulate(counts)], device=precision.device)
 
 
-def _depth_bound(ray: Ray, answer: dict[str, float], precision: Precision, *, wide: bool) -> float:
+def _bound(ray: Ray, precision: Precision) -> float:
+    """The largest relative error of a value along a ray; see `_depth_rows`."""
     if precision.compiled:
         return 16 * precision.unit
     lengths = tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True))
     samples, depth = lit([Intervals(tuple(ray.density), lengths)], precision)
-    bound = precision.unit * (16 + (samples + 2) * (1 + depth))
-    if wide and answer["spread"] > 0:
-        bound *= 1 + abs(answer["conditional"] - answer["anchor"]) / answer["spread"]
-    return bound
+    return precision.unit * (16 + (samples + 2) * (1 + depth))
 
 
 def _columns(seen: LightEnds) -> dict[str, Tensor]:
     named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
-    named |= {"conditional": seen.mean, "median": seen.quantiles[:, 0]}
-    return named | {f"quantile:{share:g}": seen.quantiles[:, i] for i, share in enumerate(exact.SHARES) if i}
+    named |= {"conditional": seen.mean, "max-weight": seen.heaviest}
+    return named | {quantile_name(share): seen.quantiles[:, i] for i, share in enumerate(SHARES)}
 
 
-def _single(ray: Ray) -> Ray:
-    """The ray with the numbers that float32 holds."""
-    columns = (torch.tensor(v, dtype=torch.float32).tolist() for v in (ray.density, ray.starts, ray.ends))
+def _rounded(ray: Ray, precision: Precision) -> Ray:
+    """The ray with the numbers that both float32 and the precision hold."""
+    dtype = torch.bfloat16 if precision.dtype == torch.bfloat16 else torch.float32
+    columns = (torch.tensor(v, dtype=dtype).double().tolist() for v in (ray.density, ray.starts, ray.ends))
     return Ray(ray.name, *columns)
 
 
@@ -133,7 +195,7 @@ _PIXEL_SHARES = (0.04, 0.25, 0.75)
 
 def _mixture_row(precision: Precision) -> Row:
     """Quantiles of the light of two rays together; no share lies where the light of one has ended and none begins."""
-    rays = [_single(ray) for pixel in _PIXELS for ray in pixel]
+    rays = [_rounded(ray, precision) for pixel in _PIXELS for ray in pixel]
     density, starts, ends, offsets = _packed(rays, precision)
     module = kernels if precision.compiled else depth_reference
     got, means, wanted = [], [], []
@@ -152,6 +214,7 @@ def _mixture_row(precision: Precision) -> Row:
         operation="mixture_quantile",
         precision=precision.name,
         errors=Errors(largest_error(torch.cat(got), wanted, tiny=precision.tiny)),
+        no_gradient="found by bisection",
         bounds=Errors(4 * precision.unit + 2.0**-depth_reference.BISECTIONS * _farthest(rays, wanted)),
         reason="4 u, and the last bracket of the bisection over the smallest answer",
         formula="mean of the rays' quantiles",
@@ -180,25 +243,50 @@ def _flat(rays: list[Intervals], precision: Precision) -> tuple[Tensor, Tensor, 
     return density, lengths, _offsets([len(ray.density) for ray in rays], precision)
 
 
+def _by_density(answers: Tensor, density: Tensor, upstream: list[float]) -> Tensor | None:
+    """The gradient of a weighted sum of answers, where one is asked for."""
+    if not density.requires_grad:
+        return None
+    (gradient,) = torch.autograd.grad(answers, density, grad_outputs=torch.tensor(upstream).to(answers))
+    return gradient
+
+
 def _before_row(precision: Precision) -> Row:
     rays = _thick_and_thin(precision)
     wanted = [x for ray in rays for x in exact.optical_depths(ray)[:-1]]
+    upstream = [(k % 3 + 1) / 4 for ray in rays for k in range(len(ray.density))]
     density, lengths, offsets = _flat(rays, precision)
+    density.requires_grad_(not precision.compiled)
     module = kernels if precision.compiled else reference
     start = time.perf_counter()
     got = module.optical_depth_before(density, lengths, offsets)
+    slope = _by_density(got, density, upstream)
     seconds = time.perf_counter() - start
     plain = textbook.optical_depth_before(density, lengths, offsets=offsets)
+    slopes = [
+        length * sum((j % 3 + 1) / 4 for j in range(k + 1, len(ray.lengths)))
+        for ray in rays
+        for k, length in enumerate(ray.lengths)
+    ]
+
+    def errors(values: Tensor, slope: Tensor | None) -> Errors:
+        tiny = precision.tiny
+        return Errors(
+            largest_error(values, wanted, tiny=tiny), None if slope is None else largest_error(slope, slopes, tiny=tiny)
+        )
+
+    bound = precision.unit * (2 if precision.compiled else max(len(ray.density) for ray in rays) + 1)
     return Row(
         hard_cases=(3, 4),
         case="optical depth in front of an interval that is 1e11 times as thick, 1 to 4096",
         operation="optical_depth_before",
         precision=precision.name,
-        errors=Errors(largest_error(got, wanted, tiny=precision.tiny)),
-        bounds=Errors(precision.unit * (2 if precision.compiled else max(len(ray.density) for ray in rays) + 1)),
+        errors=errors(got, slope),
+        bounds=Errors(bound, None if precision.compiled else bound),
         reason="(n + 1) u: sums of n terms that are all positive; compiled 2 u: sums in float64",
+        no_gradient=VALUE_ONLY if precision.compiled else "",
         formula="cumulative sum less the own part",
-        textbook=None if precision.compiled else Errors(largest_error(plain, wanted, tiny=precision.tiny)),
+        textbook=None if precision.compiled else errors(plain, _by_density(plain, density, upstream)),
         seconds=seconds,
     )
 
@@ -208,19 +296,27 @@ def _integral_row(precision: Precision) -> Row:
     rays = _thick_and_thin(precision)
     wanted = [exact.optical_depths(ray)[-1] for ray in rays]
     attenuation, lengths, offsets = _flat(rays, precision)
+    attenuation.requires_grad_()
     start = time.perf_counter()
     got = line_integral(attenuation, lengths, offsets)
+    slope = _by_density(got, attenuation, [1.0] * len(rays))
     seconds = time.perf_counter() - start
     plain = textbook.line_integral(attenuation, lengths, offsets=offsets)
+
+    def errors(values: Tensor, slope: Tensor | None) -> Errors:
+        slopes = [length for ray in rays for length in ray.lengths]
+        tiny = precision.tiny
+        return Errors(largest_error(values, wanted, tiny=tiny), largest_error(slope, slopes, tiny=tiny))
+
     return Row(
         hard_cases=(2, 3),
         case="line integral of what lets all or nothing pass, 0 to 4096 intervals",
         operation="line_integral",
         precision=precision.name,
-        errors=Errors(largest_error(got, wanted, tiny=precision.tiny)),
-        bounds=Errors(precision.unit * (max(len(ray.density) for ray in rays) + 1)),
-        reason="(n + 1) u: sums of n terms that are all positive",
+        errors=errors(got, slope),
+        bounds=Errors(precision.unit * (max(len(ray.density) for ray in rays) + 1), precision.unit),
+        reason="(n + 1) u: sums of n terms that are all positive; the gradient is the length",
         formula="-log of the product of what each interval lets pass",
-        textbook=Errors(largest_error(plain, wanted, tiny=precision.tiny)),
+        textbook=errors(plain, _by_density(plain, attenuation, [1.0] * len(rays))),
         seconds=seconds,
     )

@@ -8,7 +8,6 @@ from itertools import accumulate
 from nerfcli.selftest.rays import Intervals, Ray
 
 DIGITS = 60
-SHARES = (0.5, 0.05, 0.95)
 
 
 @dataclass(frozen=True)
@@ -126,50 +125,3 @@ def distortion(weights: list[float], starts: list[float], ends: list[float]) -> 
         value = sum((wi * (a + wi * n / 3) for wi, a, n in zip(w, apart, lengths, strict=True)), Decimal(0))
         gradient = [float(2 * (a + wi * n / 3)) for wi, a, n in zip(w, apart, lengths, strict=True)]
         return float(value), gradient
-
-
-def light_ends(ray: Ray, *, far: float) -> dict[str, float]:
-    """Every depth of a ray and what goes with it, by the definitions of `render.depth`.
-
-    Args:
-        ray: its numbers are taken as they are.
-        far: the background's distance.
-
-    Returns:
-        opacity, transmittance, moment, background, conditional, spread, max-weight, median and the quantiles of
-        `SHARES`; NaN where undefined. anchor: where the interval starts in which most light ends.
-    """
-    with localcontext() as context:
-        context.prec = DIGITS
-        tau, moment, mass, samples = Decimal(0), Decimal(0), Decimal(0), []
-        quantiles = dict.fromkeys(SHARES, Decimal("nan"))
-        columns = (map(Decimal, values) for values in (ray.density, ray.starts, ray.ends))
-        for sigma, start, end in zip(*columns, strict=True):
-            length, own = end - start, sigma * (end - start)
-            weight = (-tau).exp() * (1 - (-own).exp())
-            if own > 0:
-                # Below this, sixty digits are not enough for the closed forms; their series then has one term.
-                tiny = own < Decimal("1e-15")
-                mean = start + (length / 2 - own * length / 12 if tiny else 1 / sigma - length / (own.exp() - 1))
-                wide = length**2 / 12 if tiny else 1 / sigma**2 - length**2 * own.exp() / (own.exp() - 1) ** 2
-                samples.append((weight, mean, wide, start))
-                moment, mass = moment + weight * mean, mass + weight
-            for share in SHARES:
-                target = -(1 - Decimal(share)).ln()
-                if quantiles[share].is_nan() and tau + own >= target:
-                    quantiles[share] = start + (target - tau) / sigma
-            tau += own
-        left = (-tau).exp()
-        values: dict[str, Decimal] = {"opacity": 1 - left, "transmittance": left, "moment": moment}
-        values["background"] = moment + left * Decimal(far)
-        middle = moment / mass if mass else Decimal("nan")
-        values["conditional"] = middle
-        values["spread"] = (
-            (sum(w * (v + (m - middle) ** 2) for w, m, v, _ in samples) / mass).sqrt() if mass else Decimal("nan")
-        )
-        heaviest = max((w for w, *_ in samples), default=Decimal(0))
-        # Equal weights are told apart by rounding alone; then the nearest counts.
-        near = [(m, s) for w, m, _, s in samples if w >= heaviest * (1 - Decimal("1e-15"))]
-        values["max-weight"], values["anchor"] = near[0] if near else (Decimal("nan"), Decimal("nan"))
-        values |= {"median": quantiles[0.5], "quantile:0.05": quantiles[0.05], "quantile:0.95": quantiles[0.95]}
-        return {name: float(value) for name, value in values.items()}

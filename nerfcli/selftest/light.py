@@ -14,12 +14,10 @@ from nerfcli.kernels import reference
 from nerfcli.selftest import exact, textbook
 from nerfcli.selftest.exact import Composited
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
-from nerfcli.selftest.rays import Group, Intervals, groups, lit
+from nerfcli.selftest.rays import MEANINGLESS, Group, Intervals, groups, lit
 
 # In bfloat16 a sum of more terms than this has no digits left.
 MOST_IN_BFLOAT16 = 16
-# A bound above this says nothing: bfloat16 has no digit of exp(-tau) for tau above 100.
-MEANINGLESS = 0.25
 BACKGROUND = [1.0, 0.5, 0.25]
 COLOUR_GRADIENT = [1.0, 0.5, 0.25]
 TRANSMITTANCE_GRADIENT = 0.5

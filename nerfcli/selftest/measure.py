@@ -64,6 +64,7 @@ class Row:
         formula: what textbooks do; "" where there is none.
         textbook: its errors on the same numbers; None also for the compiled kernels, whose float32 has its own row.
         seconds: one run of the operation, forward and backward.
+        no_gradient: why an operation that others take the gradient of has none here.
     """
 
     hard_cases: tuple[int, ...]
@@ -76,6 +77,7 @@ class Row:
     formula: str = ""
     textbook: Errors | None = None
     seconds: float | None = None
+    no_gradient: str = ""
 
     @property
     def verdict(self) -> str:

@@ -13,6 +13,8 @@ from nerfcli.selftest.measure import Precision
 
 # The largest number of bfloat16, which float32 holds too.
 LARGEST = 3.3895313892515355e38
+# A bound above this says nothing: bfloat16 has no digit of exp(-tau) for tau above 100.
+MEANINGLESS = 0.25
 
 
 @dataclass(frozen=True)

@@ -34,13 +34,15 @@ def _weights(density: Tensor, lengths: Tensor) -> Tensor:
 def depth(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor) -> dict[str, Tensor]:
     """Means and quantiles at midpoints, the sum of weights clamped: sum w m / max(sum w, 1e-10)."""
     weights = _weights_of_all(density, ends - starts, offsets)
-    answers: dict[str, list[Tensor]] = {name: [] for name in ("opacity", "transmittance", "mean", "spread", "median")}
+    answers: dict[str, list[Tensor]] = {
+        name: [] for name in ("opacity", "transmittance", "conditional", "spread", "median")
+    }
     for w, m in _split(offsets, weights, (starts + ends) / 2):
         total = w.sum()
         mean = (w * m).sum() / total.clamp_min(EPS)
         answers["opacity"].append(total)
         answers["transmittance"].append(1.0 - total)
-        answers["mean"].append(mean)
+        answers["conditional"].append(mean)
         answers["spread"].append(((w * m * m).sum() / total.clamp_min(EPS) - mean * mean).sqrt())
         crossing = (w.cumsum(0) < 0.5).sum().clamp_max(max(0, len(w) - 1))
         answers["median"].append(m[crossing] if len(w) else torch.zeros_like(mean))

@@ -1,0 +1,214 @@
+"""Where the light of a ray ends and how that changes with each density, in 60 decimal digits, by the definitions.
+
+Letters: interval k has the density sigma_k, the length L_k, the weight w_k, the mean place m_k with the variance v_k;
+x = sigma_k L_k; T_k is what passes the first k intervals, W the sum of all weights.
+"""
+
+from dataclasses import dataclass
+from decimal import Decimal, localcontext
+from itertools import pairwise
+
+from nerfcli.selftest.exact import DIGITS
+from nerfcli.selftest.rays import Ray
+
+SHARES = (0.5, 0.05, 0.95)
+# Below these, sixty digits are not enough for the closed forms: of mean and variance, and of the variance's slope.
+_THIN, _THIN_SLOPE = Decimal("1e-15"), Decimal("1e-6")
+# From here on kernels use the closed forms, whose parts are of these sizes: 1 / x^2 for a mean, 2 / x^3 for a variance.
+_CLOSED_MEAN, _CLOSED_VARIANCE = Decimal("0.25"), Decimal(1)
+
+
+@dataclass(frozen=True)
+class Depth:
+    """A depth of a ray, or what goes with it.
+
+    Args:
+        value: NaN where undefined.
+        gradient: by the density of each interval; zeros where the value is undefined.
+        size: the same sums with absolute values, of places counted from where most light ends: what their rounding is
+            proportional to.
+    """
+
+    value: float
+    gradient: list[float]
+    size: list[float]
+
+
+@dataclass(frozen=True)
+class LightEnds:
+    """All depths of a ray by their names, and where the light is.
+
+    Args:
+        depths: opacity, transmittance, conditional, spread, max-weight, median and the quantiles of `SHARES`.
+        anchor: where the interval starts in which most light ends; NaN without light.
+    """
+
+    depths: dict[str, Depth]
+    anchor: float
+
+
+@dataclass(frozen=True)
+class _Interval:
+    sigma: Decimal
+    start: Decimal
+    length: Decimal
+    before: Decimal
+    weight: Decimal
+    passed: Decimal
+    mean: Decimal
+    variance: Decimal
+
+    @property
+    def depth(self) -> Decimal:
+        return self.sigma * self.length
+
+
+def light_ends(ray: Ray) -> LightEnds:
+    """Every depth of a ray and its gradient; the numbers of the ray are taken as they are."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        intervals = _intervals(ray)
+        tau = sum((one.depth for one in intervals), Decimal(0))
+        left = (-tau).exp()
+        slopes = [one.length * left for one in intervals]
+        depths = {"opacity": _depth(1 - left, slopes, slopes)}
+        depths["transmittance"] = _depth(left, [-x for x in slopes], slopes)
+        mass = sum((one.weight for one in intervals), Decimal(0))
+        heaviest = max((one.weight for one in intervals), default=Decimal(0))
+        # Equal weights are told apart by rounding alone; then the nearest counts.
+        near = [k for k, one in enumerate(intervals) if one.weight > 0 and one.weight >= heaviest * (1 - _THIN)]
+        if mass:
+            depths |= _moments(intervals, mass, intervals[near[0]].mean)
+            one = intervals[near[0]]
+            slopes = [-one.variance if k == near[0] else Decimal(0) for k in range(len(intervals))]
+            sizes = [_mean_slope_size(one) if k == near[0] else Decimal(0) for k in range(len(intervals))]
+            depths["max-weight"] = _depth(one.mean, slopes, sizes)
+        else:
+            depths |= dict.fromkeys(("conditional", "spread", "max-weight"), _undefined(ray))
+        depths |= {quantile_name(share): _quantile(ray, intervals, _target(share)) for share in SHARES}
+        return LightEnds(depths, float(intervals[near[0]].start) if near else float("nan"))
+
+
+def quantile_name(share: float) -> str:
+    """What the depth is called that counts a share of all light."""
+    return "median" if share == 0.5 else f"quantile:{share:g}"
+
+
+def is_settled(ray: Ray, share: float, *, within: float) -> bool:
+    """Whether a relative error of optical depths leaves a quantile where it is; one that lies beside a gap, a denser
+    interval or the end of all light jumps there."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        intervals, target = _intervals(ray), _target(share)
+        least, most = (_crossed(intervals, target * (1 + Decimal(x))) for x in (-within, within))
+        if least is None or most is None:
+            return least is most
+        gapless = all(a.start + a.length == b.start for a, b in pairwise(intervals[least : most + 1]))
+        return gapless and len({one.sigma for one in intervals[least : most + 1]}) == 1
+
+
+def _intervals(ray: Ray) -> list[_Interval]:
+    tau, found = Decimal(0), []
+    for sigma, start, end in zip(
+        *(map(Decimal, values) for values in (ray.density, ray.starts, ray.ends)), strict=True
+    ):
+        length = end - start
+        own = sigma * length
+        if own < _THIN:
+            mean, variance = start + length / 2 - own * length / 12, length**2 / 12
+        else:
+            mean = start + 1 / sigma - length / (own.exp() - 1)
+            variance = 1 / sigma**2 - length**2 * own.exp() / (own.exp() - 1) ** 2
+        passing, through = (-tau).exp(), (-own).exp()
+        found.append(_Interval(sigma, start, length, tau, passing * (1 - through), passing * through, mean, variance))
+        tau += own
+    return found
+
+
+def _moments(intervals: list[_Interval], mass: Decimal, place: Decimal) -> dict[str, Depth]:
+    """Mean m and spread S, with d w_i / d sigma_k = L_k (T_(k+1) for i = k, -w_i for i > k) and d m_k = -v_k.
+
+    d m / d sigma_k = sum_i d w_i (m_i - m) / W - w_k v_k / W
+    d S^2 / d sigma_k = sum_i d w_i (v_i + (m_i - m)^2 - S^2) / W + w_k (d v_k - 2 (m_k - m) v_k) / W
+    """
+    mean = sum((one.weight * one.mean for one in intervals), Decimal(0)) / mass
+    squares = [one.variance + (one.mean - mean) ** 2 for one in intervals]
+    variance = sum((one.weight * q for one, q in zip(intervals, squares, strict=True)), Decimal(0)) / mass
+    spread = variance.sqrt()
+    away = sum((one.weight * abs(one.mean - place) for one in intervals), Decimal(0)) / mass
+    reach = [abs(one.mean - place) + away for one in intervals]
+    by_mean = _by_weights(intervals, [one.mean - mean for one in intervals])
+    mean_size = _by_weights(intervals, reach, absolute=True)
+    by_square = _by_weights(intervals, [q - variance for q in squares])
+    wide = [one.variance + r * r + variance for one, r in zip(intervals, reach, strict=True)]
+    square_size = _by_weights(intervals, wide, absolute=True)
+    slopes, sizes, of_spread, spread_sizes = [], [], [], []
+    for k, one in enumerate(intervals):
+        slopes.append((by_mean[k] - one.weight * one.variance) / mass)
+        sizes.append((mean_size[k] + one.weight * _mean_slope_size(one)) / mass)
+        own = _variance_slope(one) - 2 * (one.mean - mean) * one.variance
+        own_size = _variance_slope_size(one) + 2 * reach[k] * _mean_slope_size(one)
+        of_spread.append((by_square[k] + one.weight * own) / mass / (2 * spread))
+        spread_sizes.append(((square_size[k] + one.weight * own_size) / mass + 2 * away * sizes[k]) / (2 * spread))
+    return {"conditional": _depth(mean, slopes, sizes), "spread": _depth(spread, of_spread, spread_sizes)}
+
+
+def _by_weights(intervals: list[_Interval], values: list[Decimal], *, absolute: bool = False) -> list[Decimal]:
+    """sum_i values_i d w_i / d sigma_k for each k, or the sum of the terms' sizes."""
+    behind, found = Decimal(0), []
+    for one, value in zip(reversed(intervals), reversed(values), strict=True):
+        found.append(one.length * (one.passed * value + (behind if absolute else -behind)))
+        behind += one.weight * value
+    return found[::-1]
+
+
+def _mean_slope_size(one: _Interval) -> Decimal:
+    """Of d m_k / d sigma_k = -v_k, whose closed form is a difference of parts of the size 1 / x^2."""
+    return one.variance if one.depth < _CLOSED_MEAN else (one.length / one.depth) ** 2
+
+
+def _variance_slope(one: _Interval) -> Decimal:
+    """d v_k / d sigma_k = L^3 h'(x), h' = -2 / x^3 + e^-x (1 + e^-x) / (1 - e^-x)^3 = -x / 120 + x^3 / 1512 - ..."""
+    x = one.depth
+    if x < _THIN_SLOPE:
+        return one.length**3 * (x**3 / 1512 - x / 120)
+    falling = (-x).exp()
+    return one.length**3 * (falling * (1 + falling) / (1 - falling) ** 3 - 2 / x**3)
+
+
+def _variance_slope_size(one: _Interval) -> Decimal:
+    slope = abs(_variance_slope(one))
+    return slope if one.depth < _CLOSED_VARIANCE else 2 * (one.length / one.depth) ** 3
+
+
+def _quantile(ray: Ray, intervals: list[_Interval], target: Decimal) -> Depth:
+    """t = start + (target - tau) / sigma in the interval k where it is crossed: nothing behind k counts."""
+    k = _crossed(intervals, target)
+    if k is None:
+        return _undefined(ray)
+    one = intervals[k]
+    inside = (target - one.before) / one.sigma
+    before = [earlier.length / one.sigma for earlier in intervals[:k]]
+    none = [Decimal(0)] * (len(intervals) - k - 1)
+    size = (target + one.before) / one.sigma**2
+    slopes = [*(-x for x in before), -inside / one.sigma, *none]
+    return _depth(one.start + inside, slopes, [*before, size, *none])
+
+
+def _target(share: float) -> Decimal:
+    """The optical depth at which the share of all light has ended."""
+    return -(1 - Decimal(share)).ln()
+
+
+def _crossed(intervals: list[_Interval], target: Decimal) -> int | None:
+    """The interval in which an optical depth is reached."""
+    return next((k for k, one in enumerate(intervals) if one.before + one.depth >= target), None)
+
+
+def _depth(value: Decimal, gradient: list[Decimal], size: list[Decimal]) -> Depth:
+    return Depth(float(value), [float(x) for x in gradient], [float(x) for x in size])
+
+
+def _undefined(ray: Ray) -> Depth:
+    zeros = [0.0] * len(ray.density)
+    return Depth(float("nan"), zeros, zeros)
