@@ -393,8 +393,8 @@ GROUPS: tuple[Group, ...] = (
     ),
     Group(
         "kernels/contraction.py",
-        ("tests/test_numba_kernels.py", "tests/test_field.py"),
-        "width or visible or detail",
+        ("tests/test_reference_kernels.py", "tests/test_numba_kernels.py", "tests/test_field.py"),
+        "width or visible",
         (),
         (
             Mutant("return widths / 2.0\n", "return widths / 4.0\n"),
