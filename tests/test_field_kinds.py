@@ -19,6 +19,7 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.kernels import marching
 from nerfcli.render.model import Marching, Model, load_model, save_model
 from nerfcli.train.optimiser import FieldOptimiser
 
@@ -189,6 +190,16 @@ def test_visible_samples_are_the_definition(kind, contraction):
         density, rgb = field.radiance(samples.coordinates, directions, rays)
         torch.testing.assert_close(samples.density, density, rtol=1e-4, atol=0)
         torch.testing.assert_close(field.colour_of_code(samples.code, directions, rays), rgb, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("module", [kernels, marching])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_samples_are_lit_up_to_the_one_behind_which_it_is_dark(module, dtype):
+    """By hand: optical depths 0, 2, 4 and 6 in front of four intervals, 0 and 8 of two, and a ray without."""
+    density = torch.tensor([4.0, 4.0, 4.0, 4.0, 16.0, 1.0], dtype=dtype)
+    lit, offsets = module.lit_samples(density, torch.full_like(density, 0.5), torch.tensor([0, 4, 4, 6]), deepest=5.0)
+    assert lit.tolist() == [True, True, True, False, True, False]
+    assert offsets.tolist() == [0, 3, 3, 4]
 
 
 @pytest.mark.parametrize("sizes", [(0, 9), (1, 9), (5, 3), (123, 40)])
