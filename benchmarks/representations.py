@@ -66,7 +66,7 @@ class Capture:
         photos = load_photos(capture.train_frames, factor=factor, threads=threads)
         fills_frame = any(photo.pixels.shape[-1] == 3 for photo in photos)
         settings = TrainSettings(threads=threads)
-        self.extent = choose_extent(capture, photos, settings, fills_frame=fills_frame, notify=print)
+        self.extent = choose_extent(capture, settings, fills_frame=fills_frame)
         self.similarity = self.extent.training_from_scene
         self.pool = PixelPool(photos, self.similarity, torch.device("cpu"))
         self.test_photos = load_photos(capture.test_frames, factor=factor, threads=threads)

@@ -33,6 +33,11 @@ NEEDED: dict[str, dict[str, object]] = {
     "unbounded": {"background": "sphere"},
     "glossy": {},
     "alpha": {},
+    "poses": {"cameras": "poses"},
+    "focal": {"cameras": "focal"},
+    "desk": {},
+    "poses-balls": {"cameras": "poses"},
+    "focal-balls": {"cameras": "focal"},
 }
 NEEDS_VIEW = ("glossy",)
 SEARCH_STEPS = 1000

@@ -36,7 +36,7 @@ def trained(folder: Path, seconds: float, threads: int) -> Fitting:
         budget_seconds=seconds, threads=threads, first_samples_per_step=TrainSettings.samples_per_step
     )
     fills_frame = any(photo.pixels.shape[-1] == 3 for photo in photos)
-    extent = choose_extent(capture, photos, settings, fills_frame=fills_frame, notify=print)
+    extent = choose_extent(capture, settings, fills_frame=fills_frame)
     pool = PixelPool(photos, extent.training_from_scene, torch.device("cpu"))
     fitting = Fitting(pool, extent.marching, contraction=extent.contraction, settings=settings)
     began = time.perf_counter()

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,14 +10,34 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nerfcli.train.camera_check import CameraCheck
 from nerfcli.train.components import Components
-from nerfcli.train.judgement import FLOOR, LEAST_GAIN_DB, MOST_LOSS_DB, Decision, judge_one, judge_removal
-from nerfcli.train.race import NO_TIME
-from nerfcli.train.selection import Facts, decisions_in_words, is_worth_a_search, proposals, removals, select
+from nerfcli.train.judgement import (
+    CLEAR_ERRORS,
+    FLOOR,
+    LEAST_GAIN_DB,
+    MOST_LOSS_DB,
+    SEED_DB,
+    Decision,
+    judge_one,
+    judge_removal,
+)
+from nerfcli.train.race import NO_TIME, ONCE
+from nerfcli.train.selection import (
+    MOST_START_STEPS,
+    Facts,
+    decisions_in_words,
+    is_worth_a_search,
+    proposals,
+    removals,
+    select,
+    with_known_focal,
+)
 from nerfcli.train.signs import Signs
 from nerfcli.train.trials import Start, Trial
 
 PHOTOS = 20
+FITTED = Facts("hash", has_alpha=False, has_exif=False, cameras_fitted=True)
 
 
 def trial(psnr: float, *, halfway: float | None = None, seconds: float = 1.0, noise_db: float = 0.0) -> Trial:
@@ -107,24 +128,32 @@ def test_time_counts_only_where_time_is_what_is_spent():
     assert judge_one(base, ("view", 3), slow, by_time=False).kept
 
 
+def test_one_seed_is_enough_only_where_the_gain_is_clear():
+    """All photos gain alike, so the error is what seeds are known to differ by: five of those and the least gain."""
+    least = LEAST_GAIN_DB + CLEAR_ERRORS * SEED_DB
+    for gain, kept in ((1.1 * least, False), (1.5 * least, True)):
+        decision = judged([trial(20.0)], [trial(20.0 + gain)])
+        assert decision.gain_db == pytest.approx(told(gain), abs=1e-9)
+        assert decision.error_db == pytest.approx(SEED_DB, abs=1e-9)
+        assert decision.kept == kept == (told(gain) > least)
+
+
 def signs(spread: float) -> Signs:
     return Signs(torch.zeros(PHOTOS, 3), spread)
 
 
 def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for():
-    facts = Facts("hash", has_alpha=False, has_exif=False)
-
     def names(facts: Facts, spread: float = 0.3) -> set[str]:
         return {name for name, _ in proposals(Components(), signs(spread), facts)[0]}
 
-    assert names(facts) == {"exposure", "background"}
-    assert names(Facts("hash", False, False, fixed=("view", "exposure"))) == {"background"}
-    assert names(Facts("hash", True, False)) == {"exposure"}
-    assert names(facts, spread=0.01) == {"background"}
-    (declined,) = proposals(Components(), signs(0.01), facts)[1]
+    assert names(FITTED) == {"exposure", "background"}
+    assert names(replace(FITTED, fixed=("view", "exposure"))) == {"background"}
+    assert names(replace(FITTED, has_alpha=True)) == {"exposure"}
+    assert names(FITTED, spread=0.01) == {"background"}
+    (declined,) = proposals(Components(), signs(0.01), replace(FITTED, fixed=("cameras",)))[1]
     assert (declined.component, declined.kept, declined.gain_db) == ("exposure", False, None)
     assert "1.0%" in declined.in_words()
-    assert ("exposure", "exif") in proposals(Components(), signs(0.0), Facts("hash", False, True))[0]
+    assert ("exposure", "exif") in proposals(Components(), signs(0.0), replace(FITTED, has_exif=True))[0]
 
 
 def test_what_is_left_out_is_nothing_that_the_user_or_the_field_decided():
@@ -137,19 +166,19 @@ def test_what_is_left_out_is_nothing_that_the_user_or_the_field_decided():
 class Scripted:
     """Trials that answer at once, with the gains in dB that a function says components have."""
 
-    def __init__(self, gain: Callable[[Components], float], *, steps: int = 400, spread: float = 0.3):
-        self.gain, self.steps, self.spread = gain, steps, spread
+    def __init__(self, gain: Callable[[Components], float], *, spread: float = 0.3):
+        self.gain, self.spread = gain, spread
         self.asked: list[tuple[Components, int, int]] = []
 
-    def begin(self, components: Components, *, steps: int | None, seconds: float | None = None) -> Start:
-        return Start({}, {}, steps or self.steps, 1.0, 20.0, signs(self.spread))
+    def begin(self, components: Components, *, steps: int, seconds: float = math.inf) -> Start:
+        return Start({}, {}, steps, 1.0, 20.0, signs(self.spread))
 
     def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:
         self.asked.append((components, seed, steps))
         return trial(20.0 + seed + self.gain(components))
 
 
-def chosen_by(scripted: Scripted, *, steps: int = 4000, facts: Facts = Facts("hash", False, False)):
+def chosen_by(scripted: Scripted, *, steps: int = 4000, facts: Facts = FITTED):
     return select(scripted, Components(), facts, seconds=None, steps=steps)  # type: ignore[arg-type]
 
 
@@ -157,7 +186,12 @@ def test_what_gains_is_in_the_model_what_does_not_is_not_and_seeds_are_paired():
     scripted = Scripted(lambda c: 0.5 * (c.background == "sphere") - 0.2 * (c.exposure == "learned"))
     chosen = chosen_by(scripted)
     assert chosen.components == Components(view=0, background="sphere")
-    assert {d.component: d.kept for d in chosen.decisions} == {"exposure": False, "view": True, "background": True}
+    assert {d.component: d.kept for d in chosen.decisions} == {
+        "exposure": False,
+        "view": True,
+        "background": True,
+        "cameras": False,
+    }
     assert {seed for _, seed, _ in scripted.asked} == {0, 1}
     assert {steps for _, _, steps in scripted.asked} == {400}  # half of a fifth of 4000
     assert decisions_in_words({"selection": chosen.to_json()}) == [d.in_words() for d in chosen.decisions]
@@ -190,18 +224,18 @@ def test_two_that_gain_beside_each_other_are_both_kept():
 
 def test_of_two_values_of_a_component_the_better_is_kept():
     gains = {"none": 0.0, "exif": 0.7, "learned": 0.5}
-    chosen = chosen_by(Scripted(lambda c: gains[c.exposure]), facts=Facts("hash", True, True))
+    chosen = chosen_by(Scripted(lambda c: gains[c.exposure]), facts=replace(FITTED, has_alpha=True, has_exif=True))
     assert chosen.components.exposure == "exif"
     assert [d.why for d in chosen.decisions if d.value == "learned"] == ["exposure=exif is better"]
 
 
 def test_what_there_was_no_time_for_stays_as_it_is():
-    """A fifth of the steps is for the start, a tenth for each of eight trials; all three changes would take nine."""
+    """A fifth of the steps is for the start, a tenth for each of eight trials: view would need another."""
     scripted = Scripted(lambda c: 0.6 * (c.exposure == "learned") + 0.4 * (c.background == "sphere"))
     chosen = chosen_by(scripted, steps=1000)
     assert len(scripted.asked) <= 8
     assert chosen.components == Components(exposure="learned", background="sphere")
-    assert {d.component: d.why for d in chosen.decisions}["view"] == NO_TIME
+    assert {d.component: d.why for d in chosen.decisions}["view"] == ONCE
 
 
 def test_too_few_steps_are_not_spent():
@@ -220,3 +254,65 @@ def test_short_trainings_are_not_searched_for():
 def test_a_decision_says_in_words_what_was_and_what_was_not_tried():
     tried = Decision("view", 3, 0.5, 0.1, 0.2, -0.02, 0.5, True, "gains")
     assert tried.in_words() == "view=3: +0.50 +- 0.10 dB, -2% time: kept, gains"
+
+
+def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
+    """Structure from motion has seen to them; matched features may say that they fit, or do not."""
+
+    def tried(facts: Facts, start: Components = Components()) -> list[object]:
+        return [value for name, value in proposals(start, signs(0.0), facts)[0] if name == "cameras"]
+
+    unknown = replace(FITTED, cameras_fitted=False)
+    assert tried(FITTED) == []
+    assert tried(unknown) == ["poses", "focal"]
+    assert tried(replace(unknown, fixed=("cameras",))) == []
+    assert tried(replace(unknown, cameras=CameraCheck(0.001, 0.001, (0.3, 0.3), 900))) == []
+    assert tried(replace(unknown, cameras=CameraCheck(0.02, 0.01, (2.3, 2.2), 900))) == ["poses"]
+    both = replace(unknown, cameras=CameraCheck(0.02, 0.001, (2.3, 1.2), 900))
+    assert tried(both, Components(cameras="focal")) == ["all"]
+
+
+@pytest.mark.parametrize(
+    ("check", "kept"),
+    [
+        (CameraCheck(-0.019, 0.0006, (0.26, 0.14), 900), True),
+        (CameraCheck(-0.019, 0.005, (0.26, 0.14), 900), False),  # not sure
+        (CameraCheck(0.045, 0.006, (0.22, 0.26), 900), False),  # sure, but nothing fits better
+        (CameraCheck(0.002, 0.0001, (0.26, 0.14), 900), False),  # next to nothing
+    ],
+)
+def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
+    facts = replace(FITTED, cameras_fitted=False, cameras=check)
+    components, log_focal, (decision,) = with_known_focal(Components(), facts)
+    assert components == Components(cameras="focal" if kept else "fixed")
+    assert log_focal == (check.log_focal if kept else 0.0)
+    assert decision.kept == kept
+    assert f"{math.expm1(check.log_focal):+.2%}" in decision.in_words()
+    assert with_known_focal(Components(), replace(facts, fixed=("cameras",))) == (Components(), 0.0, [])
+    assert with_known_focal(Components(), FITTED) == (Components(), 0.0, [])
+
+
+def test_what_is_clear_is_not_tried_again_and_what_is_surely_missed_neither():
+    """2 dB: one trial with it, one without. Without view 0.5 dB less: one trial."""
+    scripted = Scripted(lambda c: 2.0 * (c.background == "sphere") - 0.5 * (c.view == 0), spread=0.0)
+    chosen = chosen_by(scripted)
+    assert chosen.components == Components(background="sphere")
+    assert [seed for _, seed, _ in scripted.asked] == [0, 0, 0]
+
+
+def test_what_gains_once_is_not_kept_where_no_time_is_left_to_try_it_again():
+    """A fifth of the steps is for the start and a tenth for each of eight trials: one without a change, one with each
+    of five, and two more for the best."""
+    facts = replace(FITTED, has_exif=True, cameras_fitted=False)
+    scripted = Scripted(lambda c: 0.35 * (c.exposure == "exif") + 0.3 * (c.cameras == "focal"))
+    chosen = chosen_by(scripted, steps=2000, facts=facts)
+    assert len(scripted.asked) == 8
+    assert chosen.components == Components(exposure="exif")
+    assert {d.value: d.why for d in chosen.decisions if d.component == "cameras"}["focal"] == ONCE
+    assert {d.component: d.why for d in chosen.decisions}["view"] == NO_TIME
+
+
+def test_a_long_search_does_not_make_a_long_start():
+    scripted = Scripted(lambda c: 0.0)
+    chosen_by(scripted, steps=100_000)
+    assert {steps for _, _, steps in scripted.asked} == {MOST_START_STEPS // 2}

@@ -24,7 +24,7 @@ SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=
 @pytest.fixture(scope="module")
 def trials(spheres) -> Trials:
     album = load_album(spheres.train_frames, factor=4, threads=1, room=IN_MEMORY)
-    extent = choose_extent(spheres, album.photos, SETTINGS, fills_frame=False, notify=lambda text: None)
+    extent = choose_extent(spheres, SETTINGS, fills_frame=False)
     return Trials(album.photos, extent, settings=SETTINGS, exif=np.zeros(len(album.photos)), colours=album.colours)
 
 
@@ -42,6 +42,7 @@ def test_what_begins_late_changes_nothing_at_first(trials, start):
     same = trials.go_on(start, Components(view=0), seed=0, steps=0)
     assert same.psnr == pytest.approx(start.psnr, abs=1e-4)  # levels that do not learn yet are told by a step
     assert np.array_equal(trials.go_on(start, Components(view=3), seed=0, steps=0).errors, same.errors)
+    assert np.array_equal(trials.go_on(start, Components(view=0, cameras="poses"), seed=0, steps=0).errors, same.errors)
     # Of exposures that EXIF tells to be equal.
     exif = trials.go_on(start, Components(view=0, exposure="exif"), seed=0, steps=0)
     assert exif.errors == pytest.approx(same.errors, rel=1e-3)
@@ -51,6 +52,37 @@ def test_trials_with_the_same_seed_are_the_same_and_leave_their_start_alone(tria
     first, again = (trials.go_on(start, Components(view=0), seed=3, steps=4) for _ in range(2))
     assert np.array_equal(first.errors, again.errors)
     assert not np.array_equal(first.errors, trials.go_on(start, Components(view=0), seed=4, steps=4).errors)
+
+
+def test_cameras_learn_from_the_fork_on(trials, start):
+    """Before it no step moves them, however far the training; behind it one does."""
+    fitting = trials._fitting(Components(view=0, cameras="poses"), seed=0, log_gains=None, cameras_from=0.6)
+    trials._take_up(fitting, start)
+    assert fitting.parts.cameras is not None
+    assert fitting.parts.cameras.poses is not None
+    motions = fitting.parts.cameras.poses.motions
+    given = motions.clone()
+    fitting.advance(0.6)
+    assert torch.equal(motions, given)
+    fitting.advance(0.8)
+    assert not torch.equal(motions, given)
+
+
+def test_trials_see_through_the_lens_that_is_known_before(spheres):
+    """Matches say that lenses are 5 % longer: what learns them starts there, and its rays are closer together."""
+    album = load_album(spheres.train_frames, factor=4, threads=1, room=IN_MEMORY)
+    extent = choose_extent(spheres, SETTINGS, fills_frame=False)
+    exif = np.zeros(len(album.photos))
+    trials = Trials(album.photos, extent, settings=SETTINGS, exif=exif, log_focal=math.log(1.05), colours=album.colours)
+    fitting = trials._fitting(Components(cameras="focal"), seed=0, log_gains=None, cameras_from=0.0)
+    drawn = trials._pool.rays_of(torch.tensor([0, album.photos[0].pixels.shape[1] - 1]))
+
+    def width(directions: torch.Tensor) -> float:
+        axis = trials._pool.poses[0, :3, 2].to(directions)
+        across = directions / (directions @ axis)[:, None]
+        return float((across[1] - across[0]).norm())
+
+    assert width(fitting.parts.refined(drawn).directions) == pytest.approx(width(drawn.directions) / 1.05, rel=1e-5)
 
 
 def test_blocks_that_judge_are_not_learned_from(trials):

@@ -12,10 +12,11 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.scene import Scene
-from nerfcli.train.extent import Extent, choose_extent
+from nerfcli.train.extent import Extent, choose_extent, lacks_depth
+from nerfcli.train.matching import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.train.photos import Photo
 from nerfcli.train.settings import TrainSettings
-from nerfcli.train.triangulation import MOST_PHOTOS, chosen_pairs, meetings, triangulate
+from nerfcli.train.triangulation import meetings, triangulate
 
 CAMERA = Camera.pinhole(320, 240, 300.0)
 WALL_Z = 3.0
@@ -52,18 +53,19 @@ def photos() -> list[Photo]:
 
 
 def test_points_of_a_wall_lie_on_it(photos):
-    points = triangulate(photos, threads=2)
+    points = triangulate(photos, match(photos, threads=2))
     assert len(points) > 200
     z = points[:, 2]
     assert abs(np.median(z) - WALL_Z) < 0.003 * WALL_Z
     assert np.mean(np.abs(z - WALL_Z) < 0.05 * WALL_Z) > 0.95
-    assert np.array_equal(points, triangulate(photos, threads=1))
+    assert np.array_equal(points, triangulate(photos, match(photos, threads=1)))
 
 
 def test_masked_parts_of_photos_give_no_points(photos):
     left = np.zeros((240, 320), dtype=bool)
     left[:, :160] = True
-    points = triangulate([replace(photo, used=left) for photo in photos], threads=1)
+    masked = [replace(photo, used=left) for photo in photos]
+    points = triangulate(masked, match(masked, threads=1))
     assert len(points) > 20
     for photo in photos[:1]:
         pixels, _ = photo.frame.camera.project(points - photo.frame.centre)
@@ -72,16 +74,16 @@ def test_masked_parts_of_photos_give_no_points(photos):
 
 def test_the_unit_ball_follows_what_is_found(photos):
     """Cameras whose axes meet 1 before them, and a wall 3 away."""
-    notes: list[str] = []
-    extent = choose_extent(scene_of(photos), photos, SETTINGS, fills_frame=True, notify=notes.append)
+    scene = scene_of(photos)
+    assert lacks_depth(scene, SETTINGS, fills_frame=True)
+    scene = replace(scene, points=triangulate(photos, match(photos, threads=1)))
+    assert not lacks_depth(scene, SETTINGS, fills_frame=True)
+    extent = choose_extent(scene, SETTINGS, fills_frame=True)
     assert 1.8 < 1 / extent.training_from_scene.scale < 4
     assert extent.contraction == "l2"
-    assert "found in its photos" in notes[0]
     near = extent.marching.near / extent.training_from_scene.scale
     assert 0.25 * WALL_Z < near < WALL_Z
-    box = choose_extent(
-        scene_of(photos), photos, replace(SETTINGS, contraction="none"), fills_frame=True, notify=notes.append
-    )
+    box = choose_extent(scene, replace(SETTINGS, contraction="none"), fills_frame=True)
     assert box.contraction == "none"
     assert str(Extent.from_json(json.loads(json.dumps(box.to_json())))) == "bounded scene"
     assert Extent.from_json(box.to_json()).marching == box.marching
@@ -89,18 +91,23 @@ def test_the_unit_ball_follows_what_is_found(photos):
     assert np.abs(on_wall).max() < 1
 
 
+def test_depth_bounds_tell_enough_but_where_a_box_is_asked_for(photos):
+    bounded = replace(scene_of(photos), depth_bounds=np.array([[1.0, 4.0]] * len(photos)))
+    assert not lacks_depth(bounded, SETTINGS, fills_frame=True)
+    assert lacks_depth(bounded, replace(SETTINGS, contraction="none"), fills_frame=True)
+    assert not lacks_depth(scene_of(photos), SETTINGS, fills_frame=False)  # an object in alpha
+
+
 def test_nothing_is_found_in_photos_without_detail(photos):
     grey = [replace(photo, pixels=np.full_like(photo.pixels, 128)) for photo in photos]
-    assert triangulate(grey, threads=1).shape == (0, 3)
-    notes: list[str] = []
-    extent = choose_extent(scene_of(grey), grey, SETTINGS, fills_frame=True, notify=notes.append)
+    assert triangulate(grey, match(grey, threads=1)).shape == (0, 3)
+    extent = choose_extent(scene_of(grey), SETTINGS, fills_frame=True)
     assert np.isfinite(extent.training_from_scene.scale)
-    assert notes[0].startswith("the scene came without points; 0 found")
 
 
 def test_photos_of_one_place_have_no_pairs(photos):
     assert chosen_pairs([photos[0]] * 4) == []
-    assert triangulate([photos[0]] * 4, threads=1).shape == (0, 3)
+    assert match([photos[0]] * 4, threads=1) == ()
     assert chosen_pairs(photos[:1]) == []
 
 

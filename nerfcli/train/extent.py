@@ -1,6 +1,5 @@
 """What of space a field covers, and how: chosen for a scene before anything is learned."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,9 +10,7 @@ from nerfcli.render.model import Marching
 from nerfcli.scene import Scene
 from nerfcli.train.components import LEARNED_BACKGROUNDS
 from nerfcli.train.normalisation import box_frame, contracted_frame, object_frame
-from nerfcli.train.photos import Photo
 from nerfcli.train.settings import TrainSettings
-from nerfcli.train.triangulation import triangulate
 
 # What is infinitely far begins behind so many radii of the unit ball: what is nearer moves from photo to photo.
 BALLS_BEFORE_BACKGROUND = 1.5
@@ -66,34 +63,40 @@ class Extent:
         return replace(self, marching=replace(self.marching, far=min(self.marching.far, self.reach)))
 
 
-def choose_extent(
-    scene: Scene,
-    photos: Sequence[Photo],
-    settings: TrainSettings,
-    *,
-    fills_frame: bool,
-    notify: Callable[[str], None],
-) -> Extent:
-    """The extent that the settings ask for.
+def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> bool:
+    """Whether nothing tells how far away surfaces are, and a field with these settings has to know: then points have to
+    be found first.
 
     Args:
         scene: cameras, and points or depth bounds where it has them.
-        photos: those of training; where the scene tells nothing of depth, points are found in them.
         settings: of the training.
         fills_frame: whether there is more in the photos than an object cut out by alpha.
-        notify: takes a line for the user where points had to be found.
+    """
+    contraction = _contraction(settings, fills_frame)
+    is_object = contraction == "none" and not fills_frame
+    return not is_object and len(scene.points) == 0 and (scene.depth_bounds is None or contraction == "none")
+
+
+def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> Extent:
+    """The extent that the settings ask for.
+
+    Args:
+        scene: cameras, and points or depth bounds; see `lacks_depth`.
+        settings: of the training.
+        fills_frame: whether there is more in the photos than an object cut out by alpha.
 
     Raises:
         UserError: no contraction is asked for, and there are too few points to see where the scene ends.
     """
-    contraction = settings.contraction or ("l2" if fills_frame else "none")
+    contraction = _contraction(settings, fills_frame)
     if contraction == "none" and not fills_frame:
         return Extent(contraction, *object_frame(scene))
-    if len(scene.points) == 0 and (scene.depth_bounds is None or contraction == "none"):
-        scene = replace(scene, points=triangulate(photos, threads=settings.threads))
-        notify(f"the scene came without points; {len(scene.points)} found in its photos tell how far it reaches")
     if contraction == "none":
         return Extent(contraction, *box_frame(scene))
     similarity, marching = contracted_frame(scene)
     farthest = max(float(np.linalg.norm(similarity.apply(frame.centre))) for frame in scene.frames)
     return Extent(contraction, similarity, marching, farthest + BALLS_BEFORE_BACKGROUND)
+
+
+def _contraction(settings: TrainSettings, fills_frame: bool) -> str:
+    return settings.contraction or ("l2" if fills_frame else "none")

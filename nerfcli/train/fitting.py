@@ -67,7 +67,17 @@ class StepResult:
 class Fitting:
     """The state of a training. Same seed, threads and device give the same numbers, step for step.
 
-    The field has the given size, else the one that `sizes.chosen_size` gives for the settings and the pool.
+    Args:
+        pool: the training photos.
+        marching: the steps along rays.
+        contraction: of the field.
+        settings: of the training.
+        log_gains: (photos, 3) logarithms of their exposures to start from.
+        log_focal: logarithm of the factor of focal lengths to start from, where these learn.
+        cameras_from: the share of the budget from which on cameras learn.
+        points: pixels whose distance is known.
+        error_map: where the error is, if pixels are drawn by it.
+        size: of the field; else `sizes.chosen_size` gives one for the settings and the pool.
     """
 
     def __init__(
@@ -78,6 +88,8 @@ class Fitting:
         contraction: str,
         settings: TrainSettings,
         log_gains: Tensor | None = None,
+        log_focal: float = 0.0,
+        cameras_from: float = 0.0,
         points: PointRays | None = None,
         error_map: ErrorMap | None = None,
         size: FieldSettings | None = None,
@@ -108,7 +120,8 @@ class Fitting:
         self.field = fresh_field(size).to(device)
         gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
         self.points, self.error_map = points, error_map
-        self.parts = Parts(self.components, pool, log_gains=gains)
+        self.parts = Parts(self.components, pool, log_gains=gains, log_focal=log_focal)
+        self._cameras_from = cameras_from
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
@@ -133,7 +146,8 @@ class Fitting:
         watch.state(self.state)
         self.furthest = max(self.furthest, share)
         self.field.refine(self.furthest)
-        drawn = self.parts.with_learning_rays(self.draw(share), share)
+        of_cameras = max(0.0, share - self._cameras_from) / (1.0 - self._cameras_from)
+        drawn = self.parts.with_learning_rays(self.draw(share), of_cameras)
         rays = len(drawn.origins)
         edges = self.edges[:: self._stride(share)].contiguous()
         loss, samples = self._loss(drawn, edges=edges, share=share, watch=watch)
@@ -146,7 +160,7 @@ class Fitting:
         self.step += 1
         self.optimiser.step(self.step, rate)
         self.parts_optimiser.step(rate)
-        self.parts.step_cameras(drawn, share, factor=self.rate_factor)
+        self.parts.step_cameras(drawn, of_cameras, factor=self.rate_factor)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False

@@ -29,12 +29,13 @@ class Parts(nn.Module):
         components: what is in the model.
         pool: the training photos.
         log_gains: (photos, 3) logarithms of their exposures to start from.
+        log_focal: see `Refinement`.
 
     Raises:
         UserError: a background is to be learned behind photos with alpha.
     """
 
-    def __init__(self, components: Components, pool: Pool, *, log_gains: Tensor):
+    def __init__(self, components: Components, pool: Pool, *, log_gains: Tensor, log_focal: float = 0.0):
         super().__init__()
         device = pool.colours.device
         kind = components.background
@@ -50,7 +51,7 @@ class Parts(nn.Module):
         if components.exposure != "none":
             self.exposure = Exposure(log_gains.to(device, torch.float32))
             self.exposure.requires_grad_(components.exposure == "learned")
-        self.cameras = None if components.cameras == "fixed" else Refinement(components.cameras, pool)
+        self.cameras = None if components.cameras == "fixed" else Refinement(components.cameras, pool, log_focal)
         self.is_random = kind == "random" or (kind == "auto" and pool.has_alpha)
         self._pool = pool
 

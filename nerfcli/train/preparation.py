@@ -3,7 +3,8 @@
 Of held-out photos nothing is read here but the sizes that their cameras have.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,17 +14,23 @@ from torch import Tensor
 
 from nerfcli.errors import UserError
 from nerfcli.scene import Scene
+from nerfcli.train.camera_check import check_cameras
 from nerfcli.train.components import Components
 from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
-from nerfcli.train.extent import Extent, choose_extent
+from nerfcli.train.extent import Extent, choose_extent, lacks_depth
 from nerfcli.train.fitting import Fitting
+from nerfcli.train.matching import Matches, match
 from nerfcli.train.photos import Album, PixelPool, load_album
 from nerfcli.train.point_depth import PointRays, point_depths
 from nerfcli.train.room import Room, needs_of, room_for
-from nerfcli.train.selection import SEARCH_SHARE, Facts, Selection, is_worth_a_search, select
+from nerfcli.train.selection import SEARCH_SHARE, Facts, Selection, is_worth_a_search, select, with_known_focal
 from nerfcli.train.settings import TrainSettings, automatic_downscale
 from nerfcli.train.trials import Trials
+from nerfcli.train.triangulation import triangulate
+
+# A search that has no time left has this.
+LEAST_SECONDS = 1e-3
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,7 @@ class Prepared:
         log_exposure: the mean of the training photos by EXIF; None where exposures are not asked for, or not known.
         log_gains: (photos, 3) logarithms of their exposures relative to it, as the trials found them or as far as EXIF
             tells; else 0.
+        log_focal: logarithm of the factor of focal lengths to start from.
         points: pixels with a point of structure from motion, where the components ask for them.
     """
 
@@ -59,6 +67,7 @@ class Prepared:
     selection: Selection | None
     log_exposure: float | None
     log_gains: Tensor
+    log_focal: float
     points: PointRays | None
 
     def fitting(self) -> Fitting:
@@ -69,6 +78,7 @@ class Prepared:
             contraction=self.extent.contraction,
             settings=self.settings,
             log_gains=self.log_gains,
+            log_focal=self.log_focal,
             points=self.points,
             error_map=ErrorMap(self.pool) if self.settings.components.pixels == "error" else None,
         )
@@ -105,10 +115,16 @@ def prepare(
     notify(told)
     masks = settings.components.masks
     album = load_album(scene.train_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
+    matched: tuple[Matches, ...] = ()
     if begun is not None:
         extent = begun.extent
     else:
-        extent = choose_extent(scene, album.photos, settings, fills_frame=album.fills_frame, notify=notify)
+        located = scene
+        if lacks_depth(scene, settings, fills_frame=album.fills_frame):
+            matched = match(album.photos, threads=settings.threads)
+            located = replace(scene, points=triangulate(album.photos, matched))
+            notify(f"the scene came without points; {len(located.points)} found in its photos tell how far it reaches")
+        extent = choose_extent(located, settings, fills_frame=album.fills_frame)
     device = torch.device(settings.device)
     pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, room=room)
     camera = album.photos[0].frame.camera
@@ -122,7 +138,7 @@ def prepare(
     if begun is not None:
         settings = replace(settings, components=begun.components)
     elif settings.model == "auto":
-        selection = _search(scene, album, extent, settings, room=room, notify=notify)
+        selection = _search(scene, album, extent, settings, matched=matched, room=room, notify=notify)
         settings = replace(settings, components=selection.components)
     extent = extent.before(settings.components.background)
     reference, gains = _exposures(scene, settings.components, notify=notify)
@@ -132,7 +148,8 @@ def prepare(
     if settings.components.points:
         points = PointRays(point_depths(scene, pool, extent.training_from_scene), pool)
         notify(f"{len(points.known.numbers)} pixels have a point of structure from motion")
-    return Prepared(settings, factor, room, extent, pool, selection, reference, gains, points)
+    log_focal = selection.log_focal if selection is not None else 0.0
+    return Prepared(settings, factor, room, extent, pool, selection, reference, gains, log_focal, points)
 
 
 def _search(
@@ -141,6 +158,7 @@ def _search(
     extent: Extent,
     settings: TrainSettings,
     *,
+    matched: Sequence[Matches],
     room: Room,
     notify: Callable[[str], None],
 ) -> Selection:
@@ -150,19 +168,40 @@ def _search(
         notify("the training is too short to try components; the default ones are taken")
         return Selection(settings.components, (), 0.0)
     exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
-    trials = Trials(album.photos, extent, settings=settings, exif=exif, colours=album.colours, room=room)
+    began = time.perf_counter()
+    if album.fills_frame and len(scene.points) == 0:
+        matched = matched or match(album.photos, threads=settings.threads)
+    facts = Facts(
+        settings.field,
+        has_alpha=album.colours.shape[-1] == 4,
+        has_exif=bool(np.ptp(exif) > 0.0),
+        cameras_fitted=len(scene.points) > 0,
+        cameras=check_cameras(album.photos, matched),
+        fixed=settings.fixed,
+    )
+    asked, log_focal, measured = with_known_focal(settings.components, facts)
+    trials = Trials(
+        album.photos, extent, settings=settings, exif=exif, log_focal=log_focal, colours=album.colours, room=room
+    )
+    took = time.perf_counter() - began
     notify(f"asks the scene which components it needs, for up to {SEARCH_SHARE:.0%} of the budget")
     selection = select(
         trials,
-        settings.components,
-        Facts(settings.field, album.colours.shape[-1] == 4, bool(np.ptp(exif) > 0.0), settings.fixed),
-        seconds=None if budget is None else SEARCH_SHARE * budget,
+        asked,
+        facts,
+        seconds=None if budget is None else max(LEAST_SECONDS, SEARCH_SHARE * budget - took),
         steps=None if steps is None else round(SEARCH_SHARE * steps),
+    )
+    if not selection.decisions:
+        notify("the budget is too small to try components; the default ones are taken")
+    selection = replace(
+        selection,
+        decisions=(*measured, *selection.decisions),
+        seconds=selection.seconds + took,
+        log_focal=log_focal,
     )
     for decision in selection.decisions:
         notify(decision.in_words())
-    if not selection.decisions:
-        notify("the budget is too small to try components; the default ones are taken")
     return selection
 
 

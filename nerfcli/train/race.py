@@ -7,13 +7,13 @@ from dataclasses import replace
 from torch import Tensor
 
 from nerfcli.train.components import Change, Components
-from nerfcli.train.judgement import LEAST_GAIN_DB, Decision, Rule, judge_one, judge_removal, untried
+from nerfcli.train.judgement import LEAST_GAIN_DB, MOST_LOSS_DB, Decision, Rule, judge_one, judge_removal, untried
 from nerfcli.train.trials import Start, Trial, Trials
 
 # Steps of a trial against those of the training that it goes on from.
 STEPS_OF_START = 0.5
 SEEDS = 2
-NO_TIME, ONCE = "not tried, no time was left", "gains once, but no time was left to try it again"
+NO_TIME, ONCE = "not tried, no time was left", "not clear, and no time was left to try it again"
 
 
 class Purse:
@@ -71,8 +71,8 @@ class Race:
     def run(self, additions: Sequence[Change], removals: Sequence[Change]) -> None:
         """Fill `decisions` and `kept`.
 
-        All additions with one seed; then the best of them with the others, and if it is kept, the rest once more beside
-        it; and so on. Removals last, as what is added may do their work.
+        All additions with one seed; then the best of them with the others unless it is clear already, and if it is
+        kept, the rest once more beside it; and so on. Removals last, as what is added may do their work.
         """
         self.decisions = {change: untried(*change, NO_TIME) for change in (*additions, *removals)}
         if not self.decisions or not self._can_run(2):
@@ -86,7 +86,7 @@ class Race:
                     self._drop(other, f"{best[0]}={best[1]} is better")
                 self._try_once(list(self._once))
         for change in removals:
-            if self._can_run(1 + SEEDS - len(self._base) + SEEDS - 1):
+            if self._can_run(1):
                 self._once[change] = self._trial([change], seed=0)
                 self._is_confirmed(change, judge_removal)
 
@@ -105,14 +105,16 @@ class Race:
                 self._once[change] = trial
 
     def _is_confirmed(self, change: Change, rule: Rule) -> bool:
-        """Whether a change stands the other seeds, too; it then is in the model."""
-        first = self._once.pop(change)
-        if not self._can_run(SEEDS - len(self._base) + SEEDS - 1):
-            self._drop(change, ONCE)
-            return False
-        self._base += [self._trial([], seed=seed) for seed in range(len(self._base), SEEDS)]
-        own = [first, *(self._trial([change], seed=seed) for seed in range(1, SEEDS))]
+        """Whether a change is clear with one seed, or stands the other seeds, too; it then is in the model."""
+        own = [self._once.pop(change)]
         decision = self._judged(rule, change, own)
+        if not decision.kept and (decision.gain_db or 0.0) > -MOST_LOSS_DB:
+            if not self._can_run(SEEDS - len(self._base) + SEEDS - 1):
+                self.decisions[change] = replace(decision, why=ONCE)
+                return False
+            self._base += [self._trial([], seed=seed) for seed in range(len(self._base), SEEDS)]
+            own += [self._trial([change], seed=seed) for seed in range(1, SEEDS)]
+            decision = self._judged(rule, change, own)
         self.decisions[change] = decision
         if decision.kept:
             self.kept.append(change)

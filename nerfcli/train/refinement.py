@@ -104,9 +104,10 @@ class LensRefinement(nn.Module):
     Args:
         pool: the photos, with their cameras as given.
         names: what may change, of `lens_change.changeable`.
+        log_focal: what "focal" starts from.
     """
 
-    def __init__(self, pool: Pool, names: tuple[str, ...]):
+    def __init__(self, pool: Pool, names: tuple[str, ...], log_focal: float):
         super().__init__()
         self._cameras = tuple(dict.fromkeys(pool.cameras))
         number = {camera: index for index, camera in enumerate(self._cameras)}
@@ -118,6 +119,9 @@ class LensRefinement(nn.Module):
         self._own = [tuple(name for name in names if name in changeable(camera)) for camera in self._cameras]
         self.values: Tensor
         self.register_buffer("values", torch.zeros(len(self._cameras), len(names), dtype=torch.float64))
+        for index, own in enumerate(self._own):
+            if FOCAL in own:
+                self.values[index, names.index(FOCAL)] = log_focal
         self.adam = WhitenedAdam(np.array([self._whitening(index) for index in range(len(self._cameras))]))
 
     def changed(self, camera: Camera, photo: int) -> Camera:
@@ -186,16 +190,17 @@ class Refinement(nn.Module):
     Args:
         kind: "poses", "focal", or "all": poses, focal lengths and distortion.
         pool: the training photos.
+        log_focal: logarithm of the factor of focal lengths to start from, where these learn.
     """
 
-    def __init__(self, kind: str, pool: Pool):
+    def __init__(self, kind: str, pool: Pool, log_focal: float = 0.0):
         super().__init__()
         self._pool = pool
         self._given = pool.poses.double().cpu().numpy()
         self.poses = PoseRefinement(self._given, pool.cameras) if kind in ("poses", "all") else None
         names = [(FOCAL,)] if kind == "focal" else [changeable(camera) for camera in pool.cameras if kind == "all"]
         listed = tuple(dict.fromkeys(name for own in names for name in own))
-        self.lenses = LensRefinement(pool, listed) if listed else None
+        self.lenses = LensRefinement(pool, listed, log_focal) if listed else None
 
     @torch.no_grad()
     def refined(self, drawn: Drawn) -> Drawn:

@@ -13,6 +13,7 @@ from typing import Any
 
 from torch import Tensor
 
+from nerfcli.train.camera_check import CameraCheck
 from nerfcli.train.components import Change, Components
 from nerfcli.train.judgement import Decision, untried
 from nerfcli.train.race import Purse, Race
@@ -25,8 +26,15 @@ SEARCH_SHARE, START_SHARE = 0.15, 0.2
 FEWEST_STEPS = 120
 # No machine goes so many steps in less time than this, and what an attempt takes would be missed elsewhere.
 LEAST_START_SECONDS = 0.3
+# A start of so many steps tells all that a longer one would.
+MOST_START_STEPS = 1000
 # Photos whose brightness differs by less than this, in logarithms of light, are as well without exposures.
 LEAST_EXPOSURE_SPREAD = 0.06
+# Cameras whose photos agree to this are as good as the features: structure from motion leaves 0.1 to 0.4.
+LEAST_MISS_PX = 0.6
+# The focal length that matches tell is taken if it is so many standard errors and so far away from the given one, and
+# makes the misses so much smaller.
+FOCAL_ERRORS, LEAST_FOCAL, MISS_SHARE = 5.0, 0.003, 0.85
 
 
 @dataclass(frozen=True)
@@ -38,12 +46,14 @@ class Selection:
         decisions: one per candidate; none where there was too little to spend.
         seconds: of the search.
         log_gains: (photos, 3) of the exposures that the trials found; None where exposures are not learned.
+        log_focal: see `Fitting`.
     """
 
     components: Components
     decisions: tuple[Decision, ...]
     seconds: float
     log_gains: Tensor | None = None
+    log_focal: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -68,13 +78,37 @@ class Facts:
         field: the kind of field.
         has_alpha: whether the photos have alpha: then nothing is behind the object.
         has_exif: whether EXIF tells different exposures.
+        cameras_fitted: whether structure from motion has fitted cameras and points to each other.
+        cameras: what matched features say of them; None where nothing is known.
         fixed: components that the user has decided on.
     """
 
     field: str
     has_alpha: bool
     has_exif: bool
+    cameras_fitted: bool = False
+    cameras: CameraCheck | None = None
     fixed: tuple[str, ...] = ()
+
+
+def with_known_focal(asked: Components, facts: Facts) -> tuple[Components, float, list[Decision]]:
+    """The model with the focal length that matched features tell, if they surely tell another than the given one; the
+    logarithm of its factor, which is 0 elsewhere; and the decision about it.
+
+    Trials cannot decide this: a model that has begun with a wrong length is bent to fit, and stays so for long.
+    """
+    check = facts.cameras
+    if check is None or "cameras" in facts.fixed:
+        return asked, 0.0, []
+    given, changed = check.misses_px
+    told = (
+        f"{check.matches} matched features ask for lenses {math.expm1(check.log_focal):+.2%} +- {check.error:.2%} as "
+        f"long, and miss by {given:.2f} px as they are, by {changed:.2f} px then"
+    )
+    is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error) and changed < MISS_SHARE * given
+    if is_sure:
+        return replace(asked, cameras="focal"), check.log_focal, [untried("cameras", "focal", told, kept=True)]
+    return asked, 0.0, [untried("cameras", "focal", f"not tried, {told}")]
 
 
 def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Change], list[Decision]]:
@@ -94,6 +128,16 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
     else:
         told = f"not tried, photos differ in brightness by {math.expm1(signs.exposure_spread):.1%} only"
         declined.append(untried("exposure", "learned", told))
+    check = facts.cameras
+    if facts.cameras_fitted:
+        declined.append(untried("cameras", "poses", "not tried, structure from motion has fitted cameras to points"))
+    elif check is None:
+        candidates += [("cameras", "poses"), ("cameras", "focal")]
+    elif min(check.misses_px) < LEAST_MISS_PX:
+        told = f"not tried, matched features miss by {min(check.misses_px):.2f} px only"
+        declined.append(untried("cameras", "poses", told))
+    else:
+        candidates.append(("cameras", "poses" if start.cameras == "fixed" else "all"))
     if not facts.has_alpha:
         candidates.append(("background", "sphere"))
     open_ones = [(name, value) for name, value in candidates if getattr(start, name) != value]
@@ -139,8 +183,12 @@ def select(
         `asked` and no decisions where a first training of `FEWEST_STEPS` is too much.
     """
     purse = Purse(seconds, steps)
-    first_steps = None if seconds is not None else round(START_SHARE * (steps or 0))
-    start = trials.begin(asked, steps=first_steps, seconds=None if seconds is None else START_SHARE * seconds)
+    first_steps = MOST_START_STEPS if seconds is not None else round(START_SHARE * (steps or 0))
+    start = trials.begin(
+        asked,
+        steps=min(first_steps, MOST_START_STEPS),
+        seconds=math.inf if seconds is None else START_SHARE * seconds,
+    )
     purse.take(start.steps)
     if start.steps < FEWEST_STEPS:
         return Selection(asked, (), purse.spent)

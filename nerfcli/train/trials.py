@@ -88,6 +88,7 @@ class Trials:
         extent: of the field.
         settings: of the training that the trials are for; seed and components are given with each trial.
         exif: (photos,) logarithms of the exposures that EXIF tells, relative to their mean.
+        log_focal: see `Fitting`.
         colours, room: see `PixelPool`.
 
     Raises:
@@ -101,6 +102,7 @@ class Trials:
         *,
         settings: TrainSettings,
         exif: np.ndarray,
+        log_focal: float = 0.0,
         colours: np.ndarray | None = None,
         room: Room = IN_MEMORY,
     ):
@@ -116,19 +118,20 @@ class Trials:
         # Small steps all along: they learn more from a sample, which is what a short training has few of.
         self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
         self._exif = torch.from_numpy(exif).to(torch.float32)[:, None].expand(-1, 3)
+        self._log_focal = log_focal
         self._room = room
 
-    def begin(self, components: Components, *, steps: int | None, seconds: float | None = None) -> Start:
+    def begin(self, components: Components, *, steps: int, seconds: float = math.inf) -> Start:
         """Train from the beginning to `FORK_SHARE` of a schedule.
 
         Args:
             components: what is in the model.
-            steps: to go.
-            seconds: instead of steps; how many were gone then is in the answer.
+            steps: to go at most.
+            seconds: to take at most; how many steps were gone then is in the answer.
         """
-        fitting = self._fitting(components, seed=self._settings.seed, log_gains=None)
+        fitting = self._fitting(components, seed=self._settings.seed, log_gains=None, cameras_from=0.0)
         took = 0.0
-        while (share := fitting.step / steps if steps is not None else took / (seconds or math.inf)) < 1.0:
+        while (share := max(fitting.step / steps, took / seconds)) < 1.0:
             took += self._advance(fitting, FORK_SHARE * share)
         drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
         with torch.no_grad():
@@ -150,7 +153,7 @@ class Trials:
             steps: to go.
         """
         gains = {"exif": self._exif, "learned": start.signs.log_gains}.get(components.exposure)
-        fitting = self._fitting(components, seed=seed, log_gains=gains)
+        fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_SHARE)
         self._take_up(fitting, start)
         if fitting.parts.background is not None:
             paint(fitting.parts.background, self._pool)
@@ -166,7 +169,7 @@ class Trials:
         found = exposure.log_gains().detach().clone() if exposure is not None else None
         return Trial(errors, errors if halfway is None else halfway, self._counts, took, steps, found)
 
-    def _fitting(self, components: Components, *, seed: int, log_gains: Tensor | None) -> Fitting:
+    def _fitting(self, components: Components, *, seed: int, log_gains: Tensor | None, cameras_from: float) -> Fitting:
         settings = replace(self._settings, components=components, seed=seed)
         return Fitting(
             self._pool,
@@ -174,6 +177,8 @@ class Trials:
             contraction=self._extent.contraction,
             settings=settings,
             log_gains=log_gains,
+            log_focal=self._log_focal,
+            cameras_from=cameras_from,
             error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
         )
 
