@@ -42,7 +42,8 @@ def test_what_begins_late_changes_nothing_at_first(trials, start):
     same = trials.go_on(start, Components(view=0), seed=0, steps=0)
     assert same.psnr == pytest.approx(start.psnr, abs=1e-4)  # levels that do not learn yet are told by a step
     assert np.array_equal(trials.go_on(start, Components(view=3), seed=0, steps=0).errors, same.errors)
-    assert np.array_equal(trials.go_on(start, Components(view=0, cameras="poses"), seed=0, steps=0).errors, same.errors)
+    free = trials.go_on(start, Components(view=0, cameras="poses"), seed=0, steps=0)
+    assert free.errors == pytest.approx(same.errors, rel=1e-6)  # rays are turned by nothing, and rounded
     # Of exposures that EXIF tells to be equal.
     exif = trials.go_on(start, Components(view=0, exposure="exif"), seed=0, steps=0)
     assert exif.errors == pytest.approx(same.errors, rel=1e-3)
