@@ -4,7 +4,8 @@
 
 A mutant is one text of one file replaced by another (a sign, an index, a factor, a missing clamp) in a copy of the
 program; the tests of that file run against it until the first fails. It is killed if one fails, survives if none does.
-What survives needs a test, or a reason why no test can tell. The list of mutants stands in `mutant_list.py`.
+What survives needs a test, or a reason why no test can tell. The lists of mutants stand in `mutant_list.py` and
+`mutant_list_training.py`.
 """
 
 import csv
@@ -29,6 +30,7 @@ import scipy.interpolate  # noqa: F401
 import torch
 import typer
 from mutant_list import GROUPS, Group, Mutant
+from mutant_list_training import TRAINING
 from rich.console import Console
 from rich.table import Table
 
@@ -110,7 +112,9 @@ def main(
 ) -> None:
     torch.set_num_threads(2)
     console, table = Console(), Table("file", "what is broken", "verdict", "s")
-    chosen = [(group, mutant) for group in GROUPS if only in group.file for mutant in group.mutants][skip:]
+    chosen = [(group, mutant) for group in (*GROUPS, *TRAINING) if only in group.file for mutant in group.mutants][
+        skip:
+    ]
     rows = []
     for group, mutant in chosen:
         verdict, seconds = verdict_of(mutant, group)

@@ -20,6 +20,7 @@ from nerfcli.field.cost import field_bytes
 from nerfcli.field.encodings import fourier_features, spherical_harmonics
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log
+from nerfcli.render import model as model_file
 from nerfcli.render.model import Marching, Model, load_model, save_model
 
 TINY = HashFieldSettings(contraction="none", levels=3, log2_rows=8, coarsest=4, finest=32, width=16)
@@ -280,6 +281,23 @@ def test_model_round_trip_is_bit_exact(tmp_path):
     assert loaded.training_from_scene.scale == model.training_from_scene.scale
     np.testing.assert_array_equal(loaded.training_from_scene.rotation, model.training_from_scene.rotation)
     np.testing.assert_array_equal(loaded.training_from_scene.translation, model.training_from_scene.translation)
+
+
+def test_a_model_knows_the_digest_of_what_was_loaded_not_of_what_took_its_place(tmp_path, monkeypatch):
+    """A training replaces its field while another command reads it."""
+    path = tmp_path / "field.safetensors"
+    save_model(path, some_model())
+    wanted = hashlib.sha256(path.read_bytes()).hexdigest()
+    parse = model_file.tensors_of
+
+    def parse_late(content, *given):
+        save_model(path, replace(some_model(), unit="inch"))
+        return parse(content, *given)
+
+    monkeypatch.setattr(model_file, "tensors_of", parse_late)
+    loaded = load_model(path, "cpu")
+    assert (loaded.sha256, loaded.unit) == (wanted, "metre")
+    assert hashlib.sha256(path.read_bytes()).hexdigest() != wanted
 
 
 @pytest.mark.parametrize(("unbounded", "contraction"), [(True, "l2"), (False, "none")])

@@ -18,6 +18,7 @@ from nerfcli.bench.subject import Subject
 from nerfcli.bench.sweep import RenderSetting, render_settings, train_settings
 from nerfcli.bench.training import KEPT_FIELD, Trainings, measure_trainings
 from nerfcli.bench.worker import measure_model
+from nerfcli.errors import UserError
 from nerfcli.render.model import Model, load_model
 from nerfcli.train.run_folder import FIELD
 
@@ -106,6 +107,8 @@ def _measure_run(subject: Subject, run: Path, wanted: Wanted, session: Session) 
     """Render the run's field, then train its scene again in other ways."""
     ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
     model = load_model(run / FIELD, subject.base.device)
+    if model.sha256 != subject.identity:
+        raise UserError(f"{run / FIELD} was replaced while bench began", "let the training end first")
     if wanted.sweep != "train":
         share = _RENDERING_SHARE if wanted.sweep == "both" and subject.scene is not None else 1.0
         _render(subject, model, session, ends=share * ends)

@@ -141,7 +141,6 @@ def evaluate_run(
         UserError: the folder is no run, its split is not the one it was trained with, a photo cannot be read, or
             metrics of another state or without what is wanted stand there.
     """
-    import hashlib
     import platform
 
     import torch
@@ -158,7 +157,8 @@ def evaluate_run(
     check_split(run, config, cameras["test"])
     clear_leftovers(run)
     model = load_model(run / FIELD, device)
-    checkpoint = hashlib.sha256((run / FIELD).read_bytes()).hexdigest()
+    checkpoint = model.sha256
+    assert checkpoint is not None
     path = run / METRICS
     if path.exists() and not overwrite:
         metrics = _kept(path, checkpoint, wanted)

@@ -256,7 +256,6 @@ def render_run(
     Raises:
         UserError: no such run, no such cameras, or other files stand at `target`.
     """
-    import hashlib
     from dataclasses import replace
 
     import torch
@@ -279,7 +278,7 @@ def render_run(
     provenance: dict[str, Any] = {
         "cameras": views.cameras,
         "run": run.name,
-        "field_sha256": hashlib.sha256((run / FIELD).read_bytes()).hexdigest(),
+        "field_sha256": model.sha256,
     }
     if step != 1.0:
         provenance["step"] = step

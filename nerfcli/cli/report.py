@@ -85,10 +85,11 @@ def report_page(
     from nerfcli.train.run_folder import FIELD, read_config
 
     torch.set_num_threads(threads)
-    facts = []
+    facts, hashes = [], []
     for path, label in zip(paths, labels_of(paths), strict=True):
         read_config(path)  # says what a folder lacks that is not a run
-        facts.append(read_facts(path, label, checkpoint_sha256=hashlib.sha256(_bytes_of(path / FIELD)).hexdigest()))
+        hashes.append(hashlib.sha256(_bytes_of(path / FIELD)).hexdigest())
+        facts.append(read_facts(path, label, checkpoint_sha256=hashes[-1]))
     names = common_names(facts, views)
     looks, meanings = [], []
     with console.progress("report") as update:
@@ -98,6 +99,11 @@ def report_page(
                 update((index + share) / len(paths), label)
 
             model = load_model(run.path / FIELD, device)
+            if model.sha256 != hashes[index]:
+                raise UserError(
+                    f"{run.path / FIELD} was replaced while the report was made",
+                    "give the command again when the training is over",
+                )
             frames = [frame for frame in run.frames["test"] if frame.name in names]
             held_out = held_out_photos(run.config, frames, log_exposure=model.log_exposure, threads=threads)
             compared = [photo for photo in held_out if photo.used is None or photo.used.any()]

@@ -2,11 +2,12 @@
 
 import hashlib
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import SafetensorError
+from safetensors.torch import load, save_file
 from torch import Tensor, uint8
 
 from nerfcli.atomic import atomic_path
@@ -39,29 +40,49 @@ def load_tensors(path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, 
     Raises:
         UserError: the file is missing, cut short, damaged, or not one of ours.
     """
+    return tensors_of(read_checkpoint(path), path, device)
+
+
+def read_checkpoint(path: Path) -> bytes:
+    """All of a file at once: a training may put another one in its place meanwhile.
+
+    Raises:
+        UserError: the file is missing or cannot be read.
+    """
     try:
-        with safe_open(path, framework="pt", device="cpu") as file:
-            metadata = file.metadata() or {}
-            entry = metadata[_ENTRY]
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        told = json.loads(entry)
-        sealed = isinstance(told, list)
-        digest, description = told if sealed else (metadata.get(_DIGEST), told)
+        return path.read_bytes()
     except FileNotFoundError as error:
         raise UserError(
             f"{path} does not exist", "train first (nerfcli train SCENE), or give the folder that train wrote"
         ) from error
-    except (SafetensorError, KeyError, OSError, ValueError) as error:
-        raise UserError(
-            f"{path} is not a readable checkpoint: {error}",
-            "train again with --overwrite, or restore the file",
-        ) from error
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def tensors_of(content: bytes, path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and their description from what a file holds; see `load_tensors`."""
+    try:
+        tensors = load(content)
+        (length,) = struct.unpack_from("<Q", content)
+        metadata = json.loads(content[8 : 8 + length]).get("__metadata__") or {}
+        entry = metadata[_ENTRY]
+        told = json.loads(entry)
+        sealed = isinstance(told, list)
+        digest, description = told if sealed else (metadata.get(_DIGEST), told)
+    except (SafetensorError, KeyError, ValueError) as error:
+        raise _unreadable(path, error) from error
     if (sealed or digest is not None) and digest != _digest(tensors, json.dumps(description) if sealed else entry):
         raise UserError(
             f"{path} is damaged: its content is not what was written",
             "train again with --overwrite, or restore the file; the disk may have more damage",
         )
     return {name: tensor.to(device) for name, tensor in tensors.items()}, description
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    return UserError(
+        f"{path} is not a readable checkpoint: {error}", "train again with --overwrite, or restore the file"
+    )
 
 
 def refuse_non_finite(tensors: dict[str, Tensor], path: Path) -> None:

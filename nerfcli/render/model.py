@@ -1,5 +1,6 @@
 """A trained field with everything that is needed to look at it: the frame it lives in, where it is empty, the steps."""
 
+import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from torch import Tensor
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.field.background import Background, SphereBackground
-from nerfcli.field.checkpoint import load_tensors, refuse_non_finite, save_tensors
+from nerfcli.field.checkpoint import read_checkpoint, refuse_non_finite, save_tensors, tensors_of
 from nerfcli.field.interface import Field
 from nerfcli.field.kinds import fresh_field, settings_from_json
 from nerfcli.render.sampling import step_edges
@@ -53,6 +54,7 @@ class Model:
         unit_source: how a metre is known; None where nobody wrote it down.
         log_exposure: the mean of the training photos by EXIF, if the model knows photos of different exposures; see
             `train.exif_exposure`.
+        sha256: of the file that it was read from.
     """
 
     field: Field
@@ -63,6 +65,7 @@ class Model:
     unit: str
     unit_source: str | None = None
     log_exposure: float | None = None
+    sha256: str | None = None
 
     @property
     def contraction(self) -> str:
@@ -102,7 +105,8 @@ def load_model(path: Path, device: str) -> Model:
     Raises:
         UserError: the file is missing, damaged, not a field of this version, or holds weights that are not finite.
     """
-    tensors, description = load_tensors(path, device)
+    content = read_checkpoint(path)
+    tensors, description = tensors_of(content, path, device)
     if description.get("format") == FORMAT_1:
         description["format"] = FORMAT
         description["field"]["contraction"] = "l2" if description["field"].pop("unbounded") else "none"
@@ -125,6 +129,7 @@ def load_model(path: Path, device: str) -> Model:
         unit=description["unit"],
         unit_source=description.get("unit_source"),
         log_exposure=description.get("log_exposure"),
+        sha256=hashlib.sha256(content).hexdigest(),
     )
 
 
