@@ -54,19 +54,25 @@ class Given:
     inputs: tuple[Path, ...]
 
 
-def commands(place: Path) -> list[Given]:
-    """Poses of 12 small photos of the desk, 200 steps on spheres, 60 small pictures; and the captures for them."""
+def commands(place: Path, run: Path | None) -> list[Given]:
+    """Poses of 12 small photos of the desk, 200 steps on spheres, 60 small pictures of those or of a copy of `run`; and
+    the captures for them."""
     make_capture(place / "capture")
     photos, capture = place / "photos", place / "capture"
     photos.mkdir()
     for path in sorted(DESK.iterdir())[:12]:
         with Image.open(path) as picture:
             picture.reduce(3).save(photos / f"{path.stem}.jpg", quality=95)
+    shown = capture / "run"
+    if run is not None:
+        shown = Path(
+            shutil.copytree(run, place / "copy" / run.name, ignore=shutil.ignore_patterns("renders", "state.*"))
+        )
     views = ("--cameras", "orbit", "--count", "60", "--max-size", "48")
     return [
         Given("poses", ("poses", photos, "--quality", "fast", "--seed", "1"), (photos,)),
         Given("train", ("train", capture / "scene", "--steps", "200"), (capture / "scene", capture / "photos")),
-        Given("render", ("render", capture / "run", *views), (capture / "run",)),
+        Given("render", ("render", shown, *views), (shown,)),
     ]
 
 
@@ -138,6 +144,7 @@ def kills(
     count: Annotated[int, typer.Option(help="Kills of each command.", min=1)] = 20,
     seed: int = 0,
     only: Annotated[str, typer.Option(help="Some of poses,train,render.")] = "poses,train,render",
+    run: Annotated[Path | None, typer.Option(help="A run to render, in place of a small one; it is copied.")] = None,
     output: Annotated[Path, typer.Option("-o", help="CSV with a line per kill.")] = Path("kills.csv"),
 ) -> None:
     """Kill commands at random moments and go on."""
@@ -145,7 +152,7 @@ def kills(
     with tempfile.TemporaryDirectory() as folder, output.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(("command", "kill", "after_seconds", "outcome", "differing"))
-        for given in commands(Path(folder)):
+        for given in commands(Path(folder), run):
             if given.name not in only.split(","):
                 continue
             whole, part = Path(folder) / f"{given.name}-whole" / "out", Path(folder) / f"{given.name}-part" / "out"

@@ -218,6 +218,18 @@ def test_gradient_of_a_median_that_lies_on_an_edge(dtype):
     assert gradient.tolist() == pytest.approx([-1 / math.log(2), 0.0], rel=1e-6)
 
 
+def test_a_median_that_rounding_puts_into_thin_air_stays_inside_an_interval():
+    """Half of all light less a rounding has ended at a wall; 100 thin layers with gaps between bring the rest. A
+    rounding of the wall's optical depth is as much as sixty layers have: by the density of one it leads out."""
+    target = torch.tensor(-math.log1p(-0.5))
+    wall = torch.nextafter(target, torch.tensor(0.0))
+    density = torch.cat([wall[None], torch.full((100,), 1e-6)])
+    starts = torch.cat([torch.zeros(1), torch.arange(2.0, 102.0)])
+    ends = starts + torch.cat([torch.ones(1), torch.full((100,), 2.0**-10)])
+    median = depth.quantile(density, starts, ends, offsets=torch.tensor([0, 101]), share=0.5)
+    assert ((starts <= median) & (median <= ends)).any()
+
+
 def test_gradient_of_the_mean_of_a_far_thin_surface():
     """Closed form: minus the variance of a thin interval, length^2 / 12. It is 1e8 times smaller than the distance, and
     was the rounding of that."""
