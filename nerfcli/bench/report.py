@@ -20,7 +20,8 @@ JSON, CSV, PAGE = "bench.json", "bench.csv", "bench.html"
 
 
 def write_report(records: Records) -> tuple[Path, dict[str, Any]]:
-    """Write bench.json, bench.csv and bench.html of what was measured so far.
+    """Write bench.json, bench.csv and bench.html of what was measured so far; when all is measured, pictures that are
+    not on the page go, those of an earlier bench.
 
     Returns:
         The page's path, and the content of bench.json.
@@ -33,19 +34,25 @@ def write_report(records: Records) -> tuple[Path, dict[str, Any]]:
     write_json(records.folder / JSON, content)
     write_csv(content, records.folder / CSV)
     page = records.folder / PAGE
-    write_page(bench_page(content, _embedded(content, records.folder / FOLDER), records.folder), page)
+    pictures = _embedded(content, records.folder / FOLDER)
+    write_page(bench_page(content, pictures, records.folder), page)
+    if content["complete"]:
+        for path in (records.folder / FOLDER).glob("*.jpg"):
+            if path.name not in pictures:
+                path.unlink()
     return page, content
 
 
 def discard(folder: Path) -> None:
-    """Remove what a bench measured in a folder, and nothing else; a folder that is no bench stays as it is."""
+    """Forget what a bench measured in a folder, and nothing else; a folder that is no bench stays as it is.
+
+    Its report and pictures stay until there are others: the disk may be full, or the new bench be given up.
+    """
     if not (folder / PLAN).exists():
         return
     emptied(folder)
-    for name in (JSON, CSV, PAGE, KEPT_FIELD):
-        (folder / name).unlink(missing_ok=True)
-    for name in (FOLDER, WORK):
-        shutil.rmtree(folder / name, ignore_errors=True)
+    (folder / KEPT_FIELD).unlink(missing_ok=True)
+    shutil.rmtree(folder / WORK, ignore_errors=True)
 
 
 def _embedded(content: dict[str, Any], folder: Path) -> dict[str, str]:
