@@ -316,3 +316,11 @@ def test_a_long_search_does_not_make_a_long_start():
     scripted = Scripted(lambda c: 0.0)
     chosen_by(scripted, steps=100_000)
     assert {steps for _, _, steps in scripted.asked} == {MOST_START_STEPS // 2}
+
+
+def test_of_values_that_gain_as_much_the_plainest_is_kept():
+    """What EXIF tells is there for nothing; what has to be learned must gain more than seeds differ by."""
+    for ahead, kept in ((0.5 * SEED_DB, "exif"), (3.0 * SEED_DB, "learned")):
+        gains = {"none": 0.0, "exif": 1.0, "learned": 1.0 + ahead}
+        chosen = chosen_by(Scripted(lambda c, gains=gains: gains[c.exposure]), facts=replace(FITTED, has_exif=True))
+        assert chosen.components.exposure == kept

@@ -8,9 +8,7 @@ from torch import Tensor
 
 from nerfcli import kernels
 from nerfcli.field.interface import Field
-
-BETAS = (0.9, 0.99)
-EPS = 1e-15
+from nerfcli.train.adam import BETAS, EPS, Adam
 
 
 class FieldOptimiser:
@@ -24,16 +22,14 @@ class FieldOptimiser:
         self._field = field
         rows = field.rows()
         self._weights = {name: parameter for name, parameter in field.named_parameters() if parameter is not rows}
-        # Their rate is set at every step.
-        self._adam = torch.optim.Adam(self._weights.values(), betas=BETAS, eps=EPS) if self._weights else None
+        self._adam = Adam(self._weights.values())
         self.sink = self._first = self._second = None
         if rows is not None:
             self.sink, self._first, self._second = (torch.zeros_like(rows, requires_grad=False) for _ in range(3))
 
     def zero_grad(self) -> None:
         """Forget the gradients of the weights; those of the rows went with the step that used them."""
-        if self._adam is not None:
-            self._adam.zero_grad(set_to_none=True)
+        self._adam.zero_grad()
 
     def gradients(self) -> dict[str, Tensor]:
         """By name, those through which everything comes that could be non-finite: the rows' only without weights."""
@@ -44,10 +40,7 @@ class FieldOptimiser:
     def step(self, number: int, rate: float) -> None:
         """Step `number`, from 1, at a learning rate."""
         rate = rate * self._field.rate_factor
-        if self._adam is not None:
-            for group in self._adam.param_groups:
-                group["lr"] = rate
-            self._adam.step()
+        self._adam.step(rate)
         rows = self._field.rows()
         if rows is not None and self.sink is not None and self._first is not None and self._second is not None:
             kernels.adam_rows(rows, self.sink, self._first, self._second, step=number, rate=rate, betas=BETAS, eps=EPS)
@@ -57,9 +50,7 @@ class FieldOptimiser:
         tensors: dict[str, Tensor] = {}
         if self._first is not None and self._second is not None:
             tensors |= {"table_first": self._first, "table_second": self._second}
-        if self._adam is not None:
-            tensors |= _moments(self._adam, "adam")
-        return tensors
+        return tensors | self._adam.state("adam")
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take up what `state` gave; other tensors may stand beside it."""
@@ -67,8 +58,7 @@ class FieldOptimiser:
             self._first, self._second = tensors["table_first"], tensors["table_second"]
         if self.sink is not None:
             self.sink.zero_()  # a step may have ended before it was used
-        if self._adam is not None:
-            _restore_moments(self._adam, tensors, "adam")
+        self._adam.restore(tensors, "adam")
 
 
 class PartsOptimiser:
@@ -79,39 +69,26 @@ class PartsOptimiser:
     """
 
     def __init__(self, groups: Sequence[dict[str, Any]]):
-        self._adam = torch.optim.Adam([dict(group) for group in groups], betas=BETAS, eps=EPS) if groups else None
+        self._groups = [(Adam(group["params"]), group["multiple"]) for group in groups]
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
-        if self._adam is not None:
-            self._adam.zero_grad(set_to_none=True)
+        for adam, _ in self._groups:
+            adam.zero_grad()
 
     def step(self, rate: float) -> None:
         """One step at multiples of a learning rate."""
-        if self._adam is not None:
-            for group in self._adam.param_groups:
-                group["lr"] = rate * group["multiple"]
-            self._adam.step()
+        for adam, multiple in self._groups:
+            adam.step(rate * multiple)
 
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs; the parts' own numbers are not in it."""
-        return {} if self._adam is None else _moments(self._adam, "parts_adam")
+        tensors: dict[str, Tensor] = {}
+        for number, (adam, _) in enumerate(self._groups):
+            tensors |= adam.state(f"parts_adam.{number}")
+        return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Take up what `state` gave; other tensors may stand beside it."""
-        if self._adam is not None:
-            _restore_moments(self._adam, tensors, "parts_adam")
-
-
-def _moments(adam: torch.optim.Adam, prefix: str) -> dict[str, Tensor]:
-    state = adam.state_dict()["state"]
-    return {f"{prefix}.{index}.{name}": value for index, entry in state.items() for name, value in entry.items()}
-
-
-def _restore_moments(adam: torch.optim.Adam, tensors: dict[str, Tensor], prefix: str) -> None:
-    entries: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        if key.startswith(f"{prefix}."):
-            _, index, name = key.split(".")
-            entries.setdefault(int(index), {})[name] = value
-    adam.load_state_dict({**adam.state_dict(), "state": entries})
+        for number, (adam, _) in enumerate(self._groups):
+            adam.restore(tensors, f"parts_adam.{number}")

@@ -7,7 +7,16 @@ from dataclasses import replace
 from torch import Tensor
 
 from nerfcli.train.components import Change, Components
-from nerfcli.train.judgement import LEAST_GAIN_DB, MOST_LOSS_DB, Decision, Rule, judge_one, judge_removal, untried
+from nerfcli.train.judgement import (
+    LEAST_GAIN_DB,
+    MOST_LOSS_DB,
+    SEED_DB,
+    Decision,
+    Rule,
+    judge_one,
+    judge_removal,
+    untried,
+)
 from nerfcli.train.trials import Start, Trial, Trials
 
 # Steps of a trial against those of the training that it goes on from.
@@ -80,7 +89,7 @@ class Race:
         self._base = [self._trial([], seed=0)]
         self._try_once(additions)
         while self._once:
-            best = max(self._once, key=lambda change: self.decisions[change].gain_db or 0.0)
+            best = self._best()
             if self._is_confirmed(best, judge_one):
                 for other in [other for other in self._once if other[0] == best[0]]:
                     self._drop(other, f"{best[0]}={best[1]} is better")
@@ -103,6 +112,13 @@ class Race:
             self.decisions[change] = replace(decision, kept=False)
             if (decision.gain_db or 0.0) > LEAST_GAIN_DB:
                 self._once[change] = trial
+
+    def _best(self) -> Change:
+        """The one that gains most; of a component's values that gain as much as seeds differ by, the one proposed
+        first, as it is the plainest."""
+        gains = {change: self.decisions[change].gain_db or 0.0 for change in self._once}
+        best = max(gains, key=lambda change: gains[change])
+        return next(change for change in gains if change[0] == best[0] and gains[change] >= gains[best] - SEED_DB)
 
     def _is_confirmed(self, change: Change, rule: Rule) -> bool:
         """Whether a change is clear with one seed, or stands the other seeds, too; it then is in the model."""

@@ -20,6 +20,7 @@ from torch import Tensor
 from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.hash_field import HashField
+from nerfcli.train.adam import Adam
 from nerfcli.train.components import Components
 from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.extent import Extent
@@ -212,12 +213,12 @@ def paint(background: SphereBackground, pool: Pool) -> None:
     What a field without a background put there is cut away when it gets one.
     """
     generator = torch.Generator(device=pool.colours.device).manual_seed(SEED)
-    adam = torch.optim.Adam(background.parameters(), lr=PAINT_RATE)
+    adam = Adam(background.parameters())
     for _ in range(PAINT_STEPS):
         drawn = pool.draw(JUDGED_PIXELS, generator)
         adam.zero_grad()
         (background(drawn.directions) - drawn.colours[:, :3]).abs().sum().backward()
-        adam.step()
+        adam.step(PAINT_RATE)
     adam.zero_grad()
 
 

@@ -1,0 +1,49 @@
+"""Adam without the class of torch: the same bits, and no compiler that loads for it."""
+
+import subprocess
+import sys
+
+import torch
+
+from nerfcli.train.adam import BETAS, EPS, Adam
+
+
+def test_steps_are_those_of_torch_to_the_bit_and_go_on_from_a_saved_state():
+    generator = torch.Generator().manual_seed(0)
+    start = [torch.randn(5, 3, generator=generator), torch.randn(7, generator=generator)]
+    own, theirs = ([tensor.clone().requires_grad_() for tensor in start] for _ in range(2))
+    adam, reference = Adam(own), torch.optim.Adam(theirs, betas=BETAS, eps=EPS)
+    for step in range(12):
+        rate = 0.1 / (1 + step)
+        gradients = [torch.randn(tensor.shape, generator=generator) * 10.0**-step for tensor in start]
+        for one, other, gradient in zip(own, theirs, gradients, strict=True):
+            one.grad, other.grad = gradient.clone(), gradient.clone()
+        if step == 3:
+            own[1].grad = theirs[1].grad = None  # nothing came to it: it stays, and so do its moments
+        if step == 6:
+            saved = {name: tensor.clone() for name, tensor in adam.state("adam").items()}
+            adam = Adam(own)
+            adam.restore({**saved, "something.else": torch.ones(1)}, "adam")
+        reference.param_groups[0]["lr"] = rate
+        adam.step(rate)
+        reference.step()
+        assert all(torch.equal(one, other) for one, other in zip(own, theirs, strict=True))
+    adam.zero_grad()
+    assert own[0].grad is None
+
+
+def test_what_was_never_saved_begins_anew():
+    parameter = torch.ones(3, requires_grad=True)
+    adam = Adam([parameter])
+    parameter.grad = torch.ones(3)
+    adam.step(0.1)
+    adam.restore({}, "adam")
+    assert all((tensor == 0).all() for tensor in adam.state("adam").values())
+
+
+def test_a_step_loads_no_compiler():
+    script = (
+        "import sys, torch; from nerfcli.train.adam import Adam; p = torch.ones(3, requires_grad=True); "
+        "a = Adam([p]); p.grad = torch.ones(3); a.step(0.1); sys.exit('torch._dynamo' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
