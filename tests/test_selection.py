@@ -22,7 +22,7 @@ from nerfcli.train.judgement import (
     judge_one,
     judge_removal,
 )
-from nerfcli.train.race import NO_TIME, ONCE
+from nerfcli.train.race import NO_TIME, ONCE, REMOVAL_SHARE, Purse
 from nerfcli.train.selection import (
     MOST_START_STEPS,
     Facts,
@@ -324,3 +324,11 @@ def test_of_values_that_gain_as_much_the_plainest_is_kept():
         gains = {"none": 0.0, "exif": 1.0, "learned": 1.0 + ahead}
         chosen = chosen_by(Scripted(lambda c, gains=gains: gains[c.exposure]), facts=replace(FITTED, has_exif=True))
         assert chosen.components.exposure == kept
+
+
+def test_leaving_out_may_not_use_up_a_limit_of_time_but_may_use_up_steps():
+    purse = Purse(100.0, None)
+    assert purse.takes(3, of_steps=0, seconds_each=30.0)
+    assert not purse.takes(3, of_steps=0, seconds_each=30.0, share_of_time=REMOVAL_SHARE)
+    assert purse.takes(1, of_steps=0, seconds_each=60.0, share_of_time=REMOVAL_SHARE)
+    assert Purse(None, 100).takes(2, of_steps=50, seconds_each=math.inf, share_of_time=REMOVAL_SHARE)

@@ -22,6 +22,9 @@ from nerfcli.train.trials import Start, Trial, Trials
 # Steps of a trial against those of the training that it goes on from.
 STEPS_OF_START = 0.5
 SEEDS = 2
+# Leaving something out saves a little time in the training, and trying it takes some: of a limit of time, this share
+# may be over by then.
+REMOVAL_SHARE = 0.65
 NO_TIME, ONCE = "not tried, no time was left", "not clear, and no time was left to try it again"
 
 
@@ -42,10 +45,10 @@ class Purse:
         """Seconds so far."""
         return time.perf_counter() - self._began
 
-    def takes(self, trials: int, *, of_steps: int, seconds_each: float) -> bool:
-        """Whether there is enough left for some trials."""
+    def takes(self, trials: int, *, of_steps: int, seconds_each: float, share_of_time: float = 1.0) -> bool:
+        """Whether there is enough left for some trials; of time, within a share of what there was."""
         if self._seconds is not None:
-            return self.spent + trials * seconds_each <= self._seconds
+            return self.spent + trials * seconds_each <= share_of_time * self._seconds
         return self._gone + trials * of_steps <= (self._steps or 0)
 
     def take(self, steps: int) -> None:
@@ -95,7 +98,7 @@ class Race:
                     self._drop(other, f"{best[0]}={best[1]} is better")
                 self._try_once(list(self._once))
         for change in removals:
-            if self._can_run(1):
+            if self._can_run(1, share_of_time=REMOVAL_SHARE):
                 self._once[change] = self._trial([change], seed=0)
                 self._is_confirmed(change, judge_removal)
 
@@ -146,8 +149,10 @@ class Race:
         others = ", ".join(name for name, _ in self.kept)
         return replace(decision, why=f"{decision.why} beside {others}") if others else decision
 
-    def _can_run(self, trials: int) -> bool:
-        return self._purse.takes(trials, of_steps=self._length, seconds_each=self._seconds_each)
+    def _can_run(self, trials: int, *, share_of_time: float = 1.0) -> bool:
+        return self._purse.takes(
+            trials, of_steps=self._length, seconds_each=self._seconds_each, share_of_time=share_of_time
+        )
 
     def _trial(self, changes: Sequence[Change], *, seed: int) -> Trial:
         before = self._purse.spent
