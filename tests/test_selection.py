@@ -37,7 +37,7 @@ from nerfcli.train.signs import Signs
 from nerfcli.train.trials import Start, Trial
 
 PHOTOS = 20
-FITTED = Facts("hash", has_alpha=False, has_exif=False, cameras_fitted=True)
+FITTED = Facts("hash", has_alpha=False, has_exif=False, cameras_known="they are exact")
 
 
 def trial(psnr: float, *, halfway: float | None = None, seconds: float = 1.0, noise_db: float = 0.0) -> Trial:
@@ -262,7 +262,7 @@ def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
     def tried(facts: Facts, start: Components = Components()) -> list[object]:
         return [value for name, value in proposals(start, signs(0.0), facts)[0] if name == "cameras"]
 
-    unknown = replace(FITTED, cameras_fitted=False)
+    unknown = replace(FITTED, cameras_known=None)
     assert tried(FITTED) == []
     assert tried(unknown) == ["poses", "focal"]
     assert tried(replace(unknown, fixed=("cameras",))) == []
@@ -282,7 +282,7 @@ def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
     ],
 )
 def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
-    facts = replace(FITTED, cameras_fitted=False, cameras=check)
+    facts = replace(FITTED, cameras_known=None, cameras=check)
     components, log_focal, (decision,) = with_known_focal(Components(), facts)
     assert components == Components(cameras="focal" if kept else "fixed")
     assert log_focal == (check.log_focal if kept else 0.0)
@@ -303,7 +303,7 @@ def test_what_is_clear_is_not_tried_again_and_what_is_surely_missed_neither():
 def test_what_gains_once_is_not_kept_where_no_time_is_left_to_try_it_again():
     """A fifth of the steps is for the start and a tenth for each of eight trials: one without a change, one with each
     of five, and two more for the best."""
-    facts = replace(FITTED, has_exif=True, cameras_fitted=False)
+    facts = replace(FITTED, has_exif=True, cameras_known=None)
     scripted = Scripted(lambda c: 0.35 * (c.exposure == "exif") + 0.3 * (c.cameras == "focal"))
     chosen = chosen_by(scripted, steps=2000, facts=facts)
     assert len(scripted.asked) == 8

@@ -175,7 +175,7 @@ def _search(
         settings.field,
         has_alpha=album.colours.shape[-1] == 4,
         has_exif=bool(np.ptp(exif) > 0.0),
-        cameras_fitted=len(scene.points) > 0,
+        cameras_known=_known(scene),
         cameras=check_cameras(album.photos, matched),
         fixed=settings.fixed,
     )
@@ -203,6 +203,13 @@ def _search(
     for decision in selection.decisions:
         notify(decision.in_words())
     return selection
+
+
+def _known(scene: Scene) -> str | None:
+    """Why nobody has to doubt the cameras; None where one may."""
+    if scene.kind == "blender":
+        return "the pictures were rendered with these cameras"
+    return "structure from motion has fitted cameras to points" if len(scene.points) else None
 
 
 def _exposures(scene: Scene, components: Components, *, notify: Callable[[str], None]) -> tuple[float | None, Tensor]:

@@ -78,7 +78,7 @@ class Facts:
         field: the kind of field.
         has_alpha: whether the photos have alpha: then nothing is behind the object.
         has_exif: whether EXIF tells different exposures.
-        cameras_fitted: whether structure from motion has fitted cameras and points to each other.
+        cameras_known: why the cameras need no doubt, in words; None where they may be wrong.
         cameras: what matched features say of them; None where nothing is known.
         fixed: components that the user has decided on.
     """
@@ -86,7 +86,7 @@ class Facts:
     field: str
     has_alpha: bool
     has_exif: bool
-    cameras_fitted: bool = False
+    cameras_known: str | None = None
     cameras: CameraCheck | None = None
     fixed: tuple[str, ...] = ()
 
@@ -129,8 +129,8 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
         told = f"not tried, photos differ in brightness by {math.expm1(signs.exposure_spread):.1%} only"
         declined.append(untried("exposure", "learned", told))
     check = facts.cameras
-    if facts.cameras_fitted:
-        declined.append(untried("cameras", "poses", "not tried, structure from motion has fitted cameras to points"))
+    if facts.cameras_known is not None:
+        declined.append(untried("cameras", "poses", f"not tried, {facts.cameras_known}"))
     elif check is None:
         candidates += [("cameras", "poses"), ("cameras", "focal")]
     elif min(check.misses_px) < LEAST_MISS_PX:
