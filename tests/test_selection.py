@@ -170,7 +170,7 @@ class Scripted:
         self.gain, self.spread = gain, spread
         self.asked: list[tuple[Components, int, int]] = []
 
-    def begin(self, components: Components, *, steps: int, seconds: float = math.inf) -> Start:
+    def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start:
         return Start({}, {}, steps, 1.0, 20.0, signs(self.spread))
 
     def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:

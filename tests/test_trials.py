@@ -55,6 +55,16 @@ def test_trials_with_the_same_seed_are_the_same_and_leave_their_start_alone(tria
     assert not np.array_equal(first.errors, trials.go_on(start, Components(view=0), seed=4, steps=4).errors)
 
 
+def test_a_start_takes_longer_for_the_fewest_steps_but_twice_as_long_at_most(trials, monkeypatch):
+    """A clock on which every step takes a second."""
+    monkeypatch.setattr(
+        Trials, "_advance", lambda self, fitting, share: (setattr(fitting, "step", fitting.step + 1), 1.0)[1]
+    )
+    for fewest, steps in ((0, 10), (7, 10), (14, 14), (50, 20)):
+        assert trials.begin(Components(), steps=1000, seconds=10.0, fewest=fewest).steps == steps
+    assert trials.begin(Components(), steps=5, seconds=10.0, fewest=50).steps == 5
+
+
 def test_cameras_learn_from_the_fork_on(trials, start):
     """Before it no step moves them, however far the training; behind it one does."""
     fitting = trials._fitting(Components(view=0, cameras="poses"), seed=0, log_gains=None, cameras_from=0.6)

@@ -188,6 +188,7 @@ def select(
         asked,
         steps=min(first_steps, MOST_START_STEPS),
         seconds=math.inf if seconds is None else START_SHARE * seconds,
+        fewest=FEWEST_STEPS,
     )
     purse.take(start.steps)
     if start.steps < FEWEST_STEPS:

@@ -122,18 +122,24 @@ class Trials:
         self._log_focal = log_focal
         self._room = room
 
-    def begin(self, components: Components, *, steps: int, seconds: float = math.inf) -> Start:
+    def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start:
         """Train from the beginning to `FORK_SHARE` of a schedule.
 
         Args:
             components: what is in the model.
             steps: to go at most.
-            seconds: to take at most; how many steps were gone then is in the answer.
+            seconds: to take; how many steps were gone then is in the answer.
+            fewest: steps, for which it takes up to twice as long.
         """
         fitting = self._fitting(components, seed=self._settings.seed, log_gains=None, cameras_from=0.0)
         took = 0.0
-        while (share := max(fitting.step / steps, took / seconds)) < 1.0:
-            took += self._advance(fitting, FORK_SHARE * share)
+
+        def share() -> float:
+            enough = fitting.step / fewest if fewest else math.inf
+            return max(fitting.step / steps, took / (2.0 * seconds), min(took / seconds, enough))
+
+        while share() < 1.0:
+            took += self._advance(fitting, FORK_SHARE * share())
         drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
         with torch.no_grad():
             rendered, measured = fitting.compare(drawn)
