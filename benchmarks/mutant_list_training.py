@@ -34,7 +34,11 @@ TRAINING: tuple[Group, ...] = (
             Mutant("vectors / np.sqrt(values)", "vectors / values"),
             Mutant("jacobian.T @ jacobian", "jacobian.T @ jacobian / len(jacobian)"),
             Mutant("DAMPING * np.diag(squares)", "DAMPING"),
-            Mutant("@ gradient[..., None]", "@ gradient[..., None] * 2"),
+            Mutant(
+                "@ gradient[..., None]",
+                "@ gradient[..., None] * 2",
+                "Adam's steps do not depend on the gradient's size",
+            ),
             Mutant("1 - BETAS[0] ** steps", "1 - BETAS[0]"),
             Mutant("1 - BETAS[1] ** steps", "1 - BETAS[1]"),
             Mutant("return -rate *", "return rate *"),

@@ -34,7 +34,7 @@ from nerfcli.train.photos import PixelPool, load_photos
 from nerfcli.train.refinement import LAST_SHARE, Refinement, rate_at
 from nerfcli.train.run_folder import STATE, read_cameras, read_given_cameras
 from nerfcli.train.settings import TrainSettings
-from nerfcli.train.whitening import DAMPING, whitening
+from nerfcli.train.whitening import BETAS, DAMPING, EPS, WhitenedAdam, whitening
 
 seeds = st.integers(0, 2**32 - 1)
 FEW = TrainSettings(budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
@@ -203,6 +203,22 @@ def test_whitened_steps_move_what_is_seen_alike():
     np.testing.assert_allclose(
         jacobian @ whitening(jacobian) @ (np.eye(3)), jacobian / sizes / np.sqrt(1 + DAMPING), rtol=6e-3
     )
+
+
+def test_whitened_steps_are_those_of_adam_in_whitened_coordinates():
+    """Against torch's own: parameters x = W y, whose gradient by y is W g; the steps of y are Adam's."""
+    rng, rate = np.random.default_rng(0), 0.01
+    squares = rng.normal(size=(2, 3, 3))
+    matrices = squares @ np.swapaxes(squares, -1, -2)
+    white = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
+    theirs, ours = torch.optim.Adam([white], lr=rate, betas=BETAS, eps=EPS), WhitenedAdam(matrices)
+    moved = torch.zeros(2, 3, dtype=torch.float64)
+    for _ in range(5):
+        gradient = torch.from_numpy(rng.normal(size=(2, 3)))
+        moved += ours.change(gradient, rate)
+        white.grad = (torch.from_numpy(matrices) @ gradient[..., None])[..., 0]
+        theirs.step()
+    torch.testing.assert_close(moved, (torch.from_numpy(matrices) @ white.detach()[..., None])[..., 0])
 
 
 def test_rates_rise_from_nothing_and_end_at_nothing():

@@ -138,6 +138,28 @@ def test_one_seed_is_enough_only_where_the_gain_is_clear():
         assert decision.kept == kept == (told(gain) > least)
 
 
+def test_the_margins_in_numbers():
+    """0.05 dB is what nobody sees, 0.1 dB the most that a simpler model may lose; a step that costs a third more has to
+    gain what a third more steps would: 0.4 of the 0.9 dB that twice as many bring."""
+    base = [trial(20.0), trial(21.0)]
+
+    def both(dB: float, seconds: float = 1.0) -> list[Trial]:
+        return [trial(20.0 + dB, seconds=seconds), trial(21.0 + dB, seconds=seconds)]
+
+    assert [judged(base, both(dB)).kept for dB in (0.04, 0.06)] == [False, True]
+    assert [judge_removal(base, ("view", 0), both(dB), by_time=False).kept for dB in (-0.13, -0.08)] == [False, True]
+    assert [judged(base, both(0.4, seconds)).kept for seconds in (1.31, 1.2)] == [False, True]
+
+
+def test_a_photo_without_pixels_to_judge_by_counts_nothing():
+    def without_first(one: Trial) -> Trial:
+        none = np.arange(PHOTOS) > 0
+        return Trial(one.errors * none, one.halfway * none, one.counts * none, one.seconds, one.steps)
+
+    base, tried = ([without_first(trial(20.0 + dB)), without_first(trial(21.0 + dB))] for dB in (0.0, 0.5))
+    assert judged(base, tried).gain_db == pytest.approx(told(0.5), abs=1e-9)
+
+
 def signs(spread: float) -> Signs:
     return Signs(torch.zeros(PHOTOS, 3), spread)
 
