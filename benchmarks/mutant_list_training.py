@@ -6,7 +6,7 @@ TRAINING: tuple[Group, ...] = (
     Group(
         "train/gauge.py",
         ("tests/test_refinement.py",),
-        "mean or similarity or place",
+        "mean or similarity or place or spot",
         (),
         (
             Mutant("arms = centres - middle", "arms = centres"),
@@ -48,7 +48,7 @@ TRAINING: tuple[Group, ...] = (
     Group(
         "train/refinement.py",
         ("tests/test_refinement.py",),
-        "gradient or rates or rays or find_back or moved or cameras_of",
+        "frames_are or picture_moves or mean or gradient or rates or rays or find_back or moved or cameras_of",
         (),
         (
             Mutant("return self._given @ self.motions.numpy()", "return self.motions.numpy() @ self._given"),

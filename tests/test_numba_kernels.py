@@ -101,6 +101,11 @@ def test_hash_encode_by_points(samples, magnitude, generator):
     assert not fast.grad[outside].any()
     if samples == 5:  # few enough that none lies on a face where rounding chooses another cell
         assert_close(fast.grad, exact.grad, "gradient by points, against float64", relative=1e-3)
+    widths = torch.rand(samples, generator=generator).pow(4)
+    fast.grad, same_precision.grad = None, None
+    numba_cpu.hash_encode(fast, table, resolutions, None, None, widths).backward(gradient)
+    reference.hash_encode(same_precision, table, resolutions, widths).backward(gradient)
+    assert_close(fast.grad, same_precision.grad, "gradient by points, with widths")
 
 
 def test_hash_encode_takes_a_sink_and_known_values(generator):

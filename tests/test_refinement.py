@@ -16,10 +16,12 @@ from nerfcli.cameras.formats.run_cameras import find_run, parse_run
 from nerfcli.cameras.rigid import (
     Similarity,
     apply,
+    from_parts,
     inverse,
     look_at,
     rotation_from_vector,
     transform_from_twist,
+    vector_from_rotation,
 )
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.scene import Scene
@@ -31,7 +33,7 @@ from nerfcli.train.gauge import mean_similarity, without_mean
 from nerfcli.train.lens_change import bearings_by_change, changeable, changed
 from nerfcli.train.loop import train
 from nerfcli.train.photos import PixelPool, load_photos
-from nerfcli.train.refinement import LAST_SHARE, Refinement, rate_at
+from nerfcli.train.refinement import LAST_SHARE, PoseRefinement, Refinement, rate_at
 from nerfcli.train.run_folder import STATE, read_cameras, read_given_cameras
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.whitening import BETAS, DAMPING, EPS, WhitenedAdam, whitening
@@ -188,6 +190,57 @@ def test_a_similarity_of_all_cameras_is_taken_out_whole(seed):
     assert rest.scale == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("radius", [0.01, 1.0, 30.0])
+def test_a_turn_of_each_camera_on_its_spot_counts_as_the_move_that_it_would_be(radius):
+    """Closed form for a tetrahedron, whose arms are alike in all directions: of a turn w of all on their spots, w /
+    (1 + 2/3) is taken for one of the whole, whatever the size of the capture."""
+    centres = radius * np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+    before = from_parts(np.broadcast_to(np.eye(3), (4, 3, 3)), centres)
+    turn = np.array([1e-3, -2e-3, 5e-4])
+    after = from_parts(np.broadcast_to(rotation_from_vector(turn), (4, 3, 3)), centres)
+    found = mean_similarity(before, after)
+    np.testing.assert_allclose(vector_from_rotation(found.rotation), 0.6 * turn, rtol=1e-6)
+
+
+def test_a_step_of_poses_leaves_no_mean_and_far_cameras_move_farther(small):
+    """The gauge after a step; and a unit of whitened moves, which moves pictures alike at any distance."""
+    pool, generator = pool_of(small), torch.Generator().manual_seed(0)
+    poses = Refinement("poses", pool).poses
+    assert poses is not None
+    given = poses.poses()
+    gradient = torch.randn(len(given), 6, generator=generator, dtype=torch.float64)
+    poses.step(gradient + 1.0, 1e-3, freedom=torch.ones(6, dtype=torch.float64))
+    assert np.abs(poses.poses() - given).max() > 1e-4
+    rest = mean_similarity(given, poses.poses())
+    assert np.linalg.norm(vector_from_rotation(rest.rotation)) < 1e-5  # to first order
+    away = np.linalg.norm(given[:, :3, 3], axis=1).max()
+    given[1:, :3, 3] *= 10 * away / np.linalg.norm(given[1:, :3, 3], axis=1, keepdims=True)
+    given[:1, :3, 3] *= away / np.linalg.norm(given[:1, :3, 3], axis=1, keepdims=True)
+    change = PoseRefinement(given, pool.cameras).adam.change(torch.eye(6, dtype=torch.float64)[:1].repeat(3, 1), 1.0)
+    near, far, _ = change[:, :3].norm(dim=-1).tolist()
+    assert 5 < far / near < 20
+
+
+def test_poses_are_whitened_by_how_the_picture_moves(small):
+    """Against differences: 6 x 6 pixels of a camera at distance 3, at 2/3, 1 and 2 of that, as it moves by twists. The
+    first step of Adam tells the whitening W: it is W times the signs of W g."""
+    camera, step = small.frames[0].camera, 1e-6
+    pose = look_at(np.array([3.0, 0.0, 0.0]), np.zeros(3), np.array([0, 0, 1]))
+    x, y = ((np.arange(6) + 0.5) / 6 * side for side in (camera.width, camera.height))
+    bearings, _ = camera.bearings(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    points = np.concatenate([3 * share * bearings for share in (2 / 3, 1.0, 2.0)])
+    columns = []
+    for twist in np.eye(6):
+        ahead, behind = (
+            camera.project(apply(inverse(transform_from_twist(sign * step * twist)), points))[0] for sign in (1, -1)
+        )
+        columns.append((ahead - behind).ravel() / (2 * step * camera.focal_px * np.sqrt(len(points))))
+    wanted = whitening(np.stack(columns, axis=-1))
+    gradient = np.random.default_rng(0).normal(size=6)
+    change = PoseRefinement(pose[None], [camera]).adam.change(torch.from_numpy(gradient)[None], 1.0)
+    np.testing.assert_allclose(change[0].numpy(), -wanted @ np.sign(wanted @ gradient), rtol=1e-5)
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_cameras_in_one_place_have_no_scale(count):
     before = np.repeat(random_poses(np.random.default_rng(0), 1), count, axis=0)
@@ -236,6 +289,27 @@ def test_cameras_that_have_not_moved_give_the_same_rays(small):
     refined = Refinement("poses", pool).refined(drawn)
     assert torch.equal(refined.origins, drawn.origins)
     torch.testing.assert_close(refined.directions, drawn.directions, atol=2e-7, rtol=0)
+
+
+def test_lenses_that_have_not_changed_give_the_same_rays(small):
+    pool = pool_of(small)
+    drawn = pool.draw(100, torch.Generator().manual_seed(0))
+    refined = Refinement("focal", pool).refined(drawn)
+    torch.testing.assert_close(refined.directions, drawn.directions, atol=2e-7, rtol=0)
+
+
+def test_frames_are_where_the_cameras_of_the_training_frame_are(small):
+    """The law of the frame: what is exported, normalised, is what rays were cast from."""
+    similarity = Similarity(2.5, rotation_from_vector(np.array([0.3, -0.2, 0.9])), np.array([1.0, 2.0, 3.0]))
+    pool = PixelPool(load_photos(small.train_frames, factor=1, threads=1), similarity, torch.device("cpu"))
+    refinement = Refinement("poses", pool)
+    assert refinement.poses is not None
+    twists = np.random.default_rng(0).normal(size=(3, 6)) * 0.1
+    refinement.poses.motions.copy_(torch.from_numpy(transform_from_twist(twists)))
+    refined, held_out = refinement.frames(small.train_frames, small.test_frames, scale=similarity.scale)
+    poses = similarity.apply_pose(np.array([frame.world_from_cam for frame in refined]))
+    np.testing.assert_allclose(poses, refinement.poses.poses(), atol=1e-5)  # those of the pool are float32
+    assert np.array_equal(held_out[0].world_from_cam, small.test_frames[0].world_from_cam)
 
 
 def test_photos_find_back_into_a_field_that_knows_better(spheres, spheres_run):
