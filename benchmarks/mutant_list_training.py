@@ -93,7 +93,7 @@ TRAINING: tuple[Group, ...] = (
     Group(
         "train/camera_moves.py",
         ("tests/test_refinement.py",),
-        "moved or cameras_of",
+        "moves_are or cameras_of",
         (),
         (
             Mutant("np.degrees(turns)", "turns"),

@@ -291,6 +291,23 @@ def test_cameras_that_have_not_moved_give_the_same_rays(small):
     torch.testing.assert_close(refined.directions, drawn.directions, atol=2e-7, rtol=0)
 
 
+def test_moves_are_told_in_degrees_and_percent(small):
+    """By hand: one photo turned by 2 degrees, another moved by 0.3 in a scene of radius 6, both 1 % longer."""
+    first, second, third = small.train_frames
+    turn = transform_from_twist(np.array([0, 0, 0, 0, 0, np.radians(2.0)]))
+    move = transform_from_twist(np.array([0, 0.3, 0, 0, 0, 0]))
+    longer = changed(first.camera, ("focal",), np.log([1.01]))
+    after = [
+        replace(first, world_from_cam=first.world_from_cam @ turn, camera=longer),
+        replace(second, world_from_cam=second.world_from_cam @ move, camera=longer),
+        third,
+    ]
+    moves = camera_moves([first, second, third], after, radius=6.0)
+    assert moves["rotation_deg"] == {"median": 0.0, "max": 2.0}
+    assert moves["translation_percent"] == {"median": 0.0, "max": 5.0}
+    assert moves["focal_percent"] == {"median": 1.0, "max": 1.0}
+
+
 def test_lenses_that_have_not_changed_give_the_same_rays(small):
     pool = pool_of(small)
     drawn = pool.draw(100, torch.Generator().manual_seed(0))
