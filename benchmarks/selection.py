@@ -37,7 +37,6 @@ NEEDED: dict[str, dict[str, object]] = {
     "focal": {"cameras": "focal"},
     "desk": {},
     "poses-balls": {"cameras": "poses"},
-    "focal-balls": {"cameras": "focal"},
 }
 NEEDS_VIEW = ("glossy",)
 SEARCH_STEPS = 1000

@@ -132,7 +132,9 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
     if facts.cameras_known is not None:
         declined.append(untried("cameras", "poses", f"not tried, {facts.cameras_known}"))
     elif check is None:
-        candidates += [("cameras", "poses"), ("cameras", "focal")]
+        candidates.append(("cameras", "poses"))
+        # Within a trial, a right length changes as much as a wrong one: the coarse field pulls at both.
+        declined.append(untried("cameras", "focal", "not tried, photos share too few features to tell"))
     elif min(check.misses_px) < LEAST_MISS_PX:
         told = f"not tried, matched features miss by {min(check.misses_px):.2f} px only"
         declined.append(untried("cameras", "poses", told))
