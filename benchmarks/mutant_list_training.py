@@ -57,8 +57,8 @@ TRAINING: tuple[Group, ...] = (
                 "turns = self._given[:, :3, :3] @ np.swapaxes(now[:, :3, :3], -1, -2)",
             ),
             Mutant("return origins + shift,", "return origins - shift,"),
-            Mutant("torch.linalg.cross(directions, by_direction))", "torch.linalg.cross(by_direction, directions))"),
-            Mutant("index_add_(0, photos, by_origin)", "index_add_(0, photos, -by_origin)"),
+            Mutant("torch.linalg.cross(directions, by_direction)", "torch.linalg.cross(by_direction, directions)"),
+            Mutant("torch.stack([by_origin, torque]", "torch.stack([-by_origin, torque]"),
             Mutant(
                 "without_mean(self._given, self.poses() @ transform_from_twist(twists))",
                 "self.poses() @ transform_from_twist(twists)",

@@ -32,6 +32,7 @@ from nerfcli.train.fitting import Fitting
 from nerfcli.train.gauge import mean_similarity, without_mean
 from nerfcli.train.lens_change import bearings_by_change, changeable, changed
 from nerfcli.train.loop import train
+from nerfcli.train.newton import NewtonSteps
 from nerfcli.train.photos import PixelPool, load_photos
 from nerfcli.train.refinement import LAST_SHARE, PoseRefinement, Refinement, rate_at
 from nerfcli.train.run_folder import STATE, read_cameras, read_given_cameras
@@ -94,9 +95,10 @@ def test_pose_gradient_is_the_difference_of_a_loss(small):
     start = torch.from_numpy(transform_from_twist(twists.numpy()))
     poses.motions.copy_(start)
     drawn = refinement.refined(pool.rays_of(numbers))
-    found = poses.gradient(
+    of_rays = poses.gradients(
         drawn.directions.double(), pool.photo_of(numbers), by_origin=slopes[0], by_direction=slopes[1]
     )
+    found = torch.zeros(3, 6, dtype=torch.float64).index_add_(0, pool.photo_of(numbers), of_rays)
     step = 1e-2  # float32 rays; the third derivative of a turn is about the first
     for photo in range(3):
         for axis in range(6):
@@ -202,28 +204,26 @@ def test_a_turn_of_each_camera_on_its_spot_counts_as_the_move_that_it_would_be(r
     np.testing.assert_allclose(vector_from_rotation(found.rotation), 0.6 * turn, rtol=1e-6)
 
 
-def test_a_step_of_poses_leaves_no_mean_and_far_cameras_move_farther(small):
-    """The gauge after a step; and a unit of whitened moves, which moves pictures alike at any distance."""
+def test_a_step_of_poses_leaves_no_mean_and_far_cameras_see_moves_less(small):
+    """The gauge after a step; and what moves change in the picture is one over the distance."""
     pool, generator = pool_of(small), torch.Generator().manual_seed(0)
     poses = Refinement("poses", pool).poses
     assert poses is not None
     given = poses.poses()
-    gradient = torch.randn(len(given), 6, generator=generator, dtype=torch.float64)
-    poses.step(gradient + 1.0, 1e-3, freedom=torch.ones(6, dtype=torch.float64))
+    gradients = torch.randn(90, 6, generator=generator, dtype=torch.float64) + 1.0
+    poses.step(gradients, torch.full((90,), 0.5, dtype=torch.float64), torch.arange(90) % 3, 0.3, rate=1.0)
     assert np.abs(poses.poses() - given).max() > 1e-4
     rest = mean_similarity(given, poses.poses())
     assert np.linalg.norm(vector_from_rotation(rest.rotation)) < 1e-5  # to first order
     away = np.linalg.norm(given[:, :3, 3], axis=1).max()
-    given[1:, :3, 3] *= 10 * away / np.linalg.norm(given[1:, :3, 3], axis=1, keepdims=True)
-    given[:1, :3, 3] *= away / np.linalg.norm(given[:1, :3, 3], axis=1, keepdims=True)
-    change = PoseRefinement(given, pool.cameras).adam.change(torch.eye(6, dtype=torch.float64)[:1].repeat(3, 1), 1.0)
-    near, far, _ = change[:, :3].norm(dim=-1).tolist()
-    assert 5 < far / near < 20
+    given[:, :3, 3] *= np.array([[1.0], [10.0], [10.0]]) * away / np.linalg.norm(given[:, :3, 3], axis=1, keepdims=True)
+    near, far, _ = torch.diagonal(PoseRefinement(given, pool.cameras).picture, dim1=1, dim2=2)
+    torch.testing.assert_close(near[:3] / far[:3], torch.full((3,), 100.0, dtype=torch.float64))
+    torch.testing.assert_close(near[3:], far[3:])
 
 
-def test_poses_are_whitened_by_how_the_picture_moves(small):
-    """Against differences: 6 x 6 pixels of a camera at distance 3, at 2/3, 1 and 2 of that, as it moves by twists. The
-    first step of Adam tells the whitening W: it is W times the signs of W g."""
+def test_how_the_picture_moves_with_a_pose(small):
+    """Against differences: 6 x 6 pixels of a camera at distance 3, at 2/3, 1 and 2 of that, as it moves by twists."""
     camera, step = small.frames[0].camera, 1e-6
     pose = look_at(np.array([3.0, 0.0, 0.0]), np.zeros(3), np.array([0, 0, 1]))
     x, y = ((np.arange(6) + 0.5) / 6 * side for side in (camera.width, camera.height))
@@ -235,10 +235,26 @@ def test_poses_are_whitened_by_how_the_picture_moves(small):
             camera.project(apply(inverse(transform_from_twist(sign * step * twist)), points))[0] for sign in (1, -1)
         )
         columns.append((ahead - behind).ravel() / (2 * step * camera.focal_px * np.sqrt(len(points))))
-    wanted = whitening(np.stack(columns, axis=-1))
-    gradient = np.random.default_rng(0).normal(size=6)
-    change = PoseRefinement(pose[None], [camera]).adam.change(torch.from_numpy(gradient)[None], 1.0)
-    np.testing.assert_allclose(change[0].numpy(), -wanted @ np.sign(wanted @ gradient), rtol=1e-5)
+    jacobian = np.stack(columns, axis=-1)
+    found = PoseRefinement(pose[None], [camera]).picture[0].numpy()
+    np.testing.assert_allclose(found, jacobian.T @ jacobian, rtol=1e-5, atol=1e-7)
+
+
+@given(seed=seeds, turned_only=st.booleans())
+@examples(10)
+def test_what_was_right_says_where_the_cameras_are(seed, turned_only):
+    """Turns that were wrong do not enter the similarity, nor do centres: those that were right come back."""
+    rng = np.random.default_rng(seed)
+    before = random_poses(rng, 12)
+    noisy = before.copy()
+    if turned_only:
+        noisy[:, :3, :3] = noisy[:, :3, :3] @ rotation_from_vector(rng.normal(scale=1e-2, size=(12, 3)))
+    else:
+        noisy[:, :3, 3] += rng.normal(scale=1e-2, size=(12, 3))
+    small = Similarity(1.002, rotation_from_vector(rng.normal(scale=1e-3, size=3)), rng.normal(scale=1e-3, size=3))
+    found = without_mean(before, small.apply_pose(noisy))
+    kept = (slice(None), slice(3), 3 if turned_only else slice(3))
+    assert np.abs(found[kept] - before[kept]).max() < 1e-4
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -274,13 +290,41 @@ def test_whitened_steps_are_those_of_adam_in_whitened_coordinates():
     torch.testing.assert_close(moved, (torch.from_numpy(matrices) @ white.detach()[..., None])[..., 0])
 
 
+def newton(rng: np.random.Generator, strengths: np.ndarray) -> tuple[NewtonSteps, torch.Tensor, torch.Tensor]:
+    """Steps that have learned from scalar residuals J (x - wanted), loss r^2 / 2, at x = 0; wanted, and the slope."""
+    wanted = torch.from_numpy(rng.normal(scale=0.1, size=(3, 6)))
+    rows = torch.from_numpy(rng.normal(size=(600, 6)) * np.sqrt(strengths))
+    photos = torch.arange(600) % 3
+    residuals = -(rows * wanted[photos]).sum(-1)
+    steps = NewtonSteps(3, torch.full((3, 6), 1e3, dtype=torch.float64))
+    # Far above the least loss that counts.
+    slope = steps.learn(1e6 * residuals[:, None] * rows, 1e6 * residuals**2 / 2, photos)
+    return steps, wanted, slope
+
+
+def test_an_undamped_step_solves_least_squares():
+    """Residuals that are linear in the numbers: the way to their zero, however unequal the numbers' effects are."""
+    steps, wanted, slope = newton(np.random.default_rng(0), np.array([1, 1e-3, 1e-2, 1, 10, 100]))
+    found = steps.change(slope, torch.zeros(3, 6, dtype=torch.float64), damping=0.0, holding=0.0)
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_what_hardly_moved_is_held_and_what_moved_far_is_not():
+    """Turns of 10 pixels against moves of a thousandth: moves go back, by what holds them; turns stay."""
+    steps, _, _ = newton(np.random.default_rng(0), np.ones(6))
+    so_far = torch.tensor([[1e-5] * 3 + [0.2] * 3] * 3, dtype=torch.float64)
+    found = steps.change(torch.zeros_like(so_far), so_far, damping=0.0, holding=1.0)
+    assert (found[:, :3] / so_far[:, :3] < -0.8).all()
+    assert (found[:, 3:] / so_far[:, 3:]).abs().max() < 0.05
+
+
 def test_rates_rise_from_nothing_and_end_at_nothing():
     shares = np.linspace(0, 1, 201)
     rates = np.array([rate_at(share) for share in shares])
     assert rates.max() == 1.0
     assert (rates[[0, -1]] == 0).all()
     assert (rates[shares >= LAST_SHARE] == 0).all()
-    assert np.abs(np.diff(rates)).max() < 0.1
+    assert np.abs(np.diff(rates)).max() < 0.11
 
 
 def test_cameras_that_have_not_moved_give_the_same_rays(small):

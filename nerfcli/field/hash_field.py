@@ -74,7 +74,7 @@ class HashField(Field):
     def refine(self, share: float) -> None:
         resolutions = self.settings.resolutions
         first = min(FIRST_LEVELS, len(resolutions))
-        learning = first + int((len(resolutions) - first) * share / ALL_LEVELS_SHARE)
+        learning = max(1, first + math.floor((len(resolutions) - first) * share / ALL_LEVELS_SHARE))
         self._resolutions = tuple(side if level < learning else 0 for level, side in enumerate(resolutions))
 
     def density(self, coordinates: Tensor) -> Tensor:

@@ -71,7 +71,8 @@ class Field(nn.Module, abc.ABC):
         """
 
     def refine(self, share: float) -> None:
-        """Have the details learn that are due at this share of the budget; see `hash_field`.
+        """Have the details learn that are due at this share of the budget, see `hash_field`; below 0, fewer than at
+        first.
 
         Those that do not learn yet are as they were made: nothing that can be seen.
         """

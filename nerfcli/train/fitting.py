@@ -145,12 +145,14 @@ class Fitting:
         self.in_step = True
         watch.state(self.state)
         self.furthest = max(self.furthest, share)
-        self.field.refine(self.furthest)
+        # A field whose cameras begin late has its detail already.
+        late = self._cameras_from > 0.0
+        self.field.refine(self.furthest if late else self.parts.share_of_detail(self.furthest))
         of_cameras = max(0.0, share - self._cameras_from) / (1.0 - self._cameras_from)
         drawn = self.parts.with_learning_rays(self.draw(share), of_cameras)
         rays = len(drawn.origins)
         edges = self.edges[:: self._stride(share)].contiguous()
-        loss, samples = self._loss(drawn, edges=edges, share=share, watch=watch)
+        loss, losses, samples = self._loss(drawn, edges=edges, share=share, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
         if samples > 0:
@@ -160,7 +162,7 @@ class Fitting:
         self.step += 1
         self.optimiser.step(self.step, rate)
         self.parts_optimiser.step(rate)
-        self.parts.step_cameras(drawn, of_cameras, factor=self.rate_factor)
+        self.parts.step_cameras(drawn, losses, of_cameras, factor=self.rate_factor)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False
@@ -197,8 +199,8 @@ class Fitting:
         warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, share / WARMUP_SHARE))
         return self.rate_factor * settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
 
-    def _loss(self, drawn: Drawn, *, edges: Tensor, share: float, watch: Watch) -> tuple[Tensor, int]:
-        """Loss over some rays, and the number of samples it took."""
+    def _loss(self, drawn: Drawn, *, edges: Tensor, share: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
+        """Loss over some rays, that of the colour of each, and the number of samples it took."""
         origins, directions = drawn.origins, drawn.directions
         components, device = self.components, origins.device
         jitter = torch.rand(len(origins), generator=self.generator, device=device)
@@ -255,7 +257,7 @@ class Fitting:
             watch.rows(name, tensor, rays)
         watch.rows("rendered colour", rendered, torch.arange(len(rendered), device=device))
         watch.values("loss", loss)
-        return loss, len(starts)
+        return loss, losses.detach(), len(starts)
 
     @torch.no_grad()
     def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:

@@ -16,6 +16,9 @@ from nerfcli.train.refinement import Refinement, rate_at
 # Learning rates as multiples of the field's. After 300 steps at 0.3, gains of photos are a tenth of the way to the true
 # ones, at 2 half of it, at 5 no further.
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
+# Detail comes later to a field whose cameras learn: see `Parts.share_of_detail`. Balls, photos turned by 0.5 degree,
+# 800 steps: 31.1 dB with the usual shares, 31.2 with 0.7 of them, 31.9 and 32.0 with these.
+DETAIL_DELAY, DETAIL_SLOPE = 0.125, 0.875
 # From here on a photo's level says only that the light was at least that bright.
 SATURATED = 254.5 / 255
 # A ray that meets less than this has no colour of its own to speak of.
@@ -61,6 +64,11 @@ class Parts(nn.Module):
         learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
         return [{"params": tensors, "multiple": rate} for tensors, rate in learned if tensors[0].requires_grad]
 
+    def share_of_detail(self, share: float) -> float:
+        """The share of the budget whose detail the field may have: cameras find their places in a coarse field, while
+        a fine one learns to show each photo as it is, in its wrong place."""
+        return share if self.cameras is None else DETAIL_SLOPE * share - DETAIL_DELAY
+
     def gradients(self) -> dict[str, Tensor]:
         """By name, those that there are."""
         return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
@@ -78,16 +86,17 @@ class Parts(nn.Module):
             origins=refined.origins.clone().requires_grad_(), directions=refined.directions.clone().requires_grad_()
         )
 
-    def step_cameras(self, drawn: Drawn, share: float, *, factor: float) -> None:
+    def step_cameras(self, drawn: Drawn, losses: Tensor, share: float, *, factor: float) -> None:
         """One step of the cameras against the gradients of rays of `with_learning_rays`.
 
         Args:
             drawn: those rays.
+            losses: (R,) of each of them.
             share: of the budget.
             factor: of the rate.
         """
         if self.cameras is not None:
-            self.cameras.step(drawn, share, factor=factor)
+            self.cameras.step(drawn, losses, share, factor=factor)
 
     def behind(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) what rays are composited on: black or random colours.

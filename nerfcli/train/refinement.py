@@ -13,9 +13,10 @@ from torch import Tensor, nn
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.cameras.rigid import from_parts, transform_from_twist
+from nerfcli.cameras.rigid import from_parts, transform_from_twist, vector_from_rotation
 from nerfcli.train.gauge import relative_motions, without_mean
 from nerfcli.train.lens_change import FOCAL, bearings_by_change, changeable, changed, pixels_by_change
+from nerfcli.train.newton import NewtonSteps
 from nerfcli.train.photos import Drawn, Pool
 from nerfcli.train.whitening import WhitenedAdam, whitening
 
@@ -25,29 +26,37 @@ _PIXELS_A_SIDE = 6
 _DISTANCES = (2 / 3, 1.0, 2.0)
 # A camera in the middle sees what is at least so far away.
 _LEAST_DISTANCE = 0.2
-# Radians that a whitened step of a pose moves the picture by, at most, and those of a lens.
-POSE_RATE, LENS_RATE = 3e-4, 3e-4
-# Until the first share of the budget there is fog, from which cameras learn nothing; the rate rises up to the second,
-# and falls to 0 at the last, so that the field can settle.
-FIRST_SHARE, FULL_SHARE, LAST_SHARE = 0.05, 0.15, 0.9
-# Until this share cameras only turn. A turn and a move look much alike: let loose together, each takes half of what is
-# wrong, and what tells them apart is learned late. This is a bet on turns. Balls, 800 steps, one seed, with it against
-# without: photos turned by 0.5 degree 0.11 against 0.27 degree, 30.3 against 27.3 dB; centres off by 0.9 % of the
-# radius per axis 1.06 against 0.37 %, 27.2 against 29.5 dB.
-MOVE_SHARE = 0.5
+# Radians that a whitened step of a lens moves the picture by, at most.
+LENS_RATE = 3e-4
+# Radians that a step of a pose moves the picture by, at most.
+_FARTHEST_STEP = 2e-3
+# Until the first share of the budget there is fog, from which cameras learn nothing; the rate rises up to the second.
+# From the third on it falls, down to a last rate, so that the steps' noise averages out and the field can settle.
+FIRST_SHARE, FULL_SHARE, FALLING_SHARE, LAST_SHARE, LAST_RATE = 0.1, 0.15, 0.5, 0.98, 0.03
+# A turn and a move look much alike, and a young field tells them apart wrongly: what a photo is not sure of is damped
+# at first, and less from share to share.
+DAMPING_SHARES, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
+# Then cameras are held, see `NewtonSteps.change`; not before it is known what was wrong with them.
+HOLDING_SHARES, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
 
 
 def rate_at(share: float) -> float:
-    """The rate of cameras at a share of the budget, in [0, 1]: a line up, half a cosine down."""
+    """The rate of cameras at a share of the budget, in [0, 1]: a line up, then level, then an exponential down."""
     if not FIRST_SHARE < share < LAST_SHARE:
         return 0.0
     if share < FULL_SHARE:
         return (share - FIRST_SHARE) / (FULL_SHARE - FIRST_SHARE)
-    return float((1 + np.cos(np.pi * (share - FULL_SHARE) / (LAST_SHARE - FULL_SHARE))) / 2)
+    return _between(share, (FALLING_SHARE, LAST_SHARE), (1.0, LAST_RATE))
+
+
+def _between(share: float, shares: tuple[float, float], values: tuple[float, float]) -> float:
+    """The first value up to the first share, the second from the second on, and an exponential in between."""
+    return float(np.exp(np.interp(share, shares, np.log(values))))
 
 
 class PoseRefinement(nn.Module):
-    """The poses of P photos: `motions` (P, 4, 4) is `given_from_refined`, in the axes of each camera.
+    """The poses of P photos: `motions` (P, 4, 4) is `given_from_refined`, in the axes of each camera; a small twist x
+    (6,) moves what a camera sees by sqrt(x^T `picture` x) radians, root mean square.
 
     Args:
         poses: (P, 4, 4) `world_from_cam` as given, training frame.
@@ -61,11 +70,16 @@ class PoseRefinement(nn.Module):
         self.register_buffer("motions", torch.eye(4, dtype=torch.float64).repeat(len(poses), 1, 1))
         at_one = {camera: _picture_by_twist(camera) for camera in dict.fromkeys(cameras)}
         distances = np.linalg.norm(poses[:, :3, 3], axis=1).clip(_LEAST_DISTANCE)
-        whitenings = []
-        for camera, distance in zip(cameras, distances, strict=True):
-            # What a move changes becomes less with the distance, what a turn changes does not.
-            whitenings.append(whitening(at_one[camera] * np.array([1 / distance] * 3 + [1.0] * 3)))
-        self.adam = WhitenedAdam(np.array(whitenings))
+        # What a move changes becomes less with the distance, what a turn changes does not.
+        jacobians = [
+            at_one[camera] * np.array([1 / distance] * 3 + [1.0] * 3)
+            for camera, distance in zip(cameras, distances, strict=True)
+        ]
+        squares = np.array([jacobian.T @ jacobian for jacobian in jacobians])
+        self.picture = torch.from_numpy(squares)
+        focal = np.array([camera.focal_px for camera in cameras])
+        picture_px = focal[:, None] ** 2 * np.diagonal(squares, axis1=1, axis2=2)
+        self.newton = NewtonSteps(len(poses), torch.from_numpy(picture_px))
 
     def poses(self) -> np.ndarray:
         """(P, 4, 4) `world_from_cam` now."""
@@ -80,20 +94,36 @@ class PoseRefinement(nn.Module):
         shift = torch.from_numpy(now[:, :3, 3] - self._given[:, :3, 3]).to(origins)[photos]
         return origins + shift, (turn * directions[:, None, :]).sum(-1)
 
-    def gradient(self, directions: Tensor, photos: Tensor, *, by_origin: Tensor, by_direction: Tensor) -> Tensor:
-        """(P, 6) by twists of the cameras in their own axes, from gradients (R, 3) by rays as they are now, float64.
+    def gradients(self, directions: Tensor, photos: Tensor, *, by_origin: Tensor, by_direction: Tensor) -> Tensor:
+        """(R, 6) by twists of the rays' cameras in their own axes, from gradients (R, 3) by rays as they are now, all
+        float64.
 
         A camera that moves by u and turns by w in its axes moves its rays by R u, and turns them by R w.
         """
-        force = torch.zeros(len(self._given), 3, dtype=torch.float64).index_add_(0, photos, by_origin)
-        torque = torch.zeros_like(force).index_add_(0, photos, torch.linalg.cross(directions, by_direction))
-        cam_from_world = torch.from_numpy(self.poses()[:, :3, :3]).transpose(-1, -2)
-        return (cam_from_world @ torch.stack([force, torque], dim=-1)).transpose(-1, -2).flatten(-2)
+        torque = torch.linalg.cross(directions, by_direction)
+        cam_from_world = torch.from_numpy(self.poses()[:, :3, :3]).transpose(-1, -2)[photos]
+        return (cam_from_world @ torch.stack([by_origin, torque], dim=-1)).transpose(-1, -2).flatten(-2)
 
-    def step(self, gradient: Tensor, rate: float, *, freedom: Tensor) -> None:
-        """One step against a gradient (P, 6), along the twists whose `freedom` (6,) is 1, not where it is 0; afterwards
-        the mean similarity of all moves is taken out."""
-        twists = (freedom * self.adam.change(freedom * gradient, rate)).numpy()
+    def step(self, gradients: Tensor, losses: Tensor, photos: Tensor, share: float, *, rate: float) -> None:
+        """A step against gradients (R, 6) of losses (R,) of rays; afterwards the mean similarity of all moves is taken
+        out.
+
+        Args:
+            gradients, losses: of each ray by itself.
+            photos: (R,) whose rays they are.
+            share: of the budget.
+            rate: in [0, 1], of the step that would be the whole way.
+        """
+        so_far = self.motions.numpy()
+        so_far = np.concatenate([so_far[:, :3, 3], vector_from_rotation(so_far[:, :3, :3])], axis=1)
+        twists = rate * self.newton.change(
+            self.newton.learn(gradients, losses, photos),
+            torch.from_numpy(so_far),
+            damping=_between(share, DAMPING_SHARES, DAMPINGS),
+            holding=_between(share, HOLDING_SHARES, HOLDINGS) if share > HOLDING_SHARES[0] else 0.0,
+        )
+        seen = (twists[:, None] @ self.picture @ twists[..., None])[..., 0].sqrt()  # (P, 1) radians
+        twists = (twists * (_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP))).numpy()
         moved = without_mean(self._given, self.poses() @ transform_from_twist(twists))
         self.motions.copy_(torch.from_numpy(relative_motions(self._given, moved)))
 
@@ -214,11 +244,12 @@ class Refinement(nn.Module):
         return drawn._replace(origins=origins, directions=directions)
 
     @torch.no_grad()
-    def step(self, drawn: Drawn, share: float, *, factor: float) -> None:
-        """One step against the gradients of `drawn`, which `refined` gave.
+    def step(self, drawn: Drawn, losses: Tensor, share: float, *, factor: float) -> None:
+        """One step against the gradients of the mean loss of `drawn`, which `refined` gave.
 
         Args:
             drawn: rays that have gradients.
+            losses: (R,) of each.
             share: of the budget, for `rate_at`.
             factor: of the rate.
         """
@@ -234,9 +265,8 @@ class Refinement(nn.Module):
         if self.lenses is not None:
             by_lens = self.lenses.gradient(numbers, photos, turns=turns, by_direction=by_direction)
         if self.poses is not None:
-            by_pose = self.poses.gradient(directions, photos, by_origin=by_origin, by_direction=by_direction)
-            freedom = torch.tensor([float(share >= MOVE_SHARE)] * 3 + [1.0] * 3, dtype=torch.float64)
-            self.poses.step(by_pose, POSE_RATE * rate, freedom=freedom)
+            by_pose = self.poses.gradients(directions, photos, by_origin=by_origin, by_direction=by_direction)
+            self.poses.step(len(by_pose) * by_pose, losses.double().cpu(), photos, share, rate=rate)
         if self.lenses is not None and by_lens is not None:
             self.lenses.step(by_lens, LENS_RATE * rate)
 
