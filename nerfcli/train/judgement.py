@@ -106,6 +106,18 @@ def judge_one(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, 
     return Decision(*change, gain, error, trend, cost, at_equal_time, against is None, why)
 
 
+def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
+    """What paired trials say of something that mends a fault which is known from elsewhere: it only has to gain.
+
+    A trial is too short for all of its gain. Arguments as of `judge_one`.
+    """
+    measured = judge_one(base, change, tried, by_time=by_time)
+    gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
+    if gain > error:
+        return replace(measured, kept=True, why="gains, and what it mends is known from matched features")
+    return replace(measured, kept=False, why="no gain, though matched features speak for it")
+
+
 def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
     """What paired trials say of what is left out of the model: hardly anything must be lost, noise and trend included.
 

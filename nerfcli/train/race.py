@@ -1,7 +1,7 @@
 """Candidates against one another, within a limit of time or steps: the best first, the others beside it."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from torch import Tensor
@@ -15,6 +15,7 @@ from nerfcli.train.judgement import (
     Rule,
     judge_one,
     judge_removal,
+    judge_supported,
     untried,
 )
 from nerfcli.train.trials import Start, Trial, Trials
@@ -74,26 +75,32 @@ class Race:
         # Trials of what is kept so far, one per seed; and of what gained once beside it.
         self._base: list[Trial] = []
         self._once: dict[Change, Trial] = {}
+        self._supported: Collection[Change] = ()
 
     @property
     def log_gains(self) -> Tensor | None:
         """Of the exposures that the model which won has found."""
         return self._base[0].log_gains if self._base else None
 
-    def run(self, additions: Sequence[Change], removals: Sequence[Change]) -> None:
+    def run(self, additions: Sequence[Change], removals: Sequence[Change], supported: Collection[Change] = ()) -> None:
         """Fill `decisions` and `kept`.
 
         All additions with one seed; then the best of them with the others unless it is clear already, and if it is
         kept, the rest once more beside it; and so on. Removals last, as what is added may do their work.
+
+        Args:
+            additions, removals: changes of the model that was asked for.
+            supported: those of the additions that mend a fault which is known; see `judge_supported`.
         """
         self.decisions = {change: untried(*change, NO_TIME) for change in (*additions, *removals)}
+        self._supported = supported
         if not self.decisions or not self._can_run(2):
             return
         self._base = [self._trial([], seed=0)]
         self._try_once(additions)
         while self._once:
             best = self._best()
-            if self._is_confirmed(best, judge_one):
+            if self._is_confirmed(best, self._rule(best)):
                 for other in [other for other in self._once if other[0] == best[0]]:
                     self._drop(other, f"{best[0]}={best[1]} is better")
                 self._try_once(list(self._once))
@@ -111,10 +118,13 @@ class Race:
                     self._drop(change, ONCE)
                 continue
             trial = self._trial([change], seed=0)
-            decision = self._judged(judge_one, change, [trial])
+            decision = self._judged(self._rule(change), change, [trial])
             self.decisions[change] = replace(decision, kept=False)
-            if (decision.gain_db or 0.0) > LEAST_GAIN_DB:
+            if (decision.gain_db or 0.0) > (0.0 if change in self._supported else LEAST_GAIN_DB):
                 self._once[change] = trial
+
+    def _rule(self, addition: Change) -> Rule:
+        return judge_supported if addition in self._supported else judge_one
 
     def _best(self) -> Change:
         """The one that gains most; of a component's values that gain as much as seeds differ by, the one proposed

@@ -7,7 +7,7 @@ first is in the model that the next one has to better: two components that mend 
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -149,6 +149,11 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
     )
 
 
+def supported(candidates: Sequence[Change], facts: Facts) -> list[Change]:
+    """Those of the candidates that mend a fault which is known without a trial: cameras whose photos disagree."""
+    return [change for change in candidates if change[0] == "cameras" and facts.cameras is not None]
+
+
 def removals(start: Components, facts: Facts) -> list[Change]:
     """What may be left out of a half-trained model: only a hash grid can be, as its shape stays the same."""
     return [("view", 0)] if start.view and "view" not in facts.fixed and facts.field == "hash" else []
@@ -197,7 +202,7 @@ def select(
         return Selection(asked, (), purse.spent)
     candidates, declined = proposals(asked, start.signs, facts)
     race = Race(trials, start, purse, asked)
-    race.run(candidates, removals(asked, facts))
+    race.run(candidates, removals(asked, facts), supported(candidates, facts))
     chosen = replace(asked, **dict(race.kept))
     gains = race.log_gains if chosen.exposure == "learned" else None
     return Selection(chosen, (*race.decisions.values(), *declined), purse.spent, gains)
