@@ -25,7 +25,7 @@ from nerfcli import kernels, scene
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.render.model import load_model
 from nerfcli.train.components import Components, choose
-from nerfcli.train.exif_exposure import relative_log_exposures
+from nerfcli.train.held_out_exposure import log_gains_of
 from nerfcli.train.loop import Progress, train
 from nerfcli.train.photos import load_photos
 from nerfcli.train.run_folder import FIELD
@@ -89,9 +89,9 @@ def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, sam
         train(capture, Path(run), settings, resume=False, notify=lambda text: None, on_progress=clock)
         model = load_model(Path(run) / FIELD, "cpu")
     photos = load_photos(capture.test_frames, factor=downscale, threads=1, masks=components.masks)
-    gains = relative_log_exposures(capture.test_frames, model.log_exposure)
+    gains = log_gains_of(capture.test_frames, model).tolist()
     held_out = [
-        HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))
+        HeldOut(photo.frame, photo.pixels, photo.used, log_gains=tuple(gain))
         for photo, gain in zip(photos, gains, strict=True)
     ]
     mean = evaluate_model(model, held_out, on_image=lambda done, total: None)["mean"]

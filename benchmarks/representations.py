@@ -70,9 +70,7 @@ class Capture:
         self.similarity = self.extent.training_from_scene
         self.pool = PixelPool(photos, self.similarity, torch.device("cpu"))
         self.test_photos = load_photos(capture.test_frames, factor=factor, threads=threads)
-        self.heldout = HeldoutPixels(
-            self.test_photos, self.similarity, torch.device("cpu"), log_gains=np.zeros((len(self.test_photos), 3))
-        )
+        self.heldout = HeldoutPixels(self.test_photos, self.similarity, torch.device("cpu"))
         # A network of megabytes takes seconds for what a grid renders in milliseconds.
         for name in ("origins", "directions", "colours"):
             setattr(self.heldout, name, getattr(self.heldout, name)[:pixels])
@@ -104,7 +102,7 @@ def measure(capture: Capture, kind: str, *, megabytes: float, seconds: float, th
     clock = time.perf_counter() - clock
     model = capture.model(fitting)
     rendering = time.process_time()
-    psnr = capture.heldout.psnr(model)
+    psnr = capture.heldout.psnr(model, log_gains=np.zeros((len(capture.test_photos), 3)))
     rendering = time.process_time() - rendering
     counts = work(fitting.field.settings)
     size = fitting.field.settings.to_json()

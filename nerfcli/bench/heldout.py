@@ -17,7 +17,7 @@ from nerfcli.render.accuracy import TIGHT, refined
 from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import TOLERANCE, render_cut_rays, uniform_cuts
-from nerfcli.train.exif_exposure import relative_log_exposures
+from nerfcli.train.held_out_exposure import log_gains_of
 from nerfcli.train.photos import downscaled_camera, load_photos
 from nerfcli.train.settings import TrainSettings
 
@@ -62,7 +62,7 @@ class SampledPixels:
             rgb, valid = _rendered(model, photo, pixels, cuts=cuts, tolerance=TOLERANCE)
             truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
             if valid.any():
-                values.append(psnr(to_8_bit(as_exposed(rgb, photo.log_gain)), truth, used=valid))
+                values.append(psnr(to_8_bit(as_exposed(rgb, photo.log_gains)), truth, used=valid))
         return float(np.mean(values))
 
     @torch.no_grad()
@@ -107,9 +107,9 @@ def held_out_photos(frames: Sequence[Frame], model: Model, *, settings: TrainSet
     assert settings.downscale is not None
     masks = settings.components.masks
     photos = load_photos(frames, factor=settings.downscale, threads=settings.threads, masks=masks)
-    gains = relative_log_exposures(frames, model.log_exposure)
+    gains = log_gains_of(frames, model).tolist()
     return [
-        HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))
+        HeldOut(photo.frame, photo.pixels, photo.used, log_gains=tuple(gain))
         for photo, gain in zip(photos, gains, strict=True)
     ]
 
@@ -120,7 +120,7 @@ def smaller(photo: HeldOut, factor: float) -> HeldOut:
         return photo
     used = None if photo.used is None else downscale(photo.used.astype(np.uint8) * 255, factor) == 255
     frame = replace(photo.frame, camera=downscaled_camera(photo.frame.camera, factor))
-    return HeldOut(frame, downscale(photo.pixels, factor), used, photo.log_gain)
+    return HeldOut(frame, downscale(photo.pixels, factor), used, photo.log_gains)
 
 
 def background_of(model: Model, photo: HeldOut) -> Background:

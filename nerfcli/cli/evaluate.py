@@ -177,7 +177,7 @@ def evaluate_run(
         "rays_per_second": log[-1]["rays"] / log[-1]["seconds"],
         "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
     }
-    held_out = held_out_photos(config, cameras["test"], log_exposure=model.log_exposure, threads=threads)
+    held_out = held_out_photos(config, cameras["test"], model=model, threads=threads)
     perceptual = find_perceptual(console.note)
     billboards = billboards_of(config, cameras["train"], threads=threads, console=console)
     with (

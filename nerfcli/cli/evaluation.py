@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from nerfcli.cameras.frame import Frame
     from nerfcli.evaluate.billboards import Billboards
     from nerfcli.evaluate.protocol import Compared, HeldOut
+    from nerfcli.render.model import Model
 
 _COLUMNS = {
     "as rendered": "",
@@ -25,30 +26,29 @@ _COLUMNS = {
 
 
 def held_out_photos(
-    config: dict[str, Any], frames: "Sequence[Frame]", *, log_exposure: float | None, threads: int
+    config: dict[str, Any], frames: "Sequence[Frame]", *, model: "Model", threads: int
 ) -> "list[HeldOut]":
-    """Held-out photos as the run was trained on: their size, what their masks mean, and how EXIF says they are exposed.
+    """Held-out photos as the run was trained on: their size, what their masks mean, and how they are exposed.
 
     Args:
         config: RUN/config.json.
         frames: the photos.
-        log_exposure: see `Model`.
+        model: that they will be compared with.
         threads: to read with.
 
     Raises:
         UserError: a photo cannot be read.
     """
     from nerfcli.evaluate.protocol import HeldOut
-    from nerfcli.train.exif_exposure import relative_log_exposures
+    from nerfcli.train.held_out_exposure import log_gains_of
     from nerfcli.train.photos import load_photos
     from nerfcli.train.run_folder import chosen_components
 
     factor, masks = config["settings"]["downscale"], chosen_components(config).masks
     photos = load_photos(frames, factor=factor, threads=threads, masks=masks)
-    gains = relative_log_exposures(frames, log_exposure)
     return [
-        HeldOut(photo.frame, photo.pixels, photo.used, log_gain=float(gain))
-        for photo, gain in zip(photos, gains, strict=True)
+        HeldOut(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains))
+        for photo, gains in zip(photos, log_gains_of(frames, model).tolist(), strict=True)
     ]
 
 

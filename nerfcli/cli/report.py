@@ -105,7 +105,7 @@ def report_page(
                     "give the command again when the training is over",
                 )
             frames = [frame for frame in run.frames["test"] if frame.name in names]
-            held_out = held_out_photos(run.config, frames, log_exposure=model.log_exposure, threads=threads)
+            held_out = held_out_photos(run.config, frames, model=model, threads=threads)
             compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
             looks.append(look_at(model, compared, depth=depth, on_share=on_share))
             meanings.append(depth_meta(model, depth))

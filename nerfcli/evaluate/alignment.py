@@ -65,7 +65,7 @@ def align_pose(
     *,
     used: np.ndarray,
     background: Background,
-    log_gain: float = 0.0,
+    log_gains: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> Alignment | None:
     """The pose at which the model comes closest to a photo, from the photo's own pose on; the model is not changed.
 
@@ -80,7 +80,7 @@ def align_pose(
         colours: (H, W, 3) the photo, float in [0, 1].
         used: (H, W) bool, the pixels to look at.
         background: behind everything.
-        log_gain: the photo's exposure, as of `protocol.HeldOut`.
+        log_gains: the photo's exposure, as of `protocol.HeldOut`.
 
     Returns:
         None where too few pixels count.
@@ -100,8 +100,8 @@ def align_pose(
         behind = colours_behind(background, rays.directions)
         origins = rays.origin.expand_as(rays.directions)
         rgb = render_rays(model, origins, rays.directions, background=behind, cones=rays.cones).rgb
-        if log_gain != 0.0:
-            rgb = exposed(rgb, rgb.new_tensor(log_gain))
+        if any(log_gains):
+            rgb = exposed(rgb, rgb.new_tensor(log_gains))
         return (rgb.clamp(0.0, 1.0).cpu().numpy().astype(np.float64) - wanted).ravel()
 
     pose, current = frame.world_from_cam, residuals(frame.world_from_cam)

@@ -26,6 +26,7 @@ from nerfcli.render.pictures import Picture, render_picture
 
 METRICS = "metrics.json"
 PROTOCOL = "nerfcli-2"
+NO_GAINS = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -37,13 +38,14 @@ class HeldOut:
         frame: its camera and pose.
         pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
         used: (H, W) bool; None for all pixels.
-        log_gain: logarithm of its exposure relative to the model's photos, as EXIF tells it; see `field.exposure`.
+        log_gains: logarithms of its gains relative to the model's pictures, as EXIF or the training photos around it
+            tell them, never the photo itself; see `field.exposure`.
     """
 
     frame: Frame
     pixels: np.ndarray
     used: np.ndarray | None
-    log_gain: float = 0.0
+    log_gains: tuple[float, ...] = NO_GAINS
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,7 @@ def evaluate_model(
             **_counted(photo, picture, compared),
         }
         if extras.align_poses:
-            entry |= _pose_aligned(model, compared, photo.log_gain, background=background, on_tile=on_tile)
+            entry |= _pose_aligned(model, compared, photo.log_gains, background=background, on_tile=on_tile)
         if views is not None:
             entry["view"] = views[index].to_json()
         images.append(entry | {"seconds": seconds[-1]})
@@ -182,18 +184,18 @@ def compare(photo: HeldOut, picture: Picture) -> Compared:
         )
     return Compared(
         photo.frame,
-        as_exposed(picture.rgb, photo.log_gain),
+        as_exposed(picture.rgb, photo.log_gains),
         over_white(photo.pixels),
         used,
         photo.pixels.shape[-1] == 4,
     )
 
 
-def as_exposed(rgb: np.ndarray, log_gain: float) -> np.ndarray:
-    """A picture as a photo of another exposure shows it, clipped."""
-    if log_gain == 0.0:
+def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
+    """A picture as a photo with these gains shows it, clipped."""
+    if not any(log_gains):
         return rgb
-    return exposed(torch.from_numpy(rgb), torch.tensor(log_gain)).clamp(0.0, 1.0).numpy()
+    return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
 
 
 def _measured(compared: Compared, perceptual: Perceptual | None) -> dict[str, float | None]:
@@ -238,18 +240,23 @@ def _counted(photo: HeldOut, picture: Picture, compared: Compared) -> dict[str, 
 
 
 def _pose_aligned(
-    model: Model, compared: Compared, log_gain: float, *, background: Background, on_tile: Callable[[int], None]
+    model: Model,
+    compared: Compared,
+    log_gains: tuple[float, ...],
+    *,
+    background: Background,
+    on_tile: Callable[[int], None],
 ) -> dict[str, Any]:
     left, right = halves(compared.used)
     truth = compared.photo
-    found = align_pose(model, compared.frame, as_float(truth), used=left, background=background, log_gain=log_gain)
+    found = align_pose(model, compared.frame, as_float(truth), used=left, background=background, log_gains=log_gains)
     if found is None or not right.any():
         nothing = ("psnr_right_half", "ssim_right_half", "psnr_pose_aligned", "ssim_pose_aligned", "pose_alignment")
         return dict.fromkeys(nothing)
     again = render_picture(model, found.frame, background=background, on_tile=on_tile)
     return {
         **_close(to_8_bit(compared.rendered), truth, used=right, suffix="_right_half"),
-        **_close(to_8_bit(as_exposed(again.rgb, log_gain)), truth, used=right, suffix="_pose_aligned"),
+        **_close(to_8_bit(as_exposed(again.rgb, log_gains)), truth, used=right, suffix="_pose_aligned"),
         "pose_alignment": found.to_json(),
     }
 
@@ -266,7 +273,8 @@ def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
 def _protocol_name(held_out: Sequence[HeldOut], extras: Extras) -> str:
     sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in held_out})
     names = hashlib.sha256("\n".join(photo.frame.name for photo in held_out).encode()).hexdigest()[:12]
-    known = ", exposures by EXIF" if any(photo.log_gain for photo in held_out) else ""
+    told = any(any(photo.log_gains) for photo in held_out)
+    known = ", exposures by EXIF or training photos around" if told else ""
     alpha = ", RGBA on white" if any(photo.pixels.shape[-1] == 4 for photo in held_out) else ""
     lpips = f"{LPIPS_NAME} (torchmetrics)" if extras.perceptual is not None else "no LPIPS"
     pose = ", pose_aligned: refined on the left half, measured on the right" if extras.align_poses else ""

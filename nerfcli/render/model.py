@@ -1,6 +1,8 @@
 """A trained field with everything that is needed to look at it: the frame it lives in, where it is empty, the steps."""
 
+import dataclasses
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +56,8 @@ class Model:
         unit_source: how a metre is known; None where nobody wrote it down.
         log_exposure: the mean of the training photos by EXIF, if the model knows photos of different exposures; see
             `train.exif_exposure`.
+        exposures: of held-out photos by name, logarithms of their gains (3,) as training tells them; see
+            `train.held_out_exposure`.
         sha256: of the file that it was read from.
     """
 
@@ -65,6 +69,7 @@ class Model:
     unit: str
     unit_source: str | None = None
     log_exposure: float | None = None
+    exposures: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     sha256: str | None = None
 
     @property
@@ -95,6 +100,7 @@ def save_model(path: Path, model: Model) -> None:
         "unit": model.unit,
         "unit_source": model.unit_source,
         "log_exposure": model.log_exposure,
+        "exposures": {name: list(gains) for name, gains in model.exposures.items()},
     }
     save_tensors(path, tensors, description)
 
@@ -129,6 +135,7 @@ def load_model(path: Path, device: str) -> Model:
         unit=description["unit"],
         unit_source=description.get("unit_source"),
         log_exposure=description.get("log_exposure"),
+        exposures={name: tuple(gains) for name, gains in description.get("exposures", {}).items()},
         sha256=hashlib.sha256(content).hexdigest(),
     )
 

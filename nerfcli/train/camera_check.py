@@ -22,7 +22,7 @@ MISS_PX = 1.0
 # Fewer matches, or pairs of photos, tell nothing.
 FEWEST_MATCHES, FEWEST_PAIRS = 60, 10
 MOST_MATCHES = 4000
-# The jackknife leaves out one of so many parts of the pairs at a time.
+# The jackknife leaves out one of so many parts of the photos at a time.
 PARTS = 10
 # Factors for which rays are computed; between them they are interpolated, to 1e-6 rad.
 NODES = FARTHEST * np.cos(np.pi * (np.arange(6) + 0.5) / 6)
@@ -49,7 +49,7 @@ def check_cameras(photos: Sequence[Photo], matched: Sequence[Matches]) -> Camera
     """What matches say of the cameras; None where there are too few, or where no length within reach is best.
 
     The factor has the least sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
-    pairs of photos: wrong poses move all matches of a pair alike.
+    photos: a wrong pose moves all matches of a photo alike.
 
     Args:
         photos: to train on.
@@ -76,8 +76,8 @@ def check_cameras(photos: Sequence[Photo], matched: Sequence[Matches]) -> Camera
         return None
     fine = coarse[lowest] + np.arange(-COARSE, COARSE + FINE / 2, FINE)
     by_pair = costs(fine)
-    part = np.arange(len(pairs)) % PARTS
-    without = np.array([_lowest(fine, by_pair[:, part != left].sum(1)) for left in range(PARTS)])
+    part = np.array([matches.photos for matches in usable]) % PARTS
+    without = np.array([_lowest(fine, by_pair[:, (part != left).all(1)].sum(1)) for left in range(PARTS)])
     error = float(np.sqrt((PARTS - 1) / PARTS * np.square(without - without.mean()).sum()))
     best = _lowest(fine, by_pair.sum(1))
     given, changed_misses = (

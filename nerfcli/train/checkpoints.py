@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from nerfcli.cameras.frame import Frame
@@ -14,6 +15,7 @@ from nerfcli.render.model import Model, save_model
 from nerfcli.scene import Scene
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
+from nerfcli.train.held_out_exposure import gains_between
 from nerfcli.train.preparation import Begun, Prepared
 from nerfcli.train.run_folder import FIELD, STATE, chosen_components, read_config, write_cameras
 from nerfcli.train.settings import TrainSettings
@@ -63,7 +65,22 @@ class Checkpoints:
             self._scene.unit,
             self._scene.unit_source,
             log_exposure=prepared.log_exposure,
+            exposures=self._held_out_exposures(),
         )
+
+    def _held_out_exposures(self) -> dict[str, tuple[float, ...]]:
+        """What the exposures that were learned tell of held-out photos, by name."""
+        exposure = self._fitting.parts.exposure
+        if exposure is None or self._fitting.components.exposure != "learned":
+            return {}
+        place = {frame.name: index for index, frame in enumerate(self._scene.frames)}
+        train, test = (
+            np.array([place[frame.name] for frame in frames], dtype=int)
+            for frames in (self._scene.train_frames, self._scene.test_frames)
+        )
+        gains = exposure.log_gains().detach().cpu().double().numpy()
+        told = gains_between(train, gains, test)
+        return {frame.name: tuple(row) for frame, row in zip(self._scene.test_frames, told.tolist(), strict=True)}
 
     def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
         """The training photos and those held out, with their cameras as they are now."""

@@ -28,7 +28,6 @@ class HeldoutPixels:
         photos: held out.
         training_from_scene: the normalisation.
         device: where to keep them.
-        log_gains: (photos,) logarithms of their exposures relative to the mean photo, as far as EXIF tells; else 0.
         colours, room: see `PixelPool`.
     """
 
@@ -38,7 +37,6 @@ class HeldoutPixels:
         training_from_scene: Similarity,
         device: torch.device,
         *,
-        log_gains: np.ndarray,
         colours: np.ndarray | None = None,
         room: Room = IN_MEMORY,
     ):
@@ -46,11 +44,16 @@ class HeldoutPixels:
         generator = torch.Generator(device=device).manual_seed(SEED)
         self.origins, self.directions, self.colours, numbers = pool.draw(PIXELS, generator)[:4]
         self.cones = pool.cones[pool.photo_of(numbers)]
-        self.log_gains = torch.as_tensor(log_gains, dtype=torch.float32, device=device)[pool.photo_of(numbers)]
+        self.photos = pool.photo_of(numbers)
 
     @torch.no_grad()
-    def psnr(self, model: Model) -> float:
-        """PSNR in dB over these pixels together, clipped to [0, 1], on the model's background."""
+    def psnr(self, model: Model, *, log_gains: np.ndarray) -> float:
+        """PSNR in dB over these pixels together, clipped to [0, 1], on the model's background.
+
+        Args:
+            model: what is measured.
+            log_gains: (photos, 3) of the photos relative to its pictures; see `held_out_exposure`.
+        """
         background = colours_behind(model.background, self.directions)
         parts = zip(
             *(rays.split(RAYS_AT_A_TIME) for rays in (self.origins, self.directions, self.cones, background)),
@@ -60,7 +63,7 @@ class HeldoutPixels:
             [render_rays(model, *rays, background=behind, cones=cones).rgb for *rays, cones, behind in parts]
         )
         wanted = over_background(self.colours, background)
-        if self.log_gains.any():
-            rendered = exposed(rendered, self.log_gains[:, None])
+        if log_gains.any():
+            rendered = exposed(rendered, torch.as_tensor(log_gains).to(rendered)[self.photos])
         error = (rendered.clamp(0.0, 1.0) - wanted).square().mean().item()
         return -10.0 * math.log10(max(error, 1e-12))

@@ -105,7 +105,9 @@ def with_known_focal(asked: Components, facts: Facts) -> tuple[Components, float
         f"{check.matches} matched features ask for lenses {math.expm1(check.log_focal):+.2%} +- {check.error:.2%} as "
         f"long, and miss by {given:.2f} px as they are, by {changed:.2f} px then"
     )
-    is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error) and changed < MISS_SHARE * given
+    is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error)
+    # Wrong poses ask for any length: one that is right leaves nothing to ask for.
+    is_sure = is_sure and changed < min(MISS_SHARE * given, LEAST_MISS_PX)
     if is_sure:
         return replace(asked, cameras="focal"), check.log_focal, [untried("cameras", "focal", told, kept=True)]
     return asked, 0.0, [untried("cameras", "focal", f"not tried, {told}")]
@@ -139,7 +141,7 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
         told = f"not tried, matched features miss by {min(check.misses_px):.2f} px only"
         declined.append(untried("cameras", "poses", told))
     else:
-        candidates.append(("cameras", "poses" if start.cameras == "fixed" else "all"))
+        candidates.append(("cameras", "poses"))
     if not facts.has_alpha:
         candidates.append(("background", "sphere"))
     open_ones = [(name, value) for name, value in candidates if getattr(start, name) != value]

@@ -13,7 +13,7 @@ from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.render.model import Model, load_model, save_model
-from nerfcli.train.exif_exposure import relative_log_exposures
+from nerfcli.train.held_out_exposure import log_gains_of
 from nerfcli.train.heldout import HeldoutPixels
 from nerfcli.train.photos import load_album
 from nerfcli.train.preparation import Prepared
@@ -64,14 +64,16 @@ def measure_waypoints(
                 album.photos,
                 prepared.extent.training_from_scene,
                 torch.device(device),
-                log_gains=relative_log_exposures(held_out, prepared.log_exposure),
                 colours=album.colours,
                 room=prepared.room,
             )
         except UserError as error:
             notify(f"the training is complete, but its held-out photos cannot be compared with: {error}")
             return
-        measured = {step: pixels.psnr(load_model(_path(run, step), device)) for step in steps}
+        measured = {}
+        for step in steps:
+            model = load_model(_path(run, step), device)
+            measured[step] = pixels.psnr(model, log_gains=log_gains_of(held_out, model))
         add_to_log(run, {step: {"heldout_psnr": psnr} for step, psnr in measured.items()})
         told = ", ".join(f"{psnr:.2f} at step {step}" for step, psnr in measured.items())
         notify(f"PSNR of some held-out pixels, in dB: {told}")

@@ -1,0 +1,77 @@
+"""Exposures of held-out photos by those of the photos around: closed forms, and their way into a run and out of it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.render.model import load_model
+from nerfcli.scene import Scene
+from nerfcli.train.components import Components
+from nerfcli.train.held_out_exposure import gains_between, log_gains_of
+from nerfcli.train.loop import train
+from nerfcli.train.settings import TrainSettings
+
+
+def drifting(places: np.ndarray) -> np.ndarray:
+    """(N, 3) gains that go up along a line, each channel by its own."""
+    return places[:, None] * np.array([0.1, 0.05, -0.02]) - 0.3
+
+
+def test_gains_that_drift_are_those_between_the_neighbours_and_of_the_last_beyond():
+    places = np.array([0, 1, 2, 4, 5, 6, 8])
+    wanted = np.array([3, 7, 9])
+    told = gains_between(places, drifting(places), wanted)
+    assert told == pytest.approx(drifting(np.array([3.0, 7.0, 8.0])), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_gains_of_chance_are_told_to_be_the_mean(seed):
+    """Two neighbours tell of independent gains with 1.5 times their variance, the mean with 1."""
+    gains = np.random.default_rng(seed).normal(size=(60, 3))
+    places = np.arange(60) * 2
+    assert np.array_equal(gains_between(places, gains - gains.mean(0), np.array([1, 7, 119])), np.zeros((3, 3)))
+
+
+def test_two_photos_tell_nothing_and_nobody_may_ask():
+    assert np.array_equal(gains_between(np.array([0, 2]), np.ones((2, 3)), np.array([1])), np.zeros((1, 3)))
+    assert gains_between(np.arange(4), drifting(np.arange(4.0)), np.zeros(0)).shape == (0, 3)
+
+
+def test_a_training_keeps_what_its_photos_tell_of_the_held_out_ones_which_it_does_not_open(tmp_path: Path):
+    """Grey photos that become brighter one after another; the last but one is held out, and nearly black: its gains are
+    between those of its neighbours, which are brighter than the mean."""
+    camera, frames = Camera.pinhole(16, 12, 14.0), []
+    for index in range(9):
+        level = 10 if index == 7 else 60 + 12 * index
+        noise = np.random.default_rng(index).integers(-3, 4, (12, 16, 1))
+        Image.fromarray(np.repeat(level + noise, 3, axis=2).astype(np.uint8)).save(tmp_path / f"{index}.png")
+        pose = np.eye(4)
+        pose[:3, 3] = [0.1 * index, 0.0, -2.0]
+        frames.append(Frame(f"{index}.png", camera, pose, tmp_path / f"{index}.png"))
+    scene = Scene(tmp_path, "colmap", tuple(frames), frozenset({"7.png"}), np.array([[0.0, 0.0, 0.0]] * 9), ())
+    settings = TrainSettings(
+        budget_seconds=None,
+        steps=150,
+        levels=2,
+        log2_rows=8,
+        first_samples_per_step=2**10,
+        samples_per_step=2**10,
+        components=Components(exposure="learned"),
+        threads=1,
+    )
+    train(scene, tmp_path / "run", settings, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
+    model = load_model(tmp_path / "run" / "field.safetensors", "cpu")
+    assert set(model.exposures) == {"7.png"}
+    told = log_gains_of(scene.test_frames, model)
+    assert told.tolist() == [list(model.exposures["7.png"])]
+    assert told.mean() == pytest.approx(log_ratio(144, 107), rel=0.3)
+    assert log_gains_of(scene.train_frames, model) == pytest.approx(np.zeros((8, 3)))  # EXIF tells nothing
+
+
+def log_ratio(one: int, other: int) -> float:
+    """Of two levels, in linear light."""
+    return float(np.log(((one / 255 + 0.055) / (other / 255 + 0.055)) ** 2.4))
