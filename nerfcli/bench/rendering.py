@@ -144,7 +144,7 @@ def _converged(model: Model, photos: Sequence[HeldOut], *, session: Session) -> 
                 np.save(partial, fine.rgb)
             truth = over_white(photo.pixels)
             write_picture(session.folder / FOLDER / f"{slug(photo.frame.name)}-truth.jpg", truth)
-            decibels = psnr(to_8_bit(as_exposed(fine.rgb, photo.log_gain)), truth, used=_used(fine, photo))
+            decibels = psnr(to_8_bit(as_exposed(fine.rgb, photo.log_gains)), truth, used=_used(fine, photo))
             session.record("converged", photo=photo.frame.name, psnr=decibels)
         pictures.append(np.load(path))
     return tuple(pictures)
@@ -156,7 +156,7 @@ def _measure_picture(subject: _Subject, setting: RenderSetting, session: Session
     for index, (photo, fine) in enumerate(zip(subject.photos, subject.converged, strict=True)):
         picture = _render(model, photo, setting)
         used, truth = _used(picture, photo), over_white(photo.pixels)
-        shown = as_exposed(picture.rgb, photo.log_gain)
+        shown = as_exposed(picture.rgb, photo.log_gains)
         decibels.append(psnr(to_8_bit(shown), truth, used=used))
         squares.append(float(np.square(picture.rgb - fine, dtype=np.float64)[used].mean()))
         bound = max(bound, float(picture.truncation_error.max(initial=0.0)))

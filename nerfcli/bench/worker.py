@@ -68,7 +68,7 @@ def measure_model(
         seconds.append(time.perf_counter() - began)
         if len(seconds) > _REPEATS or seconds[-1] > _SLOW_SECONDS:
             break
-    truth, rgb = over_white(small.pixels), as_exposed(picture.rgb, small.log_gain)
+    truth, rgb = over_white(small.pixels), as_exposed(picture.rgb, small.log_gains)
     write_picture(folder / f"{prefix}-render.jpg", to_8_bit(rgb))
     write_difference(folder / f"{prefix}-error.jpg", rgb, truth / 255.0, most=MOST_ERROR)
     write_picture(folder / f"{prefix}-truth.jpg", truth)
