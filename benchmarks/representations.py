@@ -72,7 +72,7 @@ class Capture:
         self.test_photos = load_photos(capture.test_frames, factor=factor, threads=threads)
         self.heldout = HeldoutPixels(self.test_photos, self.similarity, torch.device("cpu"))
         # A network of megabytes takes seconds for what a grid renders in milliseconds.
-        for name in ("origins", "directions", "colours"):
+        for name in ("origins", "directions", "colours", "cones", "photos"):
             setattr(self.heldout, name, getattr(self.heldout, name)[:pixels])
         self.background = (1.0, 1.0, 1.0) if self.pool.has_alpha else (0.0, 0.0, 0.0)
 

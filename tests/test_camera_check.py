@@ -108,7 +108,15 @@ def test_wrong_poses_are_not_taken_for_a_wrong_lens():
     assert min(check.misses_px) > 1.5
 
 
-def test_nothing_is_said_where_there_is_too_little_or_no_length_fits():
+def test_where_no_length_fits_the_misses_are_told():
+    """Lenses that are 35 % too long, which is far outside of what is looked at."""
+    photos = ring(PINHOLE)
+    check = checked(with_lens(photos, 3 * FARTHEST), matched(photos, noise_px=0.2, wrong=0.0))
+    assert (check.log_focal, check.error) == (0.0, math.inf)
+    assert check.misses_px[0] == check.misses_px[1] > 3.0
+
+
+def test_nothing_is_said_where_there_is_too_little():
     photos = ring(PINHOLE)
     matches = matched(photos, noise_px=0.2, wrong=0.0)
     few = [replace(m, pixels=(m.pixels[0][:2], m.pixels[1][:2])) for m in matches]
@@ -116,7 +124,6 @@ def test_nothing_is_said_where_there_is_too_little_or_no_length_fits():
     assert check_cameras(photos, matches[:5]) is None
     assert check_cameras(photos, few[: FEWEST_MATCHES // 2 - 1]) is None
     assert check_cameras(photos, []) is None
-    assert check_cameras(with_lens(photos, 3 * FARTHEST), matches) is None
     around = Camera("EQUIRECTANGULAR", 600, 300, (600.0, 300.0))
     assert check_cameras(ring(around), matches) is None
 

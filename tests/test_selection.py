@@ -303,6 +303,7 @@ def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
         (CameraCheck(0.045, 0.006, (0.22, 0.26), 900), False),  # sure, but nothing fits better
         (CameraCheck(0.002, 0.0001, (0.26, 0.14), 900), False),  # next to nothing
         (CameraCheck(0.08, 0.007, (2.1, 1.7), 900), False),  # poses are wrong, too
+        (CameraCheck(0.0, math.inf, (2.1, 2.1), 900), False),  # no length within reach is best
     ],
 )
 def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
@@ -311,7 +312,8 @@ def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
     assert components == Components(cameras="focal" if kept else "fixed")
     assert log_focal == (check.log_focal if kept else 0.0)
     assert decision.kept == kept
-    assert f"{math.expm1(check.log_focal):+.2%}" in decision.in_words()
+    told = f"{math.expm1(check.log_focal):+.2%}" if math.isfinite(check.error) else "miss by 2.10 px"
+    assert told in decision.in_words()
     assert with_known_focal(Components(), replace(facts, fixed=("cameras",))) == (Components(), 0.0, [])
     assert with_known_focal(Components(), FITTED) == (Components(), 0.0, [])
 

@@ -5,6 +5,7 @@ tell little of it. Matched features do: the ray of one photo lies in the plane t
 line between both cameras, whatever the depth.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -34,7 +35,7 @@ class CameraCheck:
 
     Args:
         log_focal: all focal lengths should be exp of this times as long.
-        error: its standard error.
+        error: its standard error; infinite where no length within reach is best.
         misses_px: median distances of features from their lines, as given and with the factor.
         matches: how many there are.
     """
@@ -46,7 +47,7 @@ class CameraCheck:
 
 
 def check_cameras(photos: Sequence[Photo], matched: Sequence[Matches]) -> CameraCheck | None:
-    """What matches say of the cameras; None where there are too few, or where no length within reach is best.
+    """What matches say of the cameras; None where there are too few.
 
     The factor has the least sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
     photos: a wrong pose moves all matches of a photo alike.
@@ -73,17 +74,15 @@ def check_cameras(photos: Sequence[Photo], matched: Sequence[Matches]) -> Camera
     coarse = np.arange(-FARTHEST, FARTHEST + COARSE / 2, COARSE)
     lowest = int(costs(coarse).sum(1).argmin())
     if lowest in (0, len(coarse) - 1):
-        return None
+        miss = _median_miss(pairs, 0.0)
+        return CameraCheck(0.0, math.inf, (miss, miss), count)
     fine = coarse[lowest] + np.arange(-COARSE, COARSE + FINE / 2, FINE)
     by_pair = costs(fine)
     part = np.array([matches.photos for matches in usable]) % PARTS
     without = np.array([_lowest(fine, by_pair[:, (part != left).all(1)].sum(1)) for left in range(PARTS)])
     error = float(np.sqrt((PARTS - 1) / PARTS * np.square(without - without.mean()).sum()))
     best = _lowest(fine, by_pair.sum(1))
-    given, changed_misses = (
-        MISS_PX * float(np.median(np.concatenate([pair.misses(place) for pair in pairs]))) for place in (0.0, best)
-    )
-    return CameraCheck(best, error, (given, changed_misses), count)
+    return CameraCheck(best, error, (_median_miss(pairs, 0.0), _median_miss(pairs, best)), count)
 
 
 class _Pair:
@@ -114,6 +113,11 @@ class _Pair:
             # A ray along the line between the cameras spans no plane: it misses nothing.
             away.append(np.abs(np.einsum("ni,ni->n", ray, normal)) / np.maximum(length, 1e-300))
         return np.maximum(*away) / self._unit
+
+
+def _median_miss(pairs: Sequence[_Pair], log_focal: float) -> float:
+    """In pixels."""
+    return MISS_PX * float(np.median(np.concatenate([pair.misses(log_focal) for pair in pairs])))
 
 
 def _lowest(places: np.ndarray, costs: np.ndarray) -> float:

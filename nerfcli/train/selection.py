@@ -101,6 +101,9 @@ def with_known_focal(asked: Components, facts: Facts) -> tuple[Components, float
     if check is None or "cameras" in facts.fixed:
         return asked, 0.0, []
     given, changed = check.misses_px
+    if not math.isfinite(check.error):
+        told = f"not tried, {check.matches} matched features miss by {given:.2f} px, and by more with other lenses"
+        return asked, 0.0, [untried("cameras", "focal", told)]
     told = (
         f"{check.matches} matched features ask for lenses {math.expm1(check.log_focal):+.2%} +- {check.error:.2%} as "
         f"long, and miss by {given:.2f} px as they are, by {changed:.2f} px then"
