@@ -72,7 +72,7 @@ def fit(capture: Capture, settings: TrainSettings, *, budget: float, clock: str)
         used += now() - began
         if used / budget >= due[0]:
             due = [share for share in due if share > used / budget]
-            psnr = capture.heldout.psnr(capture.model(fitting))
+            psnr = capture.psnr(capture.model(fitting))
             curve.append(Moment(round(used / budget, 3), round(used, 2), fitting.step, samples, round(psnr, 3)))
     return fitting, curve
 

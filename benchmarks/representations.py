@@ -76,6 +76,10 @@ class Capture:
             setattr(self.heldout, name, getattr(self.heldout, name)[:pixels])
         self.background = (1.0, 1.0, 1.0) if self.pool.has_alpha else (0.0, 0.0, 0.0)
 
+    def psnr(self, model: Model) -> float:
+        """On the held-out pixels, whose photos are all exposed alike."""
+        return self.heldout.psnr(model, log_gains=np.zeros((len(self.test_photos), 3)))
+
     def model(self, fitting: Fitting) -> Model:
         """What the training of `fitting` has come to."""
         return Model(
@@ -102,7 +106,7 @@ def measure(capture: Capture, kind: str, *, megabytes: float, seconds: float, th
     clock = time.perf_counter() - clock
     model = capture.model(fitting)
     rendering = time.process_time()
-    psnr = capture.heldout.psnr(model, log_gains=np.zeros((len(capture.test_photos), 3)))
+    psnr = capture.psnr(model)
     rendering = time.process_time() - rendering
     counts = work(fitting.field.settings)
     size = fitting.field.settings.to_json()
