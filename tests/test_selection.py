@@ -360,8 +360,8 @@ def test_leaving_out_may_not_use_up_a_limit_of_time_but_may_use_up_steps():
     assert Purse(None, 100).takes(2, of_steps=50, seconds_each=math.inf, share_of_time=REMOVAL_SHARE)
 
 
-@pytest.mark.parametrize(("gain", "kept"), [(0.04, True), (-0.04, False)])
-def test_cameras_whose_photos_disagree_only_have_to_gain(gain, kept):
+@pytest.mark.parametrize(("gain", "kept"), [(0.04, True), (-0.04, True), (-0.3, False)])
+def test_cameras_whose_photos_disagree_only_must_not_lose(gain, kept):
     """Matched features miss by 2 pixels: 0.04 dB is less than what others have to gain. All photos gain alike."""
     wrong = replace(FITTED, cameras_known=None, cameras=CameraCheck(0.02, 0.01, (2.3, 2.2), 900))
     chosen = chosen_by(Scripted(lambda c: gain * (c.cameras == "poses"), spread=0.0), facts=wrong)
@@ -371,8 +371,8 @@ def test_cameras_whose_photos_disagree_only_have_to_gain(gain, kept):
     assert chosen.components.cameras == "fixed"
 
 
-def test_what_is_supported_has_to_gain_more_than_its_error():
+def test_what_is_supported_must_not_lose_more_than_its_error():
     base = [trial(20.0), trial(20.0)]
-    for gains, kept in (((0.05, 0.01), True), ((0.05, -0.01), False), ((0.3, -0.3), False)):
+    for gains, kept in (((0.05, 0.01), True), ((0.03, -0.05), True), ((-0.01, -0.05), False)):
         decision = judge_supported(base, ("cameras", "poses"), [trial(20.0 + gain) for gain in gains], by_time=True)
-        assert decision.kept == kept  # mean m and distance d of two seeds: m > d / 2
+        assert decision.kept == kept  # mean m and distance d of two seeds: m > -d / 2

@@ -107,15 +107,15 @@ def judge_one(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, 
 
 
 def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """What paired trials say of something that mends a fault which is known from elsewhere: it only has to gain.
+    """What paired trials say of something that mends a fault which is known from elsewhere: it must not lose.
 
-    A trial is too short for all of its gain. Arguments as of `judge_one`.
+    A trial is too short for most of its gain. Arguments as of `judge_one`.
     """
     measured = judge_one(base, change, tried, by_time=by_time)
     gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
-    if gain > error:
-        return replace(measured, kept=True, why="gains, and what it mends is known from matched features")
-    return replace(measured, kept=False, why="no gain, though matched features speak for it")
+    if gain > -error:
+        return replace(measured, kept=True, why="matched features show what it mends, and it does not lose")
+    return replace(measured, kept=False, why="loses, though matched features speak for it")
 
 
 def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:

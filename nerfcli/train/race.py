@@ -120,7 +120,7 @@ class Race:
             trial = self._trial([change], seed=0)
             decision = self._judged(self._rule(change), change, [trial])
             self.decisions[change] = replace(decision, kept=False)
-            if (decision.gain_db or 0.0) > (0.0 if change in self._supported else LEAST_GAIN_DB):
+            if change in self._supported or (decision.gain_db or 0.0) > LEAST_GAIN_DB:
                 self._once[change] = trial
 
     def _rule(self, addition: Change) -> Rule:
