@@ -1,6 +1,7 @@
 """Exposures of held-out photos by those of the photos around: closed forms, and their way into a run and out of it."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -70,6 +71,19 @@ def test_a_training_keeps_what_its_photos_tell_of_the_held_out_ones_which_it_doe
     assert told.tolist() == [list(model.exposures["7.png"])]
     assert told.mean() == pytest.approx(log_ratio(144, 107), rel=0.3)
     assert log_gains_of(scene.train_frames, model) == pytest.approx(np.zeros((8, 3)))  # EXIF tells nothing
+
+
+def test_what_exif_tells_of_a_held_out_photo_goes_before_its_neighbours(monkeypatch):
+    """Two photos, EXIF knows one of them; without exposures in the model it is asked for none."""
+    frames = [Frame(name, Camera.pinhole(4, 4, 4.0), np.eye(4)) for name in ("a", "b", "c")]
+    monkeypatch.setattr(
+        "nerfcli.train.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
+    )
+    told = {"a": (9.0, 9.0, 9.0), "b": (0.1, 0.2, 0.3)}
+    model = SimpleNamespace(log_exposure=1.0, exposures=told)
+    assert log_gains_of(frames, model).tolist() == [[0.5] * 3, [0.1, 0.2, 0.3], [0.0] * 3]  # type: ignore[arg-type]
+    model = SimpleNamespace(log_exposure=None, exposures=told)
+    assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
 
 
 def log_ratio(one: int, other: int) -> float:

@@ -56,8 +56,8 @@ class Model:
         unit_source: how a metre is known; None where nobody wrote it down.
         log_exposure: the mean of the training photos by EXIF, if the model knows photos of different exposures; see
             `train.exif_exposure`.
-        exposures: of held-out photos by name, logarithms of their gains (3,) as training tells them; see
-            `train.held_out_exposure`.
+        exposures: of held-out photos by name, logarithms of their gains (3,) as training tells them where EXIF
+            does not; see `train.held_out_exposure`.
         sha256: of the file that it was read from.
     """
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.model import Model
-from nerfcli.train.exif_exposure import relative_log_exposures
+from nerfcli.train.exif_exposure import log_exposures
 
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -33,11 +33,14 @@ def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray)
 
 
 def log_gains_of(frames: Sequence[Frame], model: Model) -> np.ndarray:
-    """(N, 3) logarithms of the gains of photos relative to the pictures of a model, as its training tells them; else as
-    EXIF does; else 0."""
-    by_exif = relative_log_exposures(frames, model.log_exposure)
-    known = [model.exposures.get(frame.name, (gain,) * 3) for frame, gain in zip(frames, by_exif, strict=True)]
-    return np.array(known, dtype=np.float64).reshape(-1, 3)
+    """(N, 3) logarithms of the gains of photos relative to the pictures of a model, as EXIF tells them; where it does
+    not, as the training does; else 0."""
+    if model.log_exposure is None:
+        by_exif = np.full(len(frames), np.nan)
+    else:
+        by_exif = log_exposures(frames) - model.log_exposure
+    by_training = np.array([model.exposures.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
+    return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None], by_training)
 
 
 def _interpolated(places: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:

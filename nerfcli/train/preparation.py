@@ -115,7 +115,7 @@ def prepare(
     notify(told)
     masks = settings.components.masks
     album = load_album(scene.train_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
-    matched: tuple[Matches, ...] = ()
+    matched: tuple[Matches, ...] | None = None
     if begun is not None:
         extent = begun.extent
     else:
@@ -158,7 +158,7 @@ def _search(
     extent: Extent,
     settings: TrainSettings,
     *,
-    matched: Sequence[Matches],
+    matched: Sequence[Matches] | None,
     room: Room,
     notify: Callable[[str], None],
 ) -> Selection:
@@ -169,14 +169,14 @@ def _search(
         return Selection(settings.components, (), 0.0)
     exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
     began = time.perf_counter()
-    if album.fills_frame and len(scene.points) == 0:
-        matched = matched or match(album.photos, threads=settings.threads)
+    if matched is None and album.fills_frame and len(scene.points) == 0:
+        matched = match(album.photos, threads=settings.threads)
     facts = Facts(
         settings.field,
         has_alpha=album.colours.shape[-1] == 4,
         has_exif=bool(np.ptp(exif) > 0.0),
         cameras_known=_known(scene),
-        cameras=check_cameras(album.photos, matched),
+        cameras=check_cameras(album.photos, matched or ()),
         fixed=settings.fixed,
     )
     asked, log_focal, measured = with_known_focal(settings.components, facts)
