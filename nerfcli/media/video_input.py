@@ -187,12 +187,13 @@ class _Decoder:
         assert self._process.stderr is not None
         for raw in self._process.stderr:
             line = raw.decode("utf-8", errors="replace").rstrip()
+            # First, and in every line: showinfo writes its own in pieces, and what another thread says may come amid.
+            self.cut_short = self.cut_short or bool(_CUT_SHORT.search(line))
             if time := _TIME.search(line):
                 self.times.append(time[1])
                 continue
             if len(self.head) < _LINES_KEPT:
                 self.head.append(line)
-            self.cut_short = self.cut_short or bool(_CUT_SHORT.search(line))
             if error := _ERROR.search(line):
                 self.errors += 1
                 self._said.append(error[2])
