@@ -6,6 +6,7 @@ NON_FINITE = 5
 OUT_OF_MEMORY = 6
 GATE_NOT_MET = 7
 INTERRUPTED = 130
+TERMINATED = 143
 
 
 class UserError(Exception):

@@ -15,12 +15,13 @@ FILES = sorted(ROOT.rglob("*.py"))
 FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 
 # A part is a folder of nerfcli or a module beside the folders. What stands on the right may be imported by the left.
-LEAVES = {"errors", "atomic", "exclusive", "memory", "__init__"}
+LEAVES = {"errors", "atomic", "exclusive", "memory", "interrupts", "__init__"}
 MAY_IMPORT = {
     "errors": set(),
     "atomic": set(),
     "exclusive": set(),
     "memory": set(),
+    "interrupts": set(),
     "__init__": set(),
     "cameras": set(),
     "media": set(),

@@ -26,11 +26,12 @@ from nerfcli import cli, scene
 from nerfcli.atomic import write_json
 from nerfcli.cli import poses as poses_command
 from nerfcli.cli.options import seconds_from_text, thread_count
-from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TOO_FEW_PHOTOS
+from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
+from nerfcli.train.run_folder import read_log
 
 COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench")
 WITHOUT_INPUT = ("selftest",)
@@ -82,7 +83,7 @@ def test_help_lists_every_command_and_the_exit_codes():
     result = nerfcli("--help")
     assert result.exit_code == 0
     assert all(re.search(rf"^\s+{command}\b", result.stdout, re.M) for command in (*COMMANDS, *WITHOUT_INPUT))
-    assert "130 interrupted" in re.sub(r"\s+", " ", result.stdout)
+    assert "130 interrupted; 143 ended by SIGTERM" in re.sub(r"\s+", " ", result.stdout)
     for line in result.stdout.splitlines():
         if line.strip().startswith("nerfcli "):
             check_that_it_parses(line)
@@ -676,26 +677,40 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 # Processes of their own
 
 
-def test_ctrl_c_saves_a_checkpoint_and_says_how_to_go_on(capture):
+@pytest.mark.parametrize(("sent", "exit_code"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, TERMINATED)])
+def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(sent, exit_code, capture):
     run = capture.with_name("spheres-run")
-    process = started("train", capture, "--budget", "10m", "--downscale", "8", "--threads", "1")
+    options = ("--downscale", "8", "--threads", "1", "--model", "default")
+    process = started("train", capture, "--budget", "10m", *options)
     deadline = time.monotonic() + 120
     while not (run / "log.jsonl").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(sent)
+    if sent == signal.SIGTERM:  # as `timeout` does: to the command, and to its group
+        time.sleep(0.01)
+        process.send_signal(sent)
     stdout, stderr = process.communicate(timeout=60)
-    assert process.returncode == INTERRUPTED, stderr
+    assert process.returncode == exit_code, stderr
     assert stdout == ""
-    assert "Traceback" not in stderr
-    assert f"go on with: nerfcli train {shlex.quote(str(capture))} -o {shlex.quote(str(run))} --resume" in stderr
+    assert not any(word in stderr for word in ("Traceback", "stack trace"))
+    saved, ended = stderr.splitlines()[-2:]
+    go_on = f"nerfcli train {shlex.quote(str(capture))} -o {shlex.quote(str(run))} --resume"
+    assert saved == f"checkpoint saved; go on with: {go_on}"
+    assert ended.endswith("; what was complete is kept.")
     assert {path.name for path in run.iterdir()} >= {"config.json", "field.safetensors", "state.safetensors"}
     assert not list(run.rglob("*partial*"))
+    trained = read_log(run)[-1]
+    resumed = nerfcli("train", capture, "-o", run, "--resume", "--steps", str(trained["step"] + 2), *options)
+    assert resumed.exit_code == 0, resumed.stderr
+    assert f"resumed at step {trained['step']}, " in resumed.stderr
+    assert read_log(run)[-1]["step"] == trained["step"] + 2
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="a terminal is made with the pty module")
-def test_ctrl_c_on_a_terminal_leaves_no_process_and_no_half_file(finished, tmp_path):
-    """All processes of --jobs get the signal from the terminal, not the command alone."""
+@pytest.mark.parametrize("exit_code", [INTERRUPTED, TERMINATED])
+def test_a_signal_to_all_processes_of_a_command_leaves_none_and_no_half_file(exit_code, finished, tmp_path):
+    """Ctrl-C on a terminal goes to those of --jobs, too, and SIGTERM as `timeout`, systemd and schedulers send it."""
     ours, theirs = os.openpty()
     program = "import os, signal; os.open(os.ttyname(0), os.O_RDWR); "  # it becomes the terminal of this session
     program += "signal.signal(signal.SIGINT, signal.default_int_handler); from nerfcli.cli import main; main()"
@@ -709,10 +724,13 @@ def test_ctrl_c_on_a_terminal_leaves_no_process_and_no_half_file(finished, tmp_p
     while not list(tmp_path.glob(".out.*/.frames/done/*.json")) and time.monotonic() < deadline:
         assert process.poll() is None
         time.sleep(0.05)
-    os.write(ours, b"\x03")
+    if exit_code == INTERRUPTED:
+        os.write(ours, b"\x03")
+    else:
+        os.killpg(process.pid, signal.SIGTERM)
     stdout, stderr = process.communicate(timeout=120)
-    assert (process.returncode, stdout) == (INTERRUPTED, ""), stderr
-    assert "Traceback" not in stderr
+    assert (process.returncode, stdout) == (exit_code, ""), stderr
+    assert not any(word in stderr for word in ("Traceback", "stack trace"))
     while _group_lives(process.pid) and time.monotonic() < deadline:  # multiprocessing's own process ends by itself
         time.sleep(0.05)
     assert not _group_lives(process.pid)

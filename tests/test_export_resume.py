@@ -4,6 +4,7 @@ import hashlib
 import json
 import multiprocessing
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from nerfcli.export.frames import RAYS_PER_PROCESS, Workers, automatic_workers, 
 from nerfcli.export.order import Order
 from nerfcli.export.presentation import playing_order
 from nerfcli.export.settings import ExportSettings, VideoSettings
+from nerfcli.interrupts import Terminated, hear_signals
 from nerfcli.media.descriptions import description_of
 from nerfcli.media.images import read_image
 from nerfcli.render.depth import DepthRequest
@@ -194,19 +196,22 @@ def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals cannot be kept for later here")
-def test_ctrl_c_while_a_process_starts_is_kept_and_ends_it(model, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("sent", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+def test_ctrl_c_or_sigterm_while_a_process_starts_is_kept_and_ends_it(sent, raised, model, tmp_path, monkeypatch):
     start = multiprocessing.get_context("spawn").Process.start
     started: list[Any] = []
 
     def start_and_interrupt(process: Any) -> None:
-        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(sent)
         start(process)
         started.append(process)
 
     monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_interrupt)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
+    hear_signals()
     try:
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(raised):
             export_frames(
                 *(model, order(), tmp_path / "views"),
                 on_rays=lambda rays: None,
@@ -215,6 +220,7 @@ def test_ctrl_c_while_a_process_starts_is_kept_and_ends_it(model, tmp_path, monk
             )
     finally:
         signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
     assert len(started) == 1
     assert not started[0].is_alive()
     assert not (tmp_path / "views").exists()

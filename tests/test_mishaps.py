@@ -1,4 +1,4 @@
-"""What happens around a command: a full disk, Ctrl-C, another command on the same folder, photos that have gone.
+"""What happens around a command: a full disk, Ctrl-C, SIGTERM, another command on the folder, photos that are gone.
 
 Each ends with its exit code and a line or two, and everything that was there is as it was.
 """
@@ -17,8 +17,9 @@ from commands import error_of, listing, nerfcli, started
 from full_disk import files_of_at_most
 
 from nerfcli import atomic, kernels, scene
-from nerfcli.errors import BAD_INPUT, INTERRUPTED
+from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
 from nerfcli.exclusive import exclusive
+from nerfcli.interrupts import hear_signals
 from nerfcli.train.run_folder import LOCK
 
 ONE_STEP = ("--steps", "1", "--downscale", "8", "--threads", "2")
@@ -63,32 +64,37 @@ def test_a_full_disk_is_told_and_what_was_there_is_as_it_was(name, finished, cap
     assert not list(capture.parent.rglob("*partial*"))
 
 
-@pytest.fixture
-def interrupted_when_written(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """Ctrl-C as the first result is about to get its name; which one that is."""
+@pytest.fixture(params=[signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
+def interrupted_when_written(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[list[str]]:
+    """Ctrl-C or SIGTERM as the first result is about to get its name; which one that is."""
     met: list[str] = []
     replace = os.replace
 
     def replace_and_interrupt(source: Any, target: Any) -> None:
         if not met:
             met.append(str(target))
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(request.param)
         replace(source, target)
 
     monkeypatch.setattr(atomic.os, "replace", replace_and_interrupt)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
+    hear_signals()
     yield met
     signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize("name", [name for name in WRITERS if name != "train"])
-def test_ctrl_c_ends_a_command_in_one_line(name, finished, capture, interrupted_when_written):
+def test_ctrl_c_and_sigterm_end_a_command_in_one_line(name, finished, capture, interrupted_when_written):
     before = listing(capture.parent)
     result = nerfcli(*WRITERS[name][0](capture, finished))
     assert interrupted_when_written
-    assert (result.exit_code, result.stdout) == (INTERRUPTED, "")
-    lines = result.stderr.splitlines()
-    assert lines[-1] == "Interrupted; what was complete is kept."
+    assert result.stdout == ""
+    assert (result.exit_code, result.stderr.splitlines()[-1]) in (
+        (INTERRUPTED, "Interrupted; what was complete is kept."),
+        (TERMINATED, "Ended by SIGTERM; what was complete is kept."),
+    )
     assert not any(word in result.stderr for word in ("Traceback", "Error:"))
     assert with_leftovers(capture.parent, before) == {}
     assert before.items() <= listing(capture.parent).items()

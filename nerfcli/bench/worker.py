@@ -7,6 +7,7 @@ mend something. It ends by itself when its stdin closes, which is what happens w
 
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -38,6 +39,7 @@ def main(job_path: str) -> None:
     channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all processes of a command: the parent answers it
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
     try:
         _tell(channel, result=_train_and_measure(job, channel))

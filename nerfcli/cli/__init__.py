@@ -6,6 +6,7 @@ import typer
 
 from nerfcli import __version__
 from nerfcli.cli import ablate, bench, convert, doctor, evaluate, info, poses, render, report, run, selftest, train
+from nerfcli.interrupts import hear_signals
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -42,7 +43,7 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       ls -d captures/*/ | nerfcli poses - | nerfcli train - --budget 2m | nerfcli render -
 
     Exit codes: 0 done; 1 a bug; 2 wrong usage; 3 bad input; 4 too few photos registered; 5 numbers became
-    non-finite; 6 out of memory; 7 a quality gate not met; 130 interrupted.
+    non-finite; 6 out of memory; 7 a quality gate not met; 130 interrupted; 143 ended by SIGTERM.
     """
     if version:
         typer.echo(f"nerfcli {__version__}")
@@ -55,4 +56,5 @@ def main() -> None:
     # the same cores then wait for each other's waiting: 58 training steps in 10 s, where there are 245 with this.
     # libgomp reads it when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    hear_signals()
     app()

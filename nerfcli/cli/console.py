@@ -12,7 +12,8 @@ from typing import Any, ParamSpec, TextIO, TypeVar
 
 import typer
 
-from nerfcli.errors import INTERRUPTED, OUT_OF_MEMORY, UserError
+from nerfcli.errors import INTERRUPTED, OUT_OF_MEMORY, TERMINATED, UserError
+from nerfcli.interrupts import Terminated
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -145,6 +146,9 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
         except UserError as error:
             report_error(error)
             raise typer.Exit(error.exit_code) from error
+        except Terminated as error:
+            _stderr("Ended by SIGTERM; what was complete is kept.")
+            raise typer.Exit(TERMINATED) from error
         except KeyboardInterrupt as error:
             _stderr("Interrupted; what was complete is kept.")
             raise typer.Exit(INTERRUPTED) from error

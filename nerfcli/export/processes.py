@@ -18,6 +18,7 @@ from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
 from nerfcli.export.unfinished import Unfinished
+from nerfcli.interrupts import held_back
 from nerfcli.render.model import Model
 
 # A frame at which processes died this often is not tried once more.
@@ -69,7 +70,7 @@ def render_in_processes(
         ours, theirs = context.Pipe()
         share = max(1, threads // jobs)
         process = context.Process(target=_serve, args=(theirs, model, order, unfinished, share), daemon=True)
-        with _without_interrupts():  # an interrupt that was kept comes at the end, and has to find the process
+        with _interrupts_kept():  # an interrupt that was kept comes at the end, and has to find the process
             process.start()
             workers.append(_Worker(process, ours))
         theirs.close()
@@ -133,6 +134,8 @@ def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, 
     """The life of a process: render the frames whose numbers come, until the other end closes."""
     torch.set_num_threads(threads)
     signal.signal(signal.SIGTERM, _leave)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     while True:
         try:
             index = connection.recv()
@@ -171,26 +174,20 @@ def _tell_death(worker: _Worker, order: Order, notify: Callable[[str], None], *,
 
 
 @contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """A process that is started here never hears Ctrl-C: the one that started it ends it.
+def _interrupts_kept() -> Iterator[None]:
+    """A process that is started here never hears Ctrl-C, and SIGTERM once it can answer: we end it.
 
-    Starting takes seconds, as the new process reads the model only when it has come up. A Ctrl-C that comes meanwhile
-    is kept for afterwards.
+    Starting takes seconds, as the new process reads the model only when it has come up. What comes to us meanwhile is
+    kept for afterwards: a process that is left amid its model complains.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows: there it is lost
-        try:
-            before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        except ValueError:  # not in the main thread, which alone may do this
+    with held_back() as interrupts:
+        if hasattr(signal, "pthread_sigmask"):
+            resource_tracker.ensure_running()  # it would be started with the first process, and let signals in again
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+            try:
+                yield
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        else:  # Windows
             yield
-            return
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, before)
-        return
-    resource_tracker.ensure_running()  # it would be started with the first process, and let signals in again
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    interrupts.answer()

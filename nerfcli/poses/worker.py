@@ -12,6 +12,7 @@ cannot break the list of pairs.
 
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -42,6 +43,7 @@ def main(job_path: str) -> None:
     """Do one job and write its result."""
     report, tell = _take_stdout()
     _end_with_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all processes of a command: the parent answers it
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     job = read_job(Path(job_path))
     pycolmap.set_random_seed(job.seed)

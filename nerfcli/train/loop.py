@@ -14,10 +14,10 @@ from nerfcli import kernels
 from nerfcli.atomic import cannot_write
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
+from nerfcli.interrupts import held_back
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
 from nerfcli.train.fitting import Fitting
-from nerfcli.train.interrupts import held_back
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.run_folder import (
     CONFIG,

@@ -1,0 +1,118 @@
+"""Ctrl-C and SIGTERM: both end a command in the same way, at the next moment at which what is saved is whole.
+
+SIGTERM comes from `kill`, `timeout`, systemd and the schedulers of clusters. Some of them send it more than once, to a
+command alone and to its group: the first one counts. Who cannot wait has SIGKILL.
+"""
+
+import _thread
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+
+# Long enough to be out of the callback, short enough that nobody waits.
+_AGAIN_SECONDS = 0.05
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came; what answers Ctrl-C answers this."""
+
+
+def hear_signals() -> None:
+    """Have SIGTERM raise `Terminated`, unless whoever started this process has it ignored; and lose no interrupt.
+
+    Python drops what is raised in a callback of C code or while an object is freed, numba's compiler for instance: what
+    was dropped is raised once more, elsewhere.
+    """
+    if signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _terminate)
+    sys.unraisablehook = _raise_again
+
+
+def give_back_sigterm() -> None:
+    """Have SIGTERM do what Python last had it do, after a C++ library has taken it without asking.
+
+    Outside of the main thread, which alone may do this, nothing changes.
+    """
+    handler = signal.getsignal(signal.SIGTERM)
+    if handler is not None:
+        with suppress(ValueError):
+            signal.signal(signal.SIGTERM, handler)
+
+
+class Interrupts:
+    """Whether Ctrl-C or SIGTERM came."""
+
+    def __init__(self) -> None:
+        self.came: type[KeyboardInterrupt] | None = None
+
+    def note(self, signum: int, frame: FrameType | None) -> None:
+        """Remember the first; a Ctrl-C after it does not wait."""
+        if signum == signal.SIGTERM:
+            self.came = self.came or Terminated
+        elif self.came is not None:
+            raise KeyboardInterrupt
+        else:
+            self.came = KeyboardInterrupt
+
+    def answer(self) -> None:
+        """Raise what came meanwhile.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C came.
+            Terminated: SIGTERM came.
+        """
+        if self.came is not None:
+            raise self.came
+
+
+@contextmanager
+def held_back() -> Iterator[Interrupts]:
+    """Hold Ctrl-C back until it is asked for, and SIGTERM where `hear_signals` hears it.
+
+    Outside of the main thread, to which signals do not come, nothing is held back.
+    """
+    interrupts = Interrupts()
+    try:
+        before = signal.signal(signal.SIGINT, interrupts.note)
+    except ValueError:
+        yield interrupts
+        return
+    heard = signal.getsignal(signal.SIGTERM) is _terminate
+    if heard:
+        signal.signal(signal.SIGTERM, interrupts.note)
+    try:
+        yield interrupts
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if heard:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN if interrupts.came is Terminated else _terminate)
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise Terminated
+
+
+def _raise_again(dropped: "sys.UnraisableHookArgs") -> None:
+    if not isinstance(dropped.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(dropped)
+        return
+    number = signal.SIGINT
+    if isinstance(dropped.exc_value, Terminated):
+        number = signal.SIGTERM
+        signal.signal(number, _terminate)
+    again = threading.Timer(_AGAIN_SECONDS, _send, [number])
+    again.daemon = True  # the command may end before
+    again.start()
+
+
+def _send(number: signal.Signals) -> None:
+    if sys.platform == "win32":
+        _thread.interrupt_main(number)
+        return
+    main = threading.main_thread().ident
+    assert main is not None
+    signal.pthread_kill(main, number)  # which ends a wait, too

@@ -1,0 +1,75 @@
+"""SIGTERM in processes of their own, as nothing else shows what C++ and C make of it."""
+
+import signal
+import subprocess
+import sys
+import time
+
+from commands import started
+from corner import write_capture
+
+from nerfcli.errors import TERMINATED
+from nerfcli.poses.workspace import workspace
+
+
+def ended(program: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_pycolmap_leaves_sigterm_alone_and_keeps_its_traces_of_crashes():
+    """Of a C++ library's handlers only the process itself can tell: they answer real signals."""
+    imported = "import os, signal; import nerfcli.cameras.camera; os.kill(os.getpid(), signal.{}); signal.pause()"
+    terminated = ended(imported.format("SIGTERM"))
+    assert (terminated.returncode, terminated.stderr) == (-signal.SIGTERM, "")
+    crashed = ended(imported.format("SIGSEGV"))
+    assert crashed.returncode == -signal.SIGSEGV
+    assert "SIGSEGV" in crashed.stderr
+
+
+def test_a_process_that_ignores_sigterm_goes_on_doing_so():
+    program = (
+        "import os, signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "from nerfcli.interrupts import hear_signals; hear_signals()\n"
+        "import nerfcli.cameras.camera; os.kill(os.getpid(), signal.SIGTERM); print('alive')"
+    )
+    assert ended(program).stdout == "alive\n"
+
+
+def test_an_interrupt_that_python_drops_in_a_callback_of_c_comes_again():
+    """While numba compiles, LLVM calls back into Python; there a KeyboardInterrupt becomes a message on stderr."""
+    program = """
+import ctypes, os, signal, time
+from nerfcli.interrupts import Terminated, hear_signals
+
+hear_signals()
+
+@ctypes.CFUNCTYPE(None)
+def callback():
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(0.01)
+
+try:
+    callback()
+    time.sleep(30)
+except Terminated:
+    print("heard")
+"""
+    done = ended(program)
+    assert (done.stdout, done.stderr) == ("heard\n", "")
+
+
+def test_sigterm_ends_poses_and_its_worker_without_a_stack_trace(tmp_path):
+    photos, scene = tmp_path / "photos", tmp_path / "scene"
+    write_capture(photos)
+    process = started("poses", photos, "-o", scene, "--threads", "1", "--quiet")
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.rglob("database.db")) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    stdout, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stdout) == (TERMINATED, "")
+    assert stderr.splitlines()[-1] == "Ended by SIGTERM; what was complete is kept."
+    assert not any(word in stderr for word in ("Traceback", "stack trace"))
+    assert not (scene / "scene.json").exists()
+    with workspace(scene):  # whose lock the worker has as long as it lives
+        pass
