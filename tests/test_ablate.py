@@ -47,7 +47,7 @@ def test_differences_are_taken_seed_by_seed_and_get_a_verdict():
     models.append(Variant("entropy=0.01", Components(entropy=0.01), True))
     psnr = {CHOSEN: (20.0, 22.0, 21.0), "view=0": (19.0, 21.1, 19.9), "entropy=0.01": (20.5, 21.5, 21.1)}
     measured = [
-        Measured(name, seed, value, None, 60.0, 100)
+        Measured(name, seed, value, None, 60.0, 100, "as told")
         for name, values in psnr.items()
         for seed, value in enumerate(values)
     ]
@@ -90,6 +90,15 @@ def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
     with (tmp_path / "out" / "ablation.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert float(rows[1]["difference_db"]) == pytest.approx(content["rows"][1]["difference_db"])
+    assert "sampled: 324 random pixels of 3 held-out photos at 12x9" in rows[1]["protocol"]
+
+    # The same trainings on whole photos: so small that the sample was all of their pixels.
+    assert CliRunner().invoke(app, [*command, "--whole"]).exit_code == 0
+    whole = json.loads((tmp_path / "out" / "ablation.json").read_text())
+    assert len(trained) == 4
+    assert [row["psnr"] for row in whole["rows"]] == pytest.approx([row["psnr"] for row in content["rows"]], abs=1e-3)
+    assert [row["ssim"] is None for row in content["rows"] + whole["rows"]] == [True, True, False, False]
+    assert "sampled" not in whole["rows"][1]["protocol"]
 
 
 def test_something_else_is_left_alone(tmp_path):

@@ -22,7 +22,7 @@ from typer.testing import CliRunner, Result
 from nerfcli import cli
 from nerfcli.atomic import write_json
 from nerfcli.bench import measure, rendering
-from nerfcli.bench.heldout import FINER, SampledPixels, distance_to_float64, held_out_photos, smaller
+from nerfcli.bench.heldout import FINER, distance_to_float64, held_out_photos, quadrature, smaller
 from nerfcli.bench.machine import is_busy, processor_name
 from nerfcli.bench.pareto import SAME_TIME, Measured, Spread, at_most, dominators, least_difference, near_best
 from nerfcli.bench.records import MEASURED, opened
@@ -43,6 +43,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, UserError
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.pages.page import asset
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.scene import Scene
@@ -260,7 +261,7 @@ def test_quadrature_error_shrinks_with_the_step_and_is_small_in_float64():
     """The border of the fog is seen half a step off at most: steps four times as fine, a quarter of the error."""
     model, photo = towards_fog()
     sample = SampledPixels((photo,), (np.arange(18 * 24).repeat(16),))  # every 16th of them is rendered again
-    coarse, fine = (sample.quadrature(model.stretched(step)) for step in (2.0, 0.5))
+    coarse, fine = (quadrature(sample, model.stretched(step)) for step in (2.0, 0.5))
     assert fine < 0.5 * coarse
     assert fine > 0
     assert distance_to_float64(model, photo, seed=0, count=16) < fine / FINER * 4

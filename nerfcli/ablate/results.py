@@ -15,14 +15,14 @@ from nerfcli.atomic import atomic_path, write_json
 from nerfcli.errors import UserError
 
 RESULT, TABLE, RUNS = "ablation.json", "ablation.csv", "runs"
-FORMAT = "nerfcli ablation 1"
+FORMAT = "nerfcli ablation 2"
 # Of the intervals.
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One training: PSNR and SSIM as `nerfcli evaluate` has them, means over the held-out photos."""
+    """One training: means over the held-out photos of PSNR and, on whole photos, SSIM; `protocol` says how."""
 
     variant: str
     seed: int
@@ -30,6 +30,7 @@ class Measured:
     ssim: float | None
     seconds: float
     steps: int
+    protocol: str
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Row:
         seconds, steps: of a training, means.
         seeds: how many.
         verdict: in words.
+        protocol: of the measurements.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Row:
     steps: float
     seeds: int
     verdict: str
+    protocol: str
 
 
 def rows_of(measured: Sequence[Measured], variants: Sequence[Variant]) -> list[Row]:
@@ -83,6 +86,7 @@ def rows_of(measured: Sequence[Measured], variants: Sequence[Variant]) -> list[R
                 statistics.fmean(entry.steps for entry in own),
                 len(own),
                 _verdict(variant, mean, half),
+                own[-1].protocol,
             )
         )
     return rows

@@ -6,7 +6,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from nerfcli.bench.heldout import FINER, SAMPLED_PIXELS
+from nerfcli.bench.heldout import FINER
 from nerfcli.bench.summary import SAME_QUADRATURE
 from nerfcli.bench.tables import (
     RENDERING_COLUMNS,
@@ -16,6 +16,7 @@ from nerfcli.bench.tables import (
     sentences,
     training_rows,
 )
+from nerfcli.evaluate.sampled import SAMPLED_PIXELS
 from nerfcli.pages import page
 from nerfcli.pages.tables import table
 

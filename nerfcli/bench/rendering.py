@@ -17,13 +17,14 @@ import numpy as np
 import torch
 
 from nerfcli.atomic import atomic_path
-from nerfcli.bench.heldout import FINER, background_of, distance_to_float64, smaller
+from nerfcli.bench.heldout import FINER, distance_to_float64, smaller
 from nerfcli.bench.machine import PeakMemory
 from nerfcli.bench.pictures import FOLDER, MOST_ERROR, MOST_QUADRATURE, slug, write_difference, write_picture
 from nerfcli.bench.session import Session
 from nerfcli.bench.sweep import STORED_IN, RenderSetting
 from nerfcli.evaluate.metrics import psnr, to_8_bit
 from nerfcli.evaluate.protocol import HeldOut, as_exposed, over_white
+from nerfcli.evaluate.sampled import background_of
 from nerfcli.field.cost import field_bytes
 from nerfcli.render.accuracy import TIGHT
 from nerfcli.render.model import Model

@@ -16,11 +16,12 @@ from typing import Any, TextIO
 
 from nerfcli import kernels
 from nerfcli import scene as scenes
-from nerfcli.bench.heldout import SampledPixels, background_of, held_out_photos, smaller
+from nerfcli.bench.heldout import held_out_photos, quadrature, smaller
 from nerfcli.bench.pictures import MOST_ERROR, write_difference, write_picture
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, to_8_bit
 from nerfcli.evaluate.protocol import HeldOut, as_exposed, over_white
+from nerfcli.evaluate.sampled import SampledPixels, background_of
 from nerfcli.field.cost import field_bytes
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.pictures import render_picture
@@ -77,7 +78,7 @@ def measure_model(
     used = picture.valid if small.used is None else picture.valid & small.used
     return {
         "psnr": sample.psnr(model),
-        "quadrature": sample.quadrature(model),
+        "quadrature": quadrature(sample, model),
         "shown_psnr": psnr(to_8_bit(rgb), truth, used=used),
         "render_seconds": seconds[1:] or seconds,  # the first one warms up
         "render_size": [small.frame.camera.width, small.frame.camera.height],

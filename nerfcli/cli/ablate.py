@@ -1,5 +1,6 @@
 """nerfcli ablate: what each component is worth on a scene."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -38,7 +39,10 @@ if TYPE_CHECKING:
     from nerfcli.scene import Scene
     from nerfcli.train.settings import TrainSettings
 
+    Measure = Callable[["_Trainings", str, TrainSettings, Path], Measured]
+
 DEFAULT_BUDGET = "1m"
+_SAME = "; the same pixels for all models of a seed, others for each seed"
 _STYLES = {"would help": "green", "needed: worse without it": "green", "not needed: better without it": "yellow"}
 
 
@@ -56,6 +60,10 @@ def ablate(
     ] = None,
     include: Include = None,
     exclude: Exclude = None,
+    whole: Annotated[
+        bool,
+        typer.Option("--whole", help="Measure whole held-out photos as `evaluate` does, SSIM too, not random pixels."),
+    ] = False,
     model: Annotated[
         str, typer.Option(help="What is compared with: auto (what the scene decides on) or default.")
     ] = "auto",
@@ -72,18 +80,22 @@ def ablate(
     """Measure what each component is worth on a scene: trainings with it and without it, on the held-out photos.
 
     The model that `train --model auto` chooses is compared with models that have one component less, or one more: the
-    same time or steps, the same seeds, held-out photos by the protocol of `nerfcli evaluate`. Each difference comes
-    with its 95 % interval over the seeds and a verdict. This is a measurement: nothing is chosen by it. Masks are not
-    varied, as they change what is measured. Components are those of `nerfcli train --help`.
+    same time or steps, the same seeds. Each difference comes with its 95 % interval over the seeds and a verdict. This
+    is a measurement: nothing is chosen by it. Masks are not varied, as they change what is measured. Components are
+    those of `nerfcli train --help`.
+
+    PSNR is that of some 16,000 random pixels of the held-out photos: the same ones for all models of a seed, others for
+    each seed, so that the interval includes the choice of pixels. For a table of a paper add --whole: whole photos and
+    SSIM by the protocol of `nerfcli evaluate`, which takes longer than short trainings do.
 
     Writes SCENE-ablation/ with ablation.csv, ablation.json and every run. When it was interrupted, the same command
-    goes on.
+    goes on; with --whole it measures the trainings that are there anew.
 
     \b
     Examples:
       nerfcli ablate photos-scene
       nerfcli ablate photos-scene --only view --only exposure --budget 30s
-      nerfcli ablate photos-scene --model default --seeds 5 -o paper/ablation
+      nerfcli ablate photos-scene --model default --seeds 5 --whole -o paper/ablation
     """
     from nerfcli.train.components import CHOICES, Components, choose
     from nerfcli.train.settings import TrainSettings
@@ -109,43 +121,40 @@ def ablate(
     def work(path: Path, one_of_many: bool) -> None:
         folder = result_path(path, suffix="-ablation", output=output, one_of_many=one_of_many)
         trainings = _Trainings(path, folder, rule, limit, overwrite, console)
-        content = ablate_scene(trainings, settings, seeds=seeds, only=tuple(only or ()))
+        measure = _measured_whole if whole else _measured_pixels
+        content = ablate_scene(trainings, settings, seeds=seeds, only=tuple(only or ()), measure=measure)
         console.result(folder / "ablation.csv", content)
 
     for_each_input(scene, work)
 
 
 class _Trainings:
-    """The runs of one ablation, each trained and measured once, in a folder of its own."""
+    """The runs of one ablation, each trained once, in a folder of its own."""
 
     def __init__(
         self, scene: Path, folder: Path, rule: str | None, limit: int | None, overwrite: bool, console: Console
     ):
         self.scene, self.folder, self.rule, self.console = scene, folder, rule, console
-        self._limit, self._overwrite = limit, overwrite
-        self._inner = Console(quiet=True, json_lines=False)
+        self.overwrite, self._limit = overwrite, limit
+        self.inner = Console(quiet=True, json_lines=False)
 
     def run(self, name: str, settings: "TrainSettings") -> Path:
-        """The folder of a run, trained with these settings and measured: now, or by an earlier call."""
+        """The folder of a run, trained with these settings: now, or by an earlier call."""
         from nerfcli.ablate.results import RUNS
-        from nerfcli.cli.evaluate import evaluate_run
         from nerfcli.cli.train import train_scene, was_interrupted
         from nerfcli.train.run_folder import STATE
 
         run = self.folder / RUNS / f"{name}-{settings.seed}"
-        resume = not self._overwrite and was_interrupted(self.scene, run, settings, holdout=self.rule)
+        resume = not self.overwrite and was_interrupted(self.scene, run, settings, holdout=self.rule)
         train_scene(
             self.scene,
             run,
             settings=settings,
             memory_bytes=self._limit,
             resume=resume,
-            overwrite=self._overwrite,
-            console=self._inner,
+            overwrite=self.overwrite,
+            console=self.inner,
             holdout=self.rule,
-        )
-        evaluate_run(
-            run, device=settings.device, threads=settings.threads, overwrite=self._overwrite, console=self._inner
         )
         # Three times as large as the field, and nobody goes on from here.
         (run / STATE).unlink(missing_ok=True)
@@ -153,15 +162,16 @@ class _Trainings:
 
 
 def ablate_scene(
-    trainings: _Trainings, settings: "TrainSettings", *, seeds: int, only: tuple[str, ...]
+    trainings: _Trainings, settings: "TrainSettings", *, seeds: int, only: tuple[str, ...], measure: "Measure"
 ) -> dict[str, Any]:
-    """Train and measure every variant with every seed, or what is left of it, and write the table after each.
+    """Train every variant with every seed, or what is left of it, measure it, and write the table after each.
 
     Args:
         trainings: where the runs are.
         settings: of all of them; `model` "auto" has the scene decide first.
         seeds: how many, from that of the settings on.
         only: components to vary; all where there are none.
+        measure: takes the trainings, the name of a variant, its settings and its run.
 
     Raises:
         UserError: see `nerfcli.train.loop.train`; nothing is held out, or something else stands at the folder.
@@ -185,7 +195,7 @@ def ablate_scene(
             update(0.0, "asking the scene which components it needs")
             run = trainings.run(AUTO, settings)
             compared.append(Variant(AUTO, settings.components))
-            measured.append(_measured(AUTO, settings.seed, run))
+            measured.append(measure(trainings, AUTO, settings, run))
             settings = replace(settings, model="default", components=chosen_components(read_config(run)), fixed=())
             about["chosen"] = settings.components.to_json()
             console.note(_told(measured[-1]))
@@ -195,13 +205,15 @@ def ablate_scene(
         todo = [(seed, one) for seed in range(settings.seed, settings.seed + seeds) for one in models]
         for number, (seed, variant) in enumerate(todo):
             update(number / len(todo), f"{variant.name}, seed {seed} ({number + 1} of {len(todo)})")
-            run = trainings.run(variant.name, replace(settings, components=variant.components, seed=seed))
-            measured.append(_measured(variant.name, seed, run))
+            wanted = replace(settings, components=variant.components, seed=seed)
+            run = trainings.run(variant.name, wanted)
+            measured.append(measure(trainings, variant.name, wanted, run))
             console.note(_told(measured[-1]))
             about["complete"] = number + 1 == len(todo)
             rows = rows_of(measured, compared)
             write_results(folder, rows, measured, about)
     console.table(COLUMNS, table_of(rows), styles=_STYLES)
+    console.note(f"measured by {measured[-1].protocol}; intervals of 95 % by Student's t over the seeds")
     return {"rows": [vars(row) for row in rows], **about}
 
 
@@ -225,15 +237,33 @@ def _capture(scene: "Scene") -> "Capture":
     )
 
 
-def _measured(name: str, seed: int, run: Path) -> "Measured":
-    """What the metrics of a run say."""
+def _measured_whole(trainings: _Trainings, name: str, settings: "TrainSettings", run: Path) -> "Measured":
+    """Whole photos, by the protocol of `evaluate`: now, or by an earlier call."""
     from nerfcli.ablate.results import Measured
-    from nerfcli.atomic import read_json
-    from nerfcli.evaluate.protocol import METRICS
+    from nerfcli.cli.evaluate import evaluate_run
 
-    metrics = read_json(run / METRICS, needed=("mean", "training"), hint="add --overwrite to measure again")
-    mean, training = metrics["mean"], metrics["training"]
-    return Measured(name, seed, mean["psnr"], mean["ssim"], training["seconds"], training["steps"])
+    device, threads = settings.device, settings.threads
+    _, metrics = evaluate_run(
+        run, device=device, threads=threads, overwrite=trainings.overwrite, console=trainings.inner
+    )
+    mean, training, protocol = metrics["mean"], metrics["training"], metrics["protocol"]
+    return Measured(name, settings.seed, mean["psnr"], mean["ssim"], training["seconds"], training["steps"], protocol)
+
+
+def _measured_pixels(trainings: _Trainings, name: str, settings: "TrainSettings", run: Path) -> "Measured":
+    """Random pixels of the held-out photos: the same for all models of a seed."""
+    from nerfcli.ablate.results import Measured
+    from nerfcli.cli.evaluation import held_out_photos
+    from nerfcli.evaluate.sampled import SampledPixels
+    from nerfcli.render.model import load_model
+    from nerfcli.train.run_folder import FIELD, read_cameras, read_config, read_log
+
+    model, last = load_model(run / FIELD, settings.device), read_log(run)[-1]
+    photos = held_out_photos(read_config(run), read_cameras(run)["test"], model=model, threads=settings.threads)
+    sample = SampledPixels.drawn(photos, seed=settings.seed)
+    return Measured(
+        name, settings.seed, sample.psnr(model), None, last["seconds"], last["step"], f"{sample.protocol()}{_SAME}"
+    )
 
 
 def _told(entry: "Measured") -> str:

@@ -1,0 +1,98 @@
+"""Random pixels of held-out photos: an estimate of what `evaluate` tells of whole photos, at little cost."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.evaluate.metrics import psnr, to_8_bit
+from nerfcli.evaluate.protocol import PROTOCOL, WHITE, HeldOut, as_exposed, over_white
+from nerfcli.field.background import Background, colours_behind
+from nerfcli.render.model import Model
+from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.render.tracing import TOLERANCE, render_cut_rays, uniform_cuts
+
+SAMPLED_PIXELS = 2**14
+_RAYS_AT_A_TIME = 4096
+
+
+@dataclass(frozen=True)
+class SampledPixels:
+    """The same random pixels of all held-out photos, as many of each, whatever field is looked at.
+
+    Args:
+        photos: the held-out photos.
+        pixels: for each, which of its pixels, counted row by row.
+    """
+
+    photos: tuple[HeldOut, ...]
+    pixels: tuple[np.ndarray, ...]
+
+    @staticmethod
+    def drawn(photos: Sequence[HeldOut], *, seed: int) -> "SampledPixels":
+        """`SAMPLED_PIXELS` in all, or every pixel that counts where there are fewer."""
+        generator = np.random.default_rng(seed)
+        wanted = -(-SAMPLED_PIXELS // len(photos))
+        chosen = []
+        for photo in photos:
+            count = photo.pixels.shape[0] * photo.pixels.shape[1]
+            usable = np.arange(count) if photo.used is None else np.flatnonzero(photo.used)
+            chosen.append(np.sort(generator.choice(usable, size=min(wanted, len(usable)), replace=False)))
+        return SampledPixels(tuple(photos), tuple(chosen))
+
+    def protocol(self) -> str:
+        """How `psnr` measures, in words."""
+        sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in self.photos})
+        return (
+            f"{PROTOCOL}, sampled: {sum(map(len, self.pixels))} random pixels of {len(self.photos)} held-out photos at "
+            f"{' '.join(sizes)}, sRGB 8 bit, mean over photos; PSNR"
+        )
+
+    @torch.no_grad()
+    def psnr(self, model: Model) -> float:
+        """Mean over the photos of the PSNR on their pixels, in dB, 8 bit as in `evaluate`: an estimate of its mean."""
+        cuts = uniform_cuts(model.marching)
+        values = []
+        for photo, pixels in zip(self.photos, self.pixels, strict=True):
+            rgb, valid = render_sampled(model, photo, pixels, cuts=cuts, tolerance=TOLERANCE)
+            truth = over_white(photo.pixels).reshape(-1, 3)[pixels]
+            if valid.any():
+                values.append(psnr(to_8_bit(as_exposed(rgb, photo.log_gains)), truth, used=valid))
+        return float(np.mean(values))
+
+
+def background_of(model: Model, photo: HeldOut) -> Background:
+    """What is behind the field where a photo is compared with it."""
+    return WHITE if photo.pixels.shape[-1] == 4 else model.background
+
+
+def render_sampled(
+    model: Model,
+    photo: HeldOut,
+    pixels: np.ndarray,
+    *,
+    cuts: Tensor,
+    tolerance: float,
+    at_a_time: int = _RAYS_AT_A_TIME,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (N, 3) in [0, 1] of the centres of pixels in the field's precision, and which of them have a ray."""
+    dtype = next(model.field.parameters()).dtype
+    rays = pixel_rays(photo.frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
+    directions, origin = rays.directions.to(dtype), rays.origin.to(dtype)
+    behind = colours_behind(background_of(model, photo), directions)
+    colours = [
+        render_cut_rays(
+            model,
+            origin.expand_as(some),
+            some,
+            cuts=cuts.to(some),
+            background=behind[begin : begin + len(some)],
+            shares=(),
+            tolerance=tolerance,
+            cones=rays.cones[begin : begin + len(some)].to(dtype),
+        ).rgb
+        for begin, some in zip(range(0, len(directions), at_a_time), directions.split(at_a_time), strict=True)
+    ]
+    return torch.cat(colours).clamp(0.0, 1.0).cpu().numpy(), rays.valid.cpu().numpy()
