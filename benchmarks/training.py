@@ -1,10 +1,12 @@
-"""Held-out quality against training time: every budget is a training of its own, for each seed.
+"""Held-out quality against training time, and `--model auto` against the default model in the same time.
 
-    python benchmarks/training.py photos-scene -o fox --budgets 15,30,60,120,300 --seeds 3
-    python benchmarks/training.py lego_400 -o lego --downscale 1
+    python benchmarks/training.py photos-scene lego_400 -o budgets --budgets 15,60,300,1800 --models auto
+    python benchmarks/training.py fox fern banana -o models --budgets 100 --seeds 0,1,2 --threads 1
 
-Calls `nerfcli train` and `nerfcli evaluate`, so that what is measured is what users get, peak memory included. Writes
-OUT.csv and OUT.png and prints a table. Let nothing else run meanwhile.
+Every budget is a training of its own, for each scene, model and seed; the search of `auto` is part of its budget. Calls
+`nerfcli train` and `nerfcli evaluate`, so that what is measured is what users get, peak memory included. Prints a table
+and writes OUT.csv, a line per training as soon as it is done; lines that are there already are not computed again. Let
+nothing else run meanwhile.
 """
 
 import csv
@@ -13,6 +15,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,15 +27,23 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Training:
-    """One training: its budget and seed, and what `evaluate` said of it."""
+    """One training, and what `evaluate` said of it over whole held-out photos.
 
+    `dip_db` is what the best quarter of it was better by than the end, over some held-out pixels; `kept` is what the
+    search put into the model or left out.
+    """
+
+    scene: str
     budget_s: float
+    model: str
     seed: int
     psnr: float
     ssim: float
-    samples_per_s: float
-    rays_per_s: float
+    dip_db: float
+    kept: str
+    search_s: float
     steps: int
+    samples_per_s: float
     peak_memory_gb: float
     render_s: float
 
@@ -43,90 +54,118 @@ def nerfcli(*arguments: str) -> str:
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-def measure(scene: Path, budget: float, seed: int, downscale: str, threads: int) -> Training:
+def measure(scene: Path, budget: float, model: str, seed: int, *, threads: int) -> Training:
     """Train and evaluate once."""
     with tempfile.TemporaryDirectory() as folder:
-        run = str(Path(folder) / "run")
+        run = Path(folder) / "run"
         common = ("--threads", str(threads), "--quiet")
-        nerfcli(
-            "train", str(scene), "-o", run, "--budget", f"{budget}s", "--seed", str(seed), "--downscale", downscale,
-            *common,
-        )  # fmt: skip
-        metrics: dict[str, Any] = json.loads(nerfcli("evaluate", run, "--json", *common))
+        options = ("--budget", f"{budget}s", "--model", model, "--seed", str(seed))
+        nerfcli("train", str(scene), "-o", str(run), *options, *common)
+        metrics: dict[str, Any] = json.loads(nerfcli("evaluate", str(run), "--json", *common))
+        log = [json.loads(line) for line in (run / "log.jsonl").read_text(encoding="utf-8").splitlines()]
+        selection = json.loads((run / "config.json").read_text(encoding="utf-8")).get("selection") or {}
+    course = [entry["heldout_psnr"] for entry in log if "heldout_psnr" in entry]
+    kept = [f"{one['component']}={one['value']}" for one in selection.get("decisions", []) if one["kept"]]
     training = metrics["training"]
     return Training(
+        scene=scene.name,
         budget_s=budget,
+        model=model,
         seed=seed,
-        psnr=metrics["mean"]["psnr"],
-        ssim=metrics["mean"]["ssim"],
-        samples_per_s=training["samples_per_second"],
-        rays_per_s=training["rays_per_second"],
+        psnr=round(metrics["mean"]["psnr"], 3),
+        ssim=round(metrics["mean"]["ssim"], 4),
+        dip_db=round(max(course) - course[-1], 3),
+        kept=" ".join(kept),
+        search_s=round(selection.get("seconds", 0.0), 1),
         steps=training["steps"],
-        peak_memory_gb=training["peak_memory_bytes"] / 1e9,
-        render_s=metrics["render"]["seconds_per_image"],
+        samples_per_s=round(training["samples_per_second"]),
+        peak_memory_gb=round(training["peak_memory_bytes"] / 1e9, 2),
+        render_s=round(metrics["render"]["seconds_per_image"], 2),
     )
 
 
-def print_table(trainings: list[Training], title: str) -> None:
-    """A line per budget: means over the seeds, and their spread."""
-    table = Table(title=title)
-    for name in ("budget s", "PSNR dB", "spread dB", "SSIM", "M samples/s", "k rays/s", "peak GB", "s a picture"):
-        table.add_column(name, justify="right")
-    for budget in sorted({t.budget_s for t in trainings}):
-        of_budget = [t for t in trainings if t.budget_s == budget]
-        psnrs = [t.psnr for t in of_budget]
-        table.add_row(
-            f"{budget:g}",
-            f"{statistics.fmean(psnrs):.2f}",
-            f"{max(psnrs) - min(psnrs):.2f}",
-            f"{statistics.fmean(t.ssim for t in of_budget):.3f}",
-            f"{statistics.fmean(t.samples_per_s for t in of_budget) / 1e6:.2f}",
-            f"{statistics.fmean(t.rays_per_s for t in of_budget) / 1e3:.1f}",
-            f"{max(t.peak_memory_gb for t in of_budget):.2f}",
-            f"{statistics.fmean(t.render_s for t in of_budget):.2f}",
-        )
-    Console(width=120).print(table)
+def mean(trainings: Iterable[Training], name: str) -> float:
+    return statistics.fmean(getattr(training, name) for training in trainings)
 
 
-def plot(trainings: list[Training], title: str, path: Path) -> None:
-    """PSNR over the budget, a dot per training and a line through the means."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
-    budgets = sorted({t.budget_s for t in trainings})
-    means = [statistics.fmean(t.psnr for t in trainings if t.budget_s == budget) for budget in budgets]
-    axes.plot(budgets, means)
-    axes.plot([t.budget_s for t in trainings], [t.psnr for t in trainings], "o", markersize=4)
-    axes.set(xscale="log", xlabel="training time (s)", ylabel="held-out PSNR (dB)", title=title)
-    axes.set_xticks(budgets, [f"{budget:g}" for budget in budgets], minor=False)
-    axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=150)
+def print_tables(trainings: list[Training]) -> None:
+    """A line per scene, budget and model: means over the seeds; and the gains of auto where both were trained."""
+    table = Table(title="held-out photos")
+    for name in (
+        "scene",
+        "budget s",
+        "model",
+        "seeds",
+        "PSNR dB",
+        "spread",
+        "SSIM",
+        "dip",
+        "GB",
+        "s a picture",
+        "kept",
+    ):
+        table.add_column(name)
+    gains = Table(title="auto against default, in the same time with its search")
+    for name in ("scene", "budget s", "default dB", "auto dB", "gain dB", "of each seed"):
+        gains.add_column(name)
+    for scene, budget in dict.fromkeys((t.scene, t.budget_s) for t in trainings):
+        here = [t for t in trainings if (t.scene, t.budget_s) == (scene, budget)]
+        for model in dict.fromkeys(t.model for t in here):
+            own = [t for t in here if t.model == model]
+            psnrs = [t.psnr for t in own]
+            kept = [t.kept or "nothing" for t in own] if model == "auto" else []
+            table.add_row(
+                scene, f"{budget:g}", model, str(len(own)), f"{statistics.fmean(psnrs):.2f}",
+                f"{max(psnrs) - min(psnrs):.2f}", f"{mean(own, 'ssim'):.3f}", f"{mean(own, 'dip_db'):.2f}",
+                f"{max(t.peak_memory_gb for t in own):.2f}", f"{mean(own, 'render_s'):.2f}",
+                ", ".join(f"{kept.count(one)} x {one}" for one in dict.fromkeys(kept)),
+            )  # fmt: skip
+        by_seed = {(t.model, t.seed): t.psnr for t in here}
+        both = [seed for model, seed in by_seed if model == "auto" and ("default", seed) in by_seed]
+        if both:
+            pairs = [(by_seed["default", seed], by_seed["auto", seed]) for seed in both]
+            means = [statistics.fmean(column) for column in zip(*pairs, strict=True)]
+            each = ", ".join(f"{auto - default:+.2f}" for default, auto in pairs)
+            gains.add_row(
+                scene, f"{budget:g}", f"{means[0]:.2f}", f"{means[1]:.2f}", f"{means[1] - means[0]:+.2f}", each
+            )
+    console = Console(width=150)
+    console.print(table)
+    if gains.row_count:
+        console.print(gains)
 
 
 def main(
-    scene: Annotated[Path, typer.Argument(help="A scene folder, as nerfcli train takes it.")],
+    scenes: Annotated[list[Path], typer.Argument(help="Scene folders, as nerfcli train takes them.")],
     output: Annotated[Path, typer.Option("-o", help="Where to write, without suffix.")],
     budgets: Annotated[str, typer.Option(help="Seconds of training.")] = "15,30,60,120,300",
-    seeds: Annotated[int, typer.Option(help="Trainings per budget.")] = 3,
-    downscale: Annotated[str, typer.Option(help="As nerfcli train has it.")] = "auto",
+    models: Annotated[str, typer.Option(help="Of auto and default, separated by commas.")] = "auto,default",
+    seeds: Annotated[str, typer.Option(help="Trainings of each budget and model.")] = "0",
     threads: Annotated[int, typer.Option(help="CPU threads.")] = 2,
 ) -> None:
     """Measure held-out quality against training time."""
-    trainings: list[Training] = []
-    names = [field.name for field in fields(Training)]
-    with output.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        for budget in (float(part) for part in budgets.split(",")):
-            for seed in range(seeds):
-                trainings.append(measure(scene, budget, seed, downscale, threads))
-                writer.writerow(asdict(trainings[-1]))
-                file.flush()
-                Console(stderr=True).print(trainings[-1])
-    title = f"{scene.name}, {threads} threads"
-    print_table(trainings, title)
-    plot(trainings, title, output.with_suffix(".png"))
+    path, names = output.with_suffix(".csv"), [field.name for field in fields(Training)]
+    if not path.exists():
+        path.write_text(",".join(names) + "\n", encoding="utf-8")
+    with path.open(newline="", encoding="utf-8") as file:
+        done = [typed(line) for line in csv.DictReader(file)]
+    known = {(t.scene, t.budget_s, t.model, t.seed) for t in done}
+    for seed in (int(text) for text in seeds.split(",")):
+        for scene in scenes:
+            for budget in (float(text) for text in budgets.split(",")):
+                for model in models.split(","):
+                    if (scene.name, budget, model, seed) in known:
+                        continue
+                    done.append(measure(scene, budget, model, seed, threads=threads))
+                    with path.open("a", newline="", encoding="utf-8") as file:
+                        csv.DictWriter(file, names).writerow(asdict(done[-1]))
+                    Console(stderr=True).print(done[-1])
+    print_tables(done)
+
+
+def typed(line: dict[str, str]) -> Training:
+    """A line of OUT.csv."""
+    return Training(**{field.name: field.type(line[field.name]) for field in fields(Training)})  # type: ignore[operator]
 
 
 if __name__ == "__main__":

@@ -20,12 +20,17 @@ from nerfcli.scene import Scene
 from nerfcli.train.components import Components
 from nerfcli.train.loop import train
 from nerfcli.train.losses import opacity_entropy
+from nerfcli.train.matching import chosen_pairs
 from nerfcli.train.photos import PixelPool, load_photos
 from nerfcli.train.point_depth import LAST_SHARE, PointDepths, fading, point_depth_loss, point_depths
+from nerfcli.train.preparation import prepare
 from nerfcli.train.settings import TrainSettings
+from nerfcli.train.shared import Shared
+from nerfcli.train.tracks import Tracks, tracks_of_model
+from nerfcli.train.triangulation import triangulate
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
-# Seen by both cameras, the first with an error of 3 pixels in the second.
+# Seen by both cameras, the first with an error of half a pixel in the second.
 POINTS = np.array([[0.0, 0.0, 1.0], [0.3, 0.1, 2.0], [-0.2, -0.1, 4.0]])
 
 
@@ -53,7 +58,7 @@ def capture(tmp_path: Path) -> Scene:
         pixels, _ = CAMERA.project(POINTS - frames[index].centre)
         rows += [(index, point, pixel) for point, pixel in enumerate(pixels)]
     observed = Observations(*(np.array(column) for column in zip(*rows, strict=True)))
-    observed.pixels[3] += (3.0, 0.0)
+    observed.pixels[3] += (0.0, 0.5)
     (tmp_path / scenes.MODEL_FOLDER).mkdir(parents=True)
     model = Capture(tuple(frames), POINTS, (), None, "colmap", observations=observed)
     write_colmap_binary(model, tmp_path / scenes.MODEL_FOLDER)
@@ -67,24 +72,57 @@ def pool_of(scene: Scene, masks: str = "ignore", *, similarity: Similarity) -> P
     return PixelPool(photos, similarity, torch.device("cpu"))
 
 
+def tracks_in(scene: Scene) -> Tracks:
+    return tracks_of_model(scene, load_photos(scene.train_frames, factor=1, threads=1))
+
+
 def test_points_are_found_at_their_pixels_with_their_distances_and_trust(capture):
     similarity = Similarity(0.5, np.eye(3), np.array([1.0, 2.0, 3.0]))
-    pool = pool_of(capture, similarity=similarity)
-    known = point_depths(capture, pool, similarity)
+    pool = pool_of(capture, "empty", similarity=similarity)
+    known = point_depths(tracks_in(capture), pool, similarity)
     rays = pool.rays_of(known.numbers)
     reached = rays.origins + rays.directions * known.distances[:, None]
     expected = torch.from_numpy(similarity.apply(np.concatenate([POINTS, POINTS]))).float()
     # A ray goes through the middle of its pixel: half a pixel's diagonal off at most, at these distances.
-    assert ((reached - expected).norm(dim=-1) <= known.distances * math.sqrt(0.5) / 12 + 1e-6).all()
+    off = (reached - expected).norm(dim=-1) / known.distances
+    assert (off[[1, 2, 4, 5]] <= math.sqrt(0.5) / 12 + 1e-6).all()
+    # The rays to the first point are e = 0.5 px apart in height where they meet at the angle a: nearest to both lies
+    # a^2 / (a^2 + e^2) of the way.
+    share = (0.2 / 3) ** 2 / ((0.2 / 3) ** 2 + (0.5 / 12) ** 2)
+    assert known.distances[[0, 3]].tolist() == pytest.approx([0.5 * 3 * share] * 2, rel=0.01)
     assert pool.photo_of(known.numbers).tolist() == [0, 0, 0, 1, 1, 1]
-    assert known.trust.tolist() == pytest.approx([1, 1, 1, 0.1, 1, 1], abs=1e-5)  # 1 / (1 + 3^2)
+    misses = triangulate(pool.frames, tracks_in(capture)).misses_px
+    assert misses[[0, 3]].min() > 0.2
+    assert known.trust.tolist() == pytest.approx((1 / (1 + misses**2)).tolist(), abs=1e-6)
 
 
-def test_a_scene_that_does_not_tell_who_saw_what_is_refused(spheres):
+def test_points_behind_a_mask_are_not_looked_at(capture):
     one = Similarity(1.0, np.eye(3), np.zeros(3))
-    few = replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())
-    with pytest.raises(UserError, match="does not tell which photos saw which points"):
-        point_depths(few, pool_of(few, similarity=one), one)
+    pool = pool_of(capture, "ignore", similarity=one)
+    known = point_depths(tracks_in(capture), pool, one)
+    columns = [pool.place(number)[1] for number in known.numbers.tolist()]
+    assert len(columns) == 3
+    assert min(columns) >= 6
+
+
+def test_only_training_photos_tell_where_points_are(capture):
+    """With the second photo held out, each point is left to a single one, which tells no distance: the file does."""
+    held_out = replace(capture, test_names=frozenset({"1.png"}))
+    one = Similarity(1.0, np.eye(3), np.zeros(3))
+    tracks = tracks_in(held_out)
+    assert set(tracks.photos.tolist()) == {0}
+    assert len(point_depths(tracks, pool_of(held_out, "empty", similarity=one), one).numbers) == 0
+
+
+def test_a_model_without_sightings_gives_no_tracks(spheres):
+    assert tracks_in(replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())).count == 0
+
+
+def test_points_that_are_asked_for_and_not_there_are_missed(spheres, tmp_path):
+    alone = replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())
+    settings = TrainSettings(budget_seconds=None, steps=1, downscale=8, components=Components(points=0.1))
+    with pytest.raises(UserError, match="agree on where a point is"):
+        prepare(alone, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
 
 
 def test_the_loss_of_points_is_the_mean_deviation_of_where_light_ends():
@@ -161,3 +199,25 @@ def test_training_takes_all_of_them_at_once(capture, tmp_path):
         )  # fmt: skip
     assert losses[0] == losses[1]
     assert all(map(math.isfinite, losses[0]))
+
+
+def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
+    settings = TrainSettings(budget_seconds=None, steps=10, model="auto")
+    told: list[str] = []
+    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=told.append)
+    assert prepared.settings.components == Components(points=0.1)
+    assert prepared.points is not None
+    assert len(prepared.points.known.numbers) == 3
+    assert "points=0.1: kept, 3 pixels see points whose distance is known" in told
+
+
+def test_comparing_photos_has_a_price_once(spheres):
+    """0.7 us for each pixel of photos that are compared; nothing once it is done."""
+    photos = load_photos(spheres.train_frames, factor=4, threads=1)
+    shared = Shared(spheres, photos, threads=2)
+    wanted = {index for pair in chosen_pairs(photos) for index in pair}
+    pixels = sum(photos[index].pixels.shape[0] * photos[index].pixels.shape[1] for index in wanted)
+    assert shared.matching_seconds == pytest.approx(0.7e-6 * pixels / 2)
+    assert shared.of_model.count == 0
+    assert shared.tracks is shared.of_matches
+    assert shared.matching_seconds == 0.0

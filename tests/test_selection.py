@@ -32,6 +32,7 @@ from nerfcli.train.selection import (
     proposals,
     removals,
     select,
+    tells_points,
     with_known_focal,
 )
 from nerfcli.train.signs import Signs
@@ -161,18 +162,21 @@ def test_a_photo_without_pixels_to_judge_by_counts_nothing():
     assert judged(base, tried).gain_db == pytest.approx(told(0.5), abs=1e-9)
 
 
-def signs(spread: float) -> Signs:
-    return Signs(torch.zeros(PHOTOS, 3), spread)
+def signs(spread: float, far: float = 0.2) -> Signs:
+    return Signs(torch.zeros(PHOTOS, 3), spread, far)
 
 
 def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for():
-    def names(facts: Facts, spread: float = 0.3) -> set[str]:
-        return {name for name, _ in proposals(Components(), signs(spread), facts)[0]}
+    def names(facts: Facts, spread: float = 0.3, far: float = 0.2) -> set[str]:
+        return {name for name, _ in proposals(Components(), signs(spread, far), facts)[0]}
 
     assert names(FITTED) == {"exposure", "background"}
     assert names(replace(FITTED, fixed=("view", "exposure"))) == {"background"}
     assert names(replace(FITTED, has_alpha=True)) == {"exposure"}
     assert names(FITTED, spread=0.01) == {"background"}
+    assert names(FITTED, far=0.009) == {"exposure"}
+    (near,) = proposals(Components(), signs(0.3, 0.004), replace(FITTED, fixed=("cameras",)))[1]
+    assert near.in_words() == "background=sphere: not tried, 0.4% of the pixels have most of their light from far away"
     (declined,) = proposals(Components(), signs(0.01), replace(FITTED, fixed=("cameras",)))[1]
     assert (declined.component, declined.kept, declined.gain_db) == ("exposure", False, None)
     assert "1.0%" in declined.in_words()
@@ -192,9 +196,11 @@ class Scripted:
     def __init__(self, gain: Callable[[Components], float], *, spread: float = 0.3):
         self.gain, self.spread = gain, spread
         self.asked: list[tuple[Components, int, int]] = []
+        self.begun: list[Components] = []
 
     def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start:
-        return Start({}, {}, steps, 1.0, 20.0, signs(self.spread))
+        self.begun.append(components)
+        return Start({}, {}, 1.0, replace(trial(20.0 + self.gain(components)), steps=steps), signs(self.spread))
 
     def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:
         self.asked.append((components, seed, steps))
@@ -216,8 +222,48 @@ def test_what_gains_is_in_the_model_what_does_not_is_not_and_seeds_are_paired():
         "cameras": False,
     }
     assert {seed for _, seed, _ in scripted.asked} == {0, 1}
-    assert {steps for _, _, steps in scripted.asked} == {400}  # half of a fifth of 4000
+    assert {steps for _, _, steps in scripted.asked} == {125}  # half of the longest start
     assert decisions_in_words({"selection": chosen.to_json()}) == [d.in_words() for d in chosen.decisions]
+
+
+POINTED = replace(FITTED, points=7)
+
+
+@pytest.mark.parametrize(("gain", "kept"), [(0.3, True), (0.0, True), (-0.3, False)])
+def test_points_that_photos_share_are_in_the_model_from_the_start_unless_they_lose(gain, kept):
+    """Two starts, with and without; all trials go on from the one that is taken."""
+    scripted = Scripted(lambda c: gain * (c.points > 0))
+    chosen = chosen_by(scripted, facts=POINTED)
+    assert [model.points for model in scripted.begun] == [0.1, 0.0]
+    assert chosen.components.points == (0.1 if kept else 0.0)
+    assert {model.points for model, _, _ in scripted.asked} == {chosen.components.points}
+    (decision,) = (decision for decision in chosen.decisions if decision.component == "points")
+    assert (decision.kept, decision.gain_db) == (kept, pytest.approx(told(gain), abs=1e-9))
+
+
+def test_points_are_taken_untried_where_there_is_no_time_for_a_start():
+    scripted = Scripted(lambda c: 0.0)
+    chosen = chosen_by(scripted, steps=100, facts=POINTED)
+    assert chosen.components == Components(points=0.1)
+    assert [d.in_words() for d in chosen.decisions] == ["points=0.1: kept, 7 pixels see points whose distance is known"]
+    assert scripted.asked == []
+
+
+@pytest.mark.parametrize("facts", [replace(POINTED, fixed=("points",)), replace(POINTED, has_alpha=True), FITTED])
+def test_points_are_left_alone_where_the_user_decides_alpha_tells_or_there_are_none(facts):
+    scripted = Scripted(lambda c: 0.0)
+    assert chosen_by(scripted, facts=facts).components.points == 0.0
+    assert len(scripted.begun) == 1
+
+
+@pytest.mark.parametrize(("misses", "tells"), [(0.3, True), (0.7, False)])
+def test_points_are_asked_only_where_the_cameras_fit(misses, tells):
+    facts = replace(FITTED, cameras=CameraCheck(0.0, 0.001, (misses, misses), 1000))
+    assert tells_points(Components(), facts) is tells
+    assert tells_points(Components(), FITTED)
+    assert not tells_points(Components(cameras="poses"), FITTED)
+    assert not tells_points(Components(), replace(FITTED, fixed=("points",)))
+    assert tells_points(Components(points=0.2), replace(facts, fixed=("points",)))
 
 
 def test_what_is_needed_stays():
@@ -331,7 +377,7 @@ def test_what_gains_once_is_not_kept_where_no_time_is_left_to_try_it_again():
     of four, two more for the best, and one for the second-best beside it."""
     facts = replace(FITTED, has_exif=True, cameras_known=None)
     scripted = Scripted(lambda c: 0.35 * (c.exposure == "exif") + 0.3 * (c.cameras == "poses"))
-    chosen = chosen_by(scripted, steps=2000, facts=facts)
+    chosen = chosen_by(scripted, steps=1000, facts=facts)
     assert len(scripted.asked) == 8
     assert chosen.components == Components(exposure="exif")
     assert {d.value: d.why for d in chosen.decisions if d.component == "cameras"}["poses"] == ONCE

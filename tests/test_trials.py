@@ -12,6 +12,7 @@ from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import exposed
 from nerfcli.train.components import Components
 from nerfcli.train.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
+from nerfcli.train.fitting import DETAILED_STEPS
 from nerfcli.train.photos import load_album
 from nerfcli.train.room import IN_MEMORY
 from nerfcli.train.settings import TrainSettings
@@ -40,7 +41,7 @@ def start(trials) -> Iterator[Start]:
 def test_what_begins_late_changes_nothing_at_first(trials, start):
     """Harmonics without weight, and gains of 1: no step further, every change has the errors of no change."""
     same = trials.go_on(start, Components(view=0), seed=0, steps=0)
-    assert same.psnr == pytest.approx(start.psnr, abs=1e-4)  # levels that do not learn yet are told by a step
+    assert same.psnr == pytest.approx(start.trial.psnr, abs=1e-4)  # levels that do not learn yet are told by a step
     assert np.array_equal(trials.go_on(start, Components(view=3), seed=0, steps=0).errors, same.errors)
     free = trials.go_on(start, Components(view=0, cameras="poses"), seed=0, steps=0)
     assert free.errors == pytest.approx(same.errors, rel=1e-6)  # rays are turned by nothing, and rounded
@@ -79,6 +80,27 @@ def test_cameras_learn_from_the_fork_on(trials, start):
     assert not torch.equal(motions, given)
 
 
+@pytest.mark.parametrize("distance", [0.3, 1.1, math.inf])
+def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkeypatch, distance):
+    """Fog of one density sigma everywhere: exp(-sigma t), t the way from the middle of the first step to that of the
+    last one before the distance."""
+    album = load_album(spheres.train_frames, factor=4, threads=1, room=IN_MEMORY)
+    everywhere = replace(choose_extent(spheres, SETTINGS, fills_frame=False), contraction="l2")
+    exif = np.zeros(len(album.photos))
+    trials = Trials(album.photos, everywhere, settings=SETTINGS, exif=exif, colours=album.colours)
+    fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
+    fitting.edges = torch.linspace(0.1, 1.4, 14)
+    fitting.step, fitting.furthest = DETAILED_STEPS, 1.0  # no steps are left out
+    sigma = 0.1
+    monkeypatch.setattr(
+        fitting.field,
+        "radiance_of_samples",
+        lambda samples, *rest, **more: (torch.full_like(samples.starts, sigma), torch.zeros(len(samples.starts), 3)),
+    )
+    found = fitting.light_from_beyond(trials._pool.rays_of(torch.arange(50)), distance=distance + 0.01)
+    assert found.tolist() == pytest.approx([math.exp(-sigma * (min(distance, 1.4) - 0.2))] * 50, rel=1e-5)
+
+
 def test_trials_see_through_the_lens_that_is_known_before(spheres):
     """Matches say that lenses are 5 % longer: what learns them starts there, and its rays are closer together."""
     album = load_album(spheres.train_frames, factor=4, threads=1, room=IN_MEMORY)
@@ -112,7 +134,7 @@ def test_the_brightness_of_photos_is_found_among_highlights_and_noise():
     lit = torch.rand(len(photos), generator=generator) < 0.2
     measured[lit] = exposed(measured[lit], torch.tensor(math.log(3.0)))
     measured = (measured + 2 / 255 * torch.randn(measured.shape, generator=generator)).clamp(0.0, 1.0)
-    signs = signs_of(rendered, measured, photos, count=9)
+    signs = signs_of(rendered, measured, photos, from_beyond=torch.zeros(len(photos)), count=9)
     assert (signs.log_gains - gains).abs().max() < 0.03
     assert signs.exposure_spread == pytest.approx(gains.mean(1).std().item(), abs=0.02)
 
@@ -123,8 +145,10 @@ def test_photos_of_one_exposure_have_no_spread_and_an_empty_photo_is_left_alone(
     rendered = 0.2 + 0.3 * torch.rand(len(photos), 3, generator=generator)
     measured = rendered + 0.05 * torch.randn(rendered.shape, generator=generator)
     measured[photos == 5] = 1.0
-    signs = signs_of(rendered, measured.clamp(0.0, 1.0), photos, count=8)
+    from_beyond = torch.linspace(0.0, 1.0, len(photos))
+    signs = signs_of(rendered, measured.clamp(0.0, 1.0), photos, from_beyond=from_beyond, count=8)
     assert signs.exposure_spread < 0.02
+    assert signs.far_share == 0.5
     assert signs.log_gains[5].tolist() == [0.0] * 3
 
 

@@ -16,7 +16,8 @@ from nerfcli.train.extent import Extent, choose_extent, lacks_depth
 from nerfcli.train.matching import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.train.photos import Photo
 from nerfcli.train.settings import TrainSettings
-from nerfcli.train.triangulation import meetings, triangulate
+from nerfcli.train.tracks import Tracks, tracks_of_matches
+from nerfcli.train.triangulation import triangulate
 
 CAMERA = Camera.pinhole(320, 240, 300.0)
 WALL_Z = 3.0
@@ -46,6 +47,12 @@ def scene_of(photos: list[Photo]) -> Scene:
     return Scene(Path("walls"), "transforms", frames, frozenset(), np.zeros((0, 3)), ())
 
 
+def found_in(photos: list[Photo], *, threads: int = 1) -> np.ndarray:
+    """Points that photos agree on by their own features."""
+    tracks = tracks_of_matches(photos, match(photos, threads=threads))
+    return triangulate([photo.frame for photo in photos], tracks).known
+
+
 @pytest.fixture(scope="module")
 def photos() -> list[Photo]:
     """Five of a wall at z = 3, from places 0.3 apart, with axes that meet at z = 1."""
@@ -53,19 +60,19 @@ def photos() -> list[Photo]:
 
 
 def test_points_of_a_wall_lie_on_it(photos):
-    points = triangulate(photos, match(photos, threads=2))
+    points = found_in(photos, threads=2)
     assert len(points) > 200
     z = points[:, 2]
     assert abs(np.median(z) - WALL_Z) < 0.003 * WALL_Z
     assert np.mean(np.abs(z - WALL_Z) < 0.05 * WALL_Z) > 0.95
-    assert np.array_equal(points, triangulate(photos, match(photos, threads=1)))
+    assert np.array_equal(points, found_in(photos))
 
 
 def test_masked_parts_of_photos_give_no_points(photos):
     left = np.zeros((240, 320), dtype=bool)
     left[:, :160] = True
     masked = [replace(photo, used=left) for photo in photos]
-    points = triangulate(masked, match(masked, threads=1))
+    points = found_in(masked)
     assert len(points) > 20
     for photo in photos[:1]:
         pixels, _ = photo.frame.camera.project(points - photo.frame.centre)
@@ -76,7 +83,7 @@ def test_the_unit_ball_follows_what_is_found(photos):
     """Cameras whose axes meet 1 before them, and a wall 3 away."""
     scene = scene_of(photos)
     assert lacks_depth(scene, SETTINGS, fills_frame=True)
-    scene = replace(scene, points=triangulate(photos, match(photos, threads=1)))
+    scene = replace(scene, points=found_in(photos))
     assert not lacks_depth(scene, SETTINGS, fills_frame=True)
     extent = choose_extent(scene, SETTINGS, fills_frame=True)
     assert 1.8 < 1 / extent.training_from_scene.scale < 4
@@ -100,7 +107,7 @@ def test_depth_bounds_tell_enough_but_where_a_box_is_asked_for(photos):
 
 def test_nothing_is_found_in_photos_without_detail(photos):
     grey = [replace(photo, pixels=np.full_like(photo.pixels, 128)) for photo in photos]
-    assert triangulate(grey, match(grey, threads=1)).shape == (0, 3)
+    assert found_in(grey).shape == (0, 3)
     extent = choose_extent(scene_of(grey), SETTINGS, fills_frame=True)
     assert np.isfinite(extent.training_from_scene.scale)
 
@@ -122,18 +129,63 @@ def test_pairs_are_few_and_look_the_same_way():
     assert all((a - b) % 2 == 0 for a, b in pairs)
 
 
-def test_meetings_of_exact_rays_are_exact_and_others_are_left_out():
-    centres = np.zeros(3), np.array([1.0, 0.0, 0.0])
-    points = np.array([[0.5, 0.1, 2.0], [3.0, -1.0, 5.0], [0.2, 0.0, 500.0], [0.5, 0.1, -2.0], [0.5, 0.5, 2.0]])
-    one, other = (points - centre for centre in centres)
-    one[3] = -one[3]  # they meet behind the first camera
-    other[4] = [-0.5, 0.6, 2.0]  # they pass each other: 0.05 apart at 2
-    rays = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in (one, other)]
-    found = meetings(centres, (rays[0], rays[1]), (1e-3, 1e-3))  # the third meet at 0.1 degrees
-    np.testing.assert_allclose(found, points[:2], rtol=1e-12)
-    wider = meetings(centres, (rays[0], rays[1]), (0.05, 0.05))
-    assert len(wider) == 3
-    assert meetings(centres, (np.full((2, 3), np.nan), rays[1][:2]), (1.0, 1.0)).shape == (0, 3)
+def frames_at(centres: np.ndarray) -> list[Frame]:
+    poses = np.tile(np.eye(4), (len(centres), 1, 1))
+    poses[:, :3, 3] = centres
+    return [Frame(f"{i}.png", CAMERA, pose) for i, pose in enumerate(poses)]
+
+
+def tracks_of(points: np.ndarray, centres: np.ndarray, seen: list[tuple[int, int]]) -> Tracks:
+    """Exact rays from cameras to points, for pairs of (photo, point)."""
+    photos, of = np.array(seen).T
+    rays = points[of] - centres[photos]
+    return Tracks(photos, of, rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("offset", [0.0, 4e6])
+def test_points_of_exact_rays_are_exact_wherever_the_world_begins(offset):
+    """To 1e-12 of the distances, and of what coordinates of GPS have left after the point."""
+    rng = np.random.default_rng(0)
+    centres, points = rng.uniform(-1, 1, (5, 3)) + offset, rng.uniform(-1, 1, (40, 3)) * (2, 2, 1) + (0, 0, 5) + offset
+    seen = [(photo, point) for point in range(40) for photo in rng.permutation(5)[: 2 + point % 4]]
+    surface = triangulate(frames_at(centres), tracks_of(points, centres, seen))
+    told = ~np.isnan(surface.points[:, 0])
+    assert told.mean() > 0.9
+    np.testing.assert_allclose(surface.points[told], points[told], rtol=0, atol=1e-12 * (1 + 1e3 * offset))
+    assert np.nanmax(surface.misses_px) < 1e-3
+    assert np.isnan(surface.misses_px).sum() == sum(not told[point] for _, point in seen)
+
+
+def test_photos_that_do_not_agree_tell_nothing():
+    """Rays that meet behind a camera, that pass each other, at 0.1 degrees, of one photo only, and none at all."""
+    centres = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    points = np.array(
+        [[0.5, 0.1, 2.0], [0.5, 0.1, -2.0], [0.5, 0.5, 2.0], [0.2, 0.0, 500.0], [0.3, 0.3, 3.0], [1, 1, 4.0]]
+    )
+    tracks = tracks_of(points, centres, [(photo, point) for point in range(6) for photo in (0, 1)])
+    rays = tracks.rays.copy()
+    rays[2:4] *= -1  # the second
+    rays[4] += (0.0, 0.05, 0.0)  # of the third: 5 px off for both
+    rays[8] = np.nan
+    surface = triangulate(frames_at(centres), replace(tracks, rays=rays))
+    assert np.isfinite(surface.points).all(axis=1).tolist() == [True, False, False, False, False, True]
+    assert np.isfinite(surface.misses_px).reshape(6, 2).all(axis=1).tolist() == [True, False, False, False, False, True]
+    assert triangulate(frames_at(centres), Tracks(*(column[:0] for column in vars(tracks).values()))).known.shape == (
+        0,
+        3,
+    )
+
+
+def test_a_wrong_sighting_among_right_ones_is_left_out():
+    """Six photos agree, and one is off by 20 px: the point is where the six have it."""
+    centres = np.array([[x, y, 0.0] for x in (0.0, 1.0, 2.0) for y in (0.0, 1.0)] + [[1.0, 0.5, 0.3]])
+    points = np.array([[0.8, 0.6, 4.0]])
+    tracks = tracks_of(points, centres, [(photo, 0) for photo in range(7)])
+    rays = tracks.rays.copy()
+    rays[6] += (20 / CAMERA.focal_px, 0.0, 0.0)
+    surface = triangulate(frames_at(centres), replace(tracks, rays=rays / np.linalg.norm(rays, axis=1, keepdims=True)))
+    np.testing.assert_allclose(surface.points, points, rtol=1e-9)
+    assert np.isfinite(surface.misses_px).tolist() == [True] * 6 + [False]
 
 
 def _pose(place: int, turned: float) -> np.ndarray:

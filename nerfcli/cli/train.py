@@ -87,12 +87,12 @@ def train(
     Components, for --with and --without: background (auto, black, constant, random, sphere: what is behind the
     field), view (0 to 3: the degree to which colours depend on the direction), exposure (none, exif, learned:
     brightness and white balance of each photo), cameras (fixed, poses, focal, all: what of the photos' cameras learns
-    with the field), masks (ignore, empty: what their black means), points (a weight:
-    surfaces at points of structure from motion), entropy (a weight: rays are opaque or clear), near (smaller gradients
-    near cameras), distortion (a weight: the light of a ray in one place), antialias (true, false: details smaller
-    than a pixel fade out; for photos from near and far), pixels (anywhere, error: more of them where the photos are
-    explained worst). The scene decides on exposure, view and background, unless they are named by --with or --without:
-    short trainings on up to 15 % of the budget keep a component that is better by more than the noise, on pixels of the
+    with the field), masks (ignore, empty: what their black means), points (a weight: surfaces at points that photos
+    share), entropy (a weight: rays are opaque or clear), near (smaller gradients near cameras), distortion (a weight:
+    the light of a ray in one place), antialias (true, false: details smaller than a pixel fade out; for photos from
+    near and far), pixels (anywhere, error: more of them where the photos are explained worst). The scene decides on
+    points, exposure, cameras, background and view, unless they are named by --with or --without: short trainings on
+    up to 15 % of the budget keep a component that is better by more than the noise, on pixels of the
     training photos that were not seen. --model default skips that.
 
     Fields, for --field: hash (a multiresolution hash grid with two small networks: best for its time), voxels (a dense

@@ -105,7 +105,7 @@ CHOICES = {
     "exposure": Choice("brightness and white balance of photos", "none", "learned", EXPOSURES),
     "cameras": Choice("poses and lenses of photos", "fixed", "poses", CAMERAS),
     "masks": Choice("the black of masks is empty space", "ignore", "empty", MASKS),
-    "points": Choice("surfaces at points of structure from motion, weight", 0.0, 0.1, None),
+    "points": Choice("surfaces at points that photos share, weight", 0.0, 0.1, None),
     "entropy": Choice("rays are opaque or clear, weight", 0.0, 0.01, None),
     "near": Choice("smaller gradients near cameras", False, True, (False, True)),
     "distortion": Choice("light of a ray in one place, weight", 0.0, 0.05, None),

@@ -261,16 +261,30 @@ class Fitting:
 
     @torch.no_grad()
     def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
-        """What the model says of pixels now, and what the photos say, both (N, 3) sRGB; alpha on white."""
+        """What the model says of pixels now, in steps as it learns in, and what the photos say; both (N, 3) sRGB, alpha
+        on white."""
         drawn = self.parts.refined(drawn)
+        behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)
+        edges = self.edges[:: self._stride(self.furthest)].contiguous()
+        rendered, transmittance = self._seen(drawn, edges=edges, behind=behind)
+        return self.parts.compared(rendered, transmittance, drawn, behind=behind)
+
+    @torch.no_grad()
+    def light_from_beyond(self, drawn: Drawn, *, distance: float) -> Tensor:
+        """(N,) the shares of the light of pixels that come from farther away than a distance, as the field is now."""
+        drawn = self.parts.refined(drawn)
+        edges = self.edges[:: self._stride(self.furthest)].contiguous()
+        near = edges[: max(2, int(torch.searchsorted(edges, distance, right=True)))]
+        return self._seen(drawn, edges=near, behind=torch.zeros_like(drawn.origins))[1]
+
+    def _seen(self, drawn: Drawn, *, edges: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3) colours of rays that step from edge to edge, on what is behind, and (N,) what passes through."""
         origins, directions = drawn.origins, drawn.directions
-        middle = torch.full_like(origins[:, 0], 0.5)
-        behind = torch.full_like(origins, 1.0 if self.pool.has_alpha else 0.0)
         samples = self.field.visible_samples(
             origins,
             directions,
-            self.edges,
-            jitter=middle,
+            edges,
+            jitter=torch.full_like(origins[:, 0], 0.5),
             occupied=self.occupied,
             deepest=DEEPEST,
             cones=self._cones(drawn),
@@ -280,7 +294,7 @@ class Fitting:
         rendered, transmittance, _ = kernels.composite(
             density, rgb, samples.ends - samples.starts, offsets=samples.offsets, background=behind
         )
-        return self.parts.compared(rendered, transmittance, drawn, behind=behind)
+        return rendered, transmittance
 
     def _cones(self, drawn: Drawn) -> Tensor | None:
         """Widths of pixels per distance, where they matter."""

@@ -114,7 +114,7 @@ def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial
     measured = judge_one(base, change, tried, by_time=by_time)
     gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
     if gain > -error:
-        return replace(measured, kept=True, why="matched features show what it mends, and it does not lose")
+        return replace(measured, kept=True, why="matched features speak for it, and it does not lose")
     return replace(measured, kept=False, why="loses, though matched features speak for it")
 
 

@@ -258,6 +258,13 @@ class PixelPool:
         chosen = torch.randint(self.usable_count, (count,), generator=generator, device=self.colours.device)
         return chosen if self.usable is None else self.usable[chosen]
 
+    def is_usable(self, numbers: Tensor) -> Tensor:
+        """(N,) whether pixels (N,), counted through all photos, may be trained on."""
+        if self.usable is None:
+            return torch.ones_like(numbers, dtype=torch.bool)
+        places = torch.searchsorted(self.usable, numbers).clamp_max(self.usable_count - 1)
+        return self.usable[places] == numbers
+
     def rays_of(self, numbers: Tensor) -> Drawn:
         """The rays and colours of pixels (N,), counted through all photos."""
         rays = kernels.pixel_rays(

@@ -1,4 +1,4 @@
-"""Depth that is known before training: points of structure from motion, in the photos that saw them."""
+"""Depth that is known before training: points that several photos saw, in each of them."""
 
 from dataclasses import dataclass
 
@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from nerfcli import kernels
-from nerfcli.cameras.formats.colmap import parse_colmap
 from nerfcli.cameras.rigid import Similarity, apply, inverse
-from nerfcli.errors import UserError
-from nerfcli.scene import Scene, model_folder
 from nerfcli.train.photos import Drawn, PixelPool
+from nerfcli.train.tracks import Tracks
+from nerfcli.train.triangulation import triangulate
 
 # Until this share of the budget the points count less and less; photos tell more than points once there are surfaces.
 LAST_SHARE = 0.5
@@ -19,7 +18,7 @@ LAST_SHARE = 0.5
 PIXELS_PER_POINT = 8
 # Relative distance from the point from which on light counts as simply elsewhere.
 MOST_DEVIATION = 0.25
-# Reprojection error at which a point counts half, in pixels of the photo.
+# Miss at which a point counts half, in pixels of the training photo.
 HALF_ERROR_PX = 1.0
 
 
@@ -36,6 +35,11 @@ class PointDepths:
     numbers: Tensor
     distances: Tensor
     trust: Tensor
+
+    def among(self, pool: PixelPool) -> "PointDepths":
+        """Those at usable pixels of a pool."""
+        usable = pool.is_usable(self.numbers)
+        return PointDepths(self.numbers[usable], self.distances[usable], self.trust[usable])
 
     def draw(self, count: int, generator: torch.Generator) -> "PointDepths":
         """`count` of them at random, with replacement."""
@@ -65,46 +69,38 @@ class PointRays:
         return both._replace(distances=chosen.distances, trust=chosen.trust, weights=weights)
 
 
-def point_depths(scene: Scene, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
-    """The points of the scene's COLMAP model, at the training photos' pixels that they were seen in.
+def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
+    """Where points that photos agree on are seen, at usable pixels; none where nothing is known.
 
-    trust = 1 / (1 + (reprojection error / 1 px)^2)
+    trust = 1 / (1 + (miss / 1 px)^2), in pixels of the training photos
 
-    Raises:
-        UserError: the scene has no model, or none of its points was seen in a training photo.
+    Args:
+        tracks: what the pool's photos saw.
+        pool: the training photos.
+        training_from_scene: the normalisation.
     """
-    folder = model_folder(scene.root)
-    capture = parse_colmap(folder) if folder is not None else None
-    seen = capture.observations if capture is not None else None
-    numbers, distances, trust = [], [], []
-    if capture is not None and seen is not None:
-        index_of = {frame.name: index for index, frame in enumerate(capture.frames)}
-        for photo, frame in enumerate(pool.frames):
-            of_frame = (seen.frame_index == index_of.get(frame.name, -1)) & (seen.point_index >= 0)
-            points = capture.points[seen.point_index[of_frame]]
-            calibrated = capture.frames[index_of[frame.name]] if frame.name in index_of else frame
-            expected, valid = calibrated.camera.project(apply(inverse(calibrated.world_from_cam), points))
-            error = np.linalg.norm(expected - seen.pixels[of_frame], axis=-1)
-            # The photo may be smaller or turned: the point is looked up with the photo's own camera.
-            pixels, inside = frame.camera.project(apply(inverse(frame.world_from_cam), points))
-            column, row = np.floor(pixels.T)
-            kept = valid & inside & (column >= 0) & (row >= 0)
-            kept &= (column < frame.camera.width) & (row < frame.camera.height)
-            first = int(pool.first_pixel[photo])
-            numbers.append(first + (row * frame.camera.width + column)[kept].astype(np.int64))
-            distances.append(np.linalg.norm(points[kept] - frame.centre, axis=-1) * training_from_scene.scale)
-            trust.append(1.0 / (1.0 + (error[kept] / HALF_ERROR_PX) ** 2))
-    if not sum(map(len, numbers)):
-        raise UserError(
-            f"--with points: {scene.root} does not tell which photos saw which points",
-            "use a scene of nerfcli poses or a COLMAP model, or leave it out",
-        )
+    surface = triangulate(pool.frames, tracks)
+    kept = np.flatnonzero(np.isfinite(surface.misses_px))
+    numbers = np.full(len(kept), -1)
+    for photo, frame in enumerate(pool.frames):
+        own = np.flatnonzero(tracks.photos[kept] == photo)
+        points = surface.points[tracks.points[kept[own]]]
+        pixels, valid = frame.camera.project(apply(inverse(frame.world_from_cam), points))
+        width, height = frame.camera.width, frame.camera.height
+        shown = valid & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
+        column, row = np.floor(pixels[shown]).astype(np.int64).T
+        numbers[own[shown]] = int(pool.first_pixel[photo]) + row * width + column
+    inside = numbers >= 0
+    kept = kept[inside]
+    centres = np.array([frame.centre for frame in pool.frames])[tracks.photos[kept]]
+    distances = np.linalg.norm(surface.points[tracks.points[kept]] - centres, axis=1) * training_from_scene.scale
+    trust = 1.0 / (1.0 + (surface.misses_px[kept] / HALF_ERROR_PX) ** 2)
     device = pool.colours.device
     return PointDepths(
-        torch.from_numpy(np.concatenate(numbers)).to(device),
-        torch.from_numpy(np.concatenate(distances)).to(device, torch.float32),
-        torch.from_numpy(np.concatenate(trust)).to(device, torch.float32),
-    )
+        torch.from_numpy(numbers[inside]).to(device),
+        torch.from_numpy(distances).to(device, torch.float32),
+        torch.from_numpy(trust).to(device, torch.float32),
+    ).among(pool)
 
 
 def fading(share: float) -> float:

@@ -4,7 +4,7 @@ Of held-out photos nothing is read here but the sizes that their cameras have.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,17 +20,28 @@ from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.train.extent import Extent, choose_extent, lacks_depth
 from nerfcli.train.fitting import Fitting
-from nerfcli.train.matching import Matches, match
 from nerfcli.train.photos import Album, PixelPool, load_album
-from nerfcli.train.point_depth import PointRays, point_depths
+from nerfcli.train.point_depth import PointDepths, PointRays, point_depths
 from nerfcli.train.room import Room, needs_of, room_for
-from nerfcli.train.selection import SEARCH_SHARE, Facts, Selection, is_worth_a_search, select, with_known_focal
+from nerfcli.train.selection import (
+    SEARCH_SHARE,
+    Facts,
+    Selection,
+    is_worth_a_search,
+    select,
+    tells_points,
+    with_known_focal,
+    with_points,
+)
 from nerfcli.train.settings import TrainSettings, automatic_downscale
+from nerfcli.train.shared import Shared
 from nerfcli.train.trials import Trials
 from nerfcli.train.triangulation import triangulate
 
 # A search that has no time left has this.
 LEAST_SECONDS = 1e-3
+# Of a search, what the comparison of photos may take.
+MATCHING_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -56,7 +67,7 @@ class Prepared:
         log_gains: (photos, 3) logarithms of their exposures relative to it, as the trials found them or as far as EXIF
             tells; else 0.
         log_focal: logarithm of the factor of focal lengths to start from.
-        points: pixels with a point of structure from motion, where the components ask for them.
+        points: pixels whose distance is known, where the components ask for them.
     """
 
     settings: TrainSettings
@@ -115,14 +126,14 @@ def prepare(
     notify(told)
     masks = settings.components.masks
     album = load_album(scene.train_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
-    matched: tuple[Matches, ...] | None = None
+    shared = Shared(scene, album.photos, threads=settings.threads)
     if begun is not None:
         extent = begun.extent
     else:
         located = scene
         if lacks_depth(scene, settings, fills_frame=album.fills_frame):
-            matched = match(album.photos, threads=settings.threads)
-            located = replace(scene, points=triangulate(album.photos, matched))
+            frames = [photo.frame for photo in album.photos]
+            located = replace(scene, points=triangulate(frames, shared.of_matches).known)
             notify(f"the scene came without points; {len(located.points)} found in its photos tell how far it reaches")
         extent = choose_extent(located, settings, fills_frame=album.fills_frame)
     device = torch.device(settings.device)
@@ -134,11 +145,15 @@ def prepare(
     )
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
-    selection = None
+    selection, known = None, None
     if begun is not None:
         settings = replace(settings, components=begun.components)
     elif settings.model == "auto":
-        selection = _search(scene, album, extent, settings, matched=matched, room=room, notify=notify)
+        began = time.perf_counter()
+        facts, known = _facts(scene, album, extent, settings, pool=pool, shared=shared)
+        selection = _search(
+            scene, album, extent, settings, facts=facts, known=known, room=room, began=began, notify=notify
+        )
         settings = replace(settings, components=selection.components)
     extent = extent.before(settings.components.background)
     reference, gains = _exposures(scene, settings.components, notify=notify)
@@ -146,10 +161,42 @@ def prepare(
         gains = selection.log_gains
     points = None
     if settings.components.points:
-        points = PointRays(point_depths(scene, pool, extent.training_from_scene), pool)
-        notify(f"{len(points.known.numbers)} pixels have a point of structure from motion")
+        known = known or point_depths(shared.tracks, pool, extent.training_from_scene)
+        if len(known.numbers) == 0:
+            raise UserError(
+                f"--with points: no photos of {scene.root} agree on where a point is",
+                "use a scene of nerfcli poses or a COLMAP model, or leave it out",
+            )
+        notify(f"{len(known.numbers)} pixels see a point whose distance is known")
+        points = PointRays(known, pool)
     log_focal = selection.log_focal if selection is not None else 0.0
     return Prepared(settings, factor, room, extent, pool, selection, reference, gains, log_focal, points)
+
+
+def _facts(
+    scene: Scene, album: Album, extent: Extent, settings: TrainSettings, *, pool: PixelPool, shared: Shared
+) -> tuple[Facts, PointDepths | None]:
+    """What is known before anything is learned, and the pixels whose distance is known, where these may be asked."""
+    lacks_points = album.fills_frame and len(scene.points) == 0
+    budget = settings.budget_seconds
+    has_time = budget is None or shared.matching_seconds <= MATCHING_SHARE * SEARCH_SHARE * budget
+    facts = Facts(
+        settings.field,
+        has_alpha=album.colours.shape[-1] == 4,
+        has_exif=bool(np.ptp(_exif(scene)) > 0.0),
+        cameras_known=_known(scene) or (None if has_time else "there is no time to compare photos"),
+        cameras=check_cameras(album.photos, shared.matched) if lacks_points and has_time else None,
+        fixed=settings.fixed,
+    )
+    if not tells_points(settings.components, facts):
+        return facts, None
+    if shared.of_model.count:
+        known = point_depths(shared.of_model, pool, extent.training_from_scene)
+    elif has_time or settings.components.points:
+        known = point_depths(shared.of_matches, pool, extent.training_from_scene)
+    else:
+        return facts, None
+    return replace(facts, points=len(known.numbers)), known
 
 
 def _search(
@@ -158,30 +205,30 @@ def _search(
     extent: Extent,
     settings: TrainSettings,
     *,
-    matched: Sequence[Matches] | None,
+    facts: Facts,
+    known: PointDepths | None,
     room: Room,
+    began: float,
     notify: Callable[[str], None],
 ) -> Selection:
     """Let the scene decide on the components, and tell how it did."""
     budget, steps = settings.budget_seconds, settings.steps
     if not is_worth_a_search(budget, steps):
-        notify("the training is too short to try components; the default ones are taken")
-        return Selection(settings.components, (), 0.0)
-    exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
-    began = time.perf_counter()
-    if matched is None and album.fills_frame and len(scene.points) == 0:
-        matched = match(album.photos, threads=settings.threads)
-    facts = Facts(
-        settings.field,
-        has_alpha=album.colours.shape[-1] == 4,
-        has_exif=bool(np.ptp(exif) > 0.0),
-        cameras_known=_known(scene),
-        cameras=check_cameras(album.photos, matched or ()),
-        fixed=settings.fixed,
-    )
+        notify("the training is too short to try components; those are taken that need no trial")
+        components, decisions = with_points(settings.components, facts)
+        for decision in decisions:
+            notify(decision.in_words())
+        return Selection(components, tuple(decisions), time.perf_counter() - began)
     asked, log_focal, measured = with_known_focal(settings.components, facts)
     trials = Trials(
-        album.photos, extent, settings=settings, exif=exif, log_focal=log_focal, colours=album.colours, room=room
+        album.photos,
+        extent,
+        settings=settings,
+        exif=_exif(scene),
+        log_focal=log_focal,
+        known=known,
+        colours=album.colours,
+        room=room,
     )
     took = time.perf_counter() - began
     notify(f"asks the scene which components it needs, for up to {SEARCH_SHARE:.0%} of the budget")
@@ -203,6 +250,11 @@ def _search(
     for decision in selection.decisions:
         notify(decision.in_words())
     return selection
+
+
+def _exif(scene: Scene) -> np.ndarray:
+    """(photos,) logarithms of the exposures that EXIF tells, relative to their mean."""
+    return relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
 
 
 def _known(scene: Scene) -> str | None:

@@ -25,13 +25,15 @@ class Signs:
             mean is 0.
         exposure_spread: standard deviation of the photos' brightness among them, without what the estimates' own noise
             brings.
+        far_share: of the pixels, those whose light comes from where no photo sees it move, for the larger part.
     """
 
     log_gains: Tensor
     exposure_spread: float
+    far_share: float
 
 
-def signs_of(rendered: Tensor, measured: Tensor, photos: Tensor, *, count: int) -> Signs:
+def signs_of(rendered: Tensor, measured: Tensor, photos: Tensor, *, from_beyond: Tensor, count: int) -> Signs:
     """The signs in some pixels.
 
     The gain of a photo is the median over its pixels of log(measured / rendered), channel by channel: highlights and
@@ -40,11 +42,13 @@ def signs_of(rendered: Tensor, measured: Tensor, photos: Tensor, *, count: int) 
     Args:
         rendered, measured: (N, 3) sRGB.
         photos: (N,) which photo each is of.
+        from_beyond: (N,) shares of their light that come from beyond the field, had it a background.
         count: of the photos.
     """
     compared = ((measured > DARKEST) & (measured < BRIGHTEST) & (rendered > DARKEST)).cpu().numpy()
     ratios = (linear_from_srgb(measured).log() - linear_from_srgb(rendered.clamp_min(DARKEST)).log()).cpu().numpy()
     of_photo = photos.cpu().numpy()
+    far_share = float((from_beyond > 0.5).float().mean())
     gains, errors = np.zeros((count, 3)), np.full(count, np.nan)
     for photo in range(count):
         mine = of_photo == photo
@@ -56,7 +60,7 @@ def signs_of(rendered: Tensor, measured: Tensor, photos: Tensor, *, count: int) 
             errors[photo] = _OF_MEDIAN * deviation / np.sqrt(good.sum())
     known = np.isfinite(errors)
     if known.sum() < 2:
-        return Signs(torch.zeros(count, 3), 0.0)
+        return Signs(torch.zeros(count, 3), 0.0, far_share)
     gains[known] -= gains[known].mean(0)
     excess = gains[known].mean(-1).var(ddof=1) - np.square(errors[known]).mean()
-    return Signs(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))))
+    return Signs(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_share)

@@ -26,6 +26,7 @@ from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.photos import Photo, PixelPool, Pool
+from nerfcli.train.point_depth import PointDepths, PointRays
 from nerfcli.train.room import IN_MEMORY, Room
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.signs import Signs, signs_of
@@ -71,14 +72,25 @@ class Trial:
 
 @dataclass(frozen=True)
 class Start:
-    """Where the first training stood when it stopped: its state, steps, seconds, and what its residuals tell."""
+    """Where the first training stood when it stopped.
+
+    Args:
+        tensors, description: its state.
+        seconds: it took.
+        trial: what it achieved.
+        signs: what its residuals tell.
+    """
 
     tensors: dict[str, Tensor]
     description: dict[str, Any]
-    steps: int
     seconds: float
-    psnr: float
+    trial: Trial
     signs: Signs
+
+    @property
+    def steps(self) -> int:
+        """It went."""
+        return self.trial.steps
 
 
 class Trials:
@@ -90,6 +102,7 @@ class Trials:
         settings: of the training that the trials are for; seed and components are given with each trial.
         exif: (photos,) logarithms of the exposures that EXIF tells, relative to their mean.
         log_focal: see `Fitting`.
+        known: pixels whose distance is known; None where that is not asked for.
         colours, room: see `PixelPool`.
 
     Raises:
@@ -104,6 +117,7 @@ class Trials:
         settings: TrainSettings,
         exif: np.ndarray,
         log_focal: float = 0.0,
+        known: PointDepths | None = None,
         colours: np.ndarray | None = None,
         room: Room = IN_MEMORY,
     ):
@@ -120,6 +134,8 @@ class Trials:
         self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
         self._exif = torch.from_numpy(exif).to(torch.float32)[:, None].expand(-1, 3)
         self._log_focal = log_focal
+        usable = None if known is None else known.among(self._pool)
+        self._points = PointRays(usable, self._pool) if usable is not None and len(usable.numbers) else None
         self._room = room
 
     def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start:
@@ -132,22 +148,30 @@ class Trials:
             fewest: steps, for which it takes up to twice as long.
         """
         fitting = self._fitting(components, seed=self._settings.seed, log_gains=None, cameras_from=0.0)
-        took = 0.0
+        took: list[float] = []
 
         def share() -> float:
             enough = fitting.step / fewest if fewest else math.inf
-            return max(fitting.step / steps, took / (2.0 * seconds), min(took / seconds, enough))
+            return max(fitting.step / steps, sum(took) / (2.0 * seconds), min(sum(took) / seconds, enough))
 
         while share() < 1.0:
-            took += self._advance(fitting, FORK_SHARE * share())
+            took.append(self._advance(fitting, FORK_SHARE * share()))
         drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
         with torch.no_grad():
             rendered, measured = fitting.compare(drawn)
-        signs = signs_of(rendered, measured, self._pool.photo_of(drawn.numbers), count=len(self._counts))
+        reach = self._extent.reach
+        signs = signs_of(
+            rendered,
+            measured,
+            self._pool.photo_of(drawn.numbers),
+            from_beyond=fitting.light_from_beyond(drawn, distance=math.inf if reach is None else reach),
+            count=len(self._counts),
+        )
         tensors, description = fitting.state()
-        psnr = -10.0 * math.log10(max(float(self._errors(fitting).sum() / self._counts.sum()), 1e-12))
         copies = {name: tensor.clone() for name, tensor in tensors.items()}
-        return Start(copies, description, fitting.step, took, psnr, signs)
+        errors = self._errors(fitting)
+        trial = Trial(errors, errors, self._counts, statistics.median(took) * len(took), fitting.step)
+        return Start(copies, description, sum(took), trial, signs)
 
     def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:
         """Go on to the end of the schedule with these components, and judge.
@@ -186,6 +210,7 @@ class Trials:
             log_gains=log_gains,
             log_focal=self._log_focal,
             cameras_from=cameras_from,
+            points=self._points if components.points else None,
             error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
         )
 

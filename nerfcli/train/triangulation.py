@@ -1,64 +1,86 @@
-"""Points of the surface, found in the training photos with the poses that the scene gives.
-
-Some capture formats bring cameras and no points. Where the cameras look, nobody knows then how far what they see is
-away; matched features tell, within a few seconds.
-"""
+"""Where points of the surface are, by the training photos that saw them and the poses that the scene gives."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from nerfcli.train.matching import Matches, radians_per_pixel
-from nerfcli.train.photos import Photo
+from nerfcli.cameras.frame import Frame
+from nerfcli.train.tracks import Tracks
 
-# How far a point may be from where its features are; poses and lenses of captures are often off by a pixel or two.
+# How far a sighting may be from its point, in pixels of the training photo; poses and lenses of captures are often off
+# by one or two.
 WITHIN_PX = 3.0
-# Rays that meet at less than this are as good as parallel: the distance would be made of noise.
-LEAST_ANGLE_RAD = np.radians(0.5)
+# Two rays that meet at a smaller angle do not tell the distance: half a pixel would change it by a tenth and more.
+LEAST_ANGLE_RAD = np.radians(1.0)
+# After the first round, points are found without the sightings that were far off.
+ROUNDS = 2
 
 
-def triangulate(photos: Sequence[Photo], matched: Sequence[Matches]) -> np.ndarray:
-    """Points (N, 3) in the scene's frame, float64, that two photos agree on; N is 0 where nothing was matched.
-
-    Accuracy: a few per cent of the distance at best, and a few wrong ones are among them: good for percentiles.
-    """
-    return np.concatenate([np.zeros((0, 3)), *(_points(photos, matches) for matches in matched)])
-
-
-def _points(photos: Sequence[Photo], matches: Matches) -> np.ndarray:
-    """The points (M, 3) of the matches of two photos that fit their poses."""
-    one, other = (photos[index] for index in matches.photos)
-    rays = [_world_rays(photo, pixels) for photo, pixels in zip((one, other), matches.pixels, strict=True)]
-    tolerances = tuple(WITHIN_PX * radians_per_pixel(photo.frame.camera) for photo in (one, other))
-    return meetings((one.frame.centre, other.frame.centre), (rays[0], rays[1]), (tolerances[0], tolerances[1]))
-
-
-def meetings(
-    centres: tuple[np.ndarray, np.ndarray], rays: tuple[np.ndarray, np.ndarray], tolerances: tuple[float, float]
-) -> np.ndarray:
-    """Where rays of two cameras meet, (M, 3): of the pairs that do, the middles of their closest points.
+@dataclass(frozen=True)
+class Surface:
+    """Points that photos agree on.
 
     Args:
-        centres: (3,) of each camera.
-        rays: (N, 3) unit directions of each; NaN where there is none.
-        tolerances: how far a ray may pass beside its point, in radians as its camera sees it.
+        points: (P, 3) in the scene's frame, float64; NaN where photos do not agree.
+        misses_px: (O,) how far each sighting is from its point, in pixels of the training photo at its middle; NaN
+            where it is too far, or there is no point.
     """
-    (p, q), (d, e) = centres, rays
-    baseline = q - p
-    cosine = np.einsum("ni,ni->n", d, e)
-    along_d, along_e = d @ baseline, e @ baseline
-    # Closest points p + s d and q + t e: d and e are both across their connection.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s = (along_d - cosine * along_e) / (1 - cosine**2)
-        t = (cosine * along_d - along_e) / (1 - cosine**2)
-        first, second = p + s[:, None] * d, q + t[:, None] * e
-        half_gap = np.linalg.norm(first - second, axis=1) / 2
-        angle = np.arctan2(np.linalg.norm(np.cross(d, e), axis=1), cosine)
-        good = (s > 0) & (t > 0) & (angle > LEAST_ANGLE_RAD)
-        good &= (half_gap < tolerances[0] * s) & (half_gap < tolerances[1] * t)
-    return (first[good] + second[good]) / 2
+
+    points: np.ndarray
+    misses_px: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """(N, 3): the points that there are."""
+        return self.points[np.isfinite(self.points).all(axis=1)]
 
 
-def _world_rays(photo: Photo, pixels: np.ndarray) -> np.ndarray:
-    bearings, valid = photo.frame.camera.bearings(pixels)
-    return np.where(valid[:, None], bearings, np.nan) @ photo.frame.world_from_cam[:3, :3].T
+def triangulate(frames: Sequence[Frame], tracks: Tracks) -> Surface:
+    """The point that all rays of a track pass nearest to, for each track that two photos at least agree on.
+
+    x = (sum_i I - d_i d_i^T)^-1 sum_i (I - d_i d_i^T) o_i,  d_i unit rays, o_i camera centres
+
+    Two rays at the angle a make the least eigenvalue of the matrix 1 - cos a: below that of `LEAST_ANGLE_RAD` the
+    distance is not known. Accuracy: a few per cent of the distance at worst, and a few wrong ones may be among them.
+
+    Args:
+        frames: of the photos.
+        tracks: what they saw.
+    """
+    centres = np.array([frame.centre for frame in frames])
+    middle = centres.mean(axis=0)  # far from the origin of GPS coordinates, rounding would cost digits
+    origins = (centres - middle)[tracks.photos]
+    px = np.array([1.0 / frame.camera.focal_px for frame in frames])[tracks.photos]
+    misses = np.where(np.isfinite(tracks.rays).all(axis=1), 0.0, np.nan)
+    points = np.full((tracks.count, 3), np.nan)
+    for _ in range(ROUNDS):
+        points = _nearest(origins, tracks, np.isfinite(misses))
+        away = points[tracks.points] - origins
+        across = np.linalg.norm(np.cross(tracks.rays, away), axis=1)
+        misses = np.arctan2(across, np.einsum("oi,oi->o", tracks.rays, away)) / px
+        misses[~(misses < WITHIN_PX)] = np.nan
+    agreed = np.bincount(tracks.points[np.isfinite(misses)], minlength=tracks.count) >= 2
+    points[~agreed] = np.nan
+    misses[~agreed[tracks.points]] = np.nan
+    return Surface(points + middle, misses)
+
+
+def _nearest(origins: np.ndarray, tracks: Tracks, used: np.ndarray) -> np.ndarray:
+    """(P, 3) the point nearest to the used rays of each track; NaN where they do not tell one."""
+    of, rays, origins = tracks.points[used], tracks.rays[used], origins[used]
+
+    def summed(values: np.ndarray) -> np.ndarray:
+        return np.bincount(of, values, tracks.count)
+
+    # Sum by sum, as a matrix for each sighting would be as large as the photos of a large capture.
+    products = [[summed(rays[:, i] * rays[:, j]) for j in range(3)] for i in range(3)]
+    matrices = np.eye(3) * np.bincount(of, minlength=tracks.count)[:, None, None] - np.array(products).transpose(
+        2, 0, 1
+    )
+    along = np.einsum("oi,oi->o", rays, origins)
+    sums = np.stack([summed(origins[:, i] - rays[:, i] * along) for i in range(3)], axis=-1)
+    told = np.linalg.eigvalsh(matrices)[:, 0] > 1.0 - np.cos(LEAST_ANGLE_RAD)
+    points = np.full((tracks.count, 3), np.nan)
+    points[told] = np.linalg.solve(matrices[told], sums[told][:, :, None])[..., 0]
+    return points
