@@ -26,7 +26,8 @@ from nerfcli.train.preparation import prepare
 from nerfcli.train.selection import SEARCH_SHARE
 from nerfcli.train.settings import TrainSettings
 
-# What each scene needs, beside what every model has; and what may be left out of it.
+# What each scene needs, beside what every model has; and what may be left out of it. Points are needed where photos
+# share any, and are told apart.
 NEEDED: dict[str, dict[str, object]] = {
     "exposure-balls": {"exposure": "learned"},
     "exposure-exif-balls": {"exposure": "exif"},
@@ -40,7 +41,7 @@ NEEDED: dict[str, dict[str, object]] = {
 }
 NEEDS_VIEW = ("glossy",)
 SEARCH_STEPS = 1000
-COLUMNS = ["scene", "seed", "picked", "view", "right", "cpu_seconds", "decisions"]
+COLUMNS = ["scene", "seed", "picked", "points", "view", "right", "cpu_seconds", "decisions"]
 
 
 def search(name: str, seed: int, steps: int) -> dict[str, object]:
@@ -62,12 +63,14 @@ def search(name: str, seed: int, steps: int) -> dict[str, object]:
     assert prepared.selection is not None
     changed = differences(prepared.selection.components)
     changed.pop("view", None)
+    points = changed.pop("points", 0.0)
     view = prepared.selection.components.view
     right = changed == NEEDED[name] and (view > 0 or name not in NEEDS_VIEW)
     return {
         "scene": name,
         "seed": seed,
         "picked": " ".join(f"{key}={value}" for key, value in changed.items()),
+        "points": points,
         "view": view,
         "right": right,
         "cpu_seconds": round(time.process_time() - began, 1),
@@ -78,7 +81,7 @@ def search(name: str, seed: int, steps: int) -> dict[str, object]:
 def print_table(lines: list[dict[str, str]]) -> None:
     """A line per scene."""
     table = Table(title="picked by --model auto")
-    for column in ("scene", "needs", "right", "view kept", "picked", "CPU s"):
+    for column in ("scene", "needs", "right", "points", "view kept", "picked", "CPU s"):
         table.add_column(column)
     for name in dict.fromkeys(line["scene"] for line in lines):
         own = [line for line in lines if line["scene"] == name]
@@ -88,6 +91,7 @@ def print_table(lines: list[dict[str, str]]) -> None:
             name,
             " ".join(needs) or "nothing",
             f"{sum(str(line['right']) == 'True' for line in own)} of {len(own)}",
+            f"{sum(float(line['points']) > 0 for line in own)} of {len(own)}",
             f"{sum(int(line['view']) > 0 for line in own)} of {len(own)}",
             ", ".join(f"{picked.count(one)} x {one}" for one in dict.fromkeys(picked)),
             f"{sum(float(line['cpu_seconds']) for line in own) / len(own):.0f}",
