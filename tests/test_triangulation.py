@@ -7,6 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -16,7 +18,7 @@ from nerfcli.train.extent import Extent, choose_extent, lacks_depth
 from nerfcli.train.matching import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.train.photos import Photo
 from nerfcli.train.settings import TrainSettings
-from nerfcli.train.tracks import Tracks, tracks_of_matches
+from nerfcli.train.tracks import Tracks, places_of, tracks_of_matches
 from nerfcli.train.triangulation import triangulate
 
 CAMERA = Camera.pinhole(320, 240, 300.0)
@@ -154,6 +156,14 @@ def test_points_of_exact_rays_are_exact_wherever_the_world_begins(offset):
     np.testing.assert_allclose(surface.points[told], points[told], rtol=0, atol=1e-12 * (1 + 1e3 * offset))
     assert np.nanmax(surface.misses_px) < 1e-3
     assert np.isnan(surface.misses_px).sum() == sum(not told[point] for _, point in seen)
+
+
+@given(st.lists(st.integers(-1, 6), max_size=30), st.integers(0, 5))
+def test_places_of_numbers_are_those_that_are_equal(numbers, count):
+    found = places_of(np.array(numbers, dtype=int), count)
+    assert [list(places) for places in found] == [
+        [place for place, number in enumerate(numbers) if number == wanted] for wanted in range(count)
+    ]
 
 
 def test_photos_that_do_not_agree_tell_nothing():

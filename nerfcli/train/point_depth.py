@@ -9,7 +9,7 @@ from torch import Tensor
 from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.train.photos import Drawn, PixelPool
-from nerfcli.train.tracks import Tracks
+from nerfcli.train.tracks import Tracks, places_of
 from nerfcli.train.triangulation import triangulate
 
 # Until this share of the budget the points count less and less; photos tell more than points once there are surfaces.
@@ -82,8 +82,8 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
     surface = triangulate(pool.frames, tracks)
     kept = np.flatnonzero(np.isfinite(surface.misses_px))
     numbers = np.full(len(kept), -1)
-    for photo, frame in enumerate(pool.frames):
-        own = np.flatnonzero(tracks.photos[kept] == photo)
+    by_photo = places_of(tracks.photos[kept], len(pool.frames))
+    for photo, (frame, own) in enumerate(zip(pool.frames, by_photo, strict=True)):
         points = surface.points[tracks.points[kept[own]]]
         pixels, valid = frame.camera.project(apply(inverse(frame.world_from_cam), points))
         width, height = frame.camera.width, frame.camera.height

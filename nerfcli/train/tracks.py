@@ -43,11 +43,12 @@ def tracks_of_model(scene: Scene, photos: Sequence[Photo]) -> Tracks:
     if capture is not None and capture.observations is not None:
         seen = capture.observations
         index_of = {frame.name: index for index, frame in enumerate(capture.frames)}
+        of_frame = places_of(np.where(seen.point_index >= 0, seen.frame_index, -1), len(capture.frames))
         for number, photo in enumerate(photos):
             index = index_of.get(photo.frame.name)
             if index is None:
                 continue
-            own = np.flatnonzero((seen.frame_index == index) & (seen.point_index >= 0))
+            own = of_frame[index]
             # The photo may be smaller or turned: the model's own camera knows what its pixels mean.
             rays = _rays(capture.frames[index].camera.bearings(seen.pixels[own]), capture.frames[index].world_from_cam)
             parts.append((np.full(len(own), number), seen.point_index[own], rays))
@@ -67,6 +68,12 @@ def tracks_of_matches(photos: Sequence[Photo], matched: Sequence[Matches]) -> Tr
                 (np.full(len(points), number), points, _rays(frame.camera.bearings(pixels), frame.world_from_cam))
             )
     return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def places_of(numbers: np.ndarray, count: int) -> list[np.ndarray]:
+    """For each number from 0 to count - 1, where it stands, in rising order; others are left out."""
+    order = np.argsort(numbers, kind="stable")
+    return np.split(order, np.searchsorted(numbers[order], np.arange(count + 1)))[1:-1]
 
 
 def _rays(bearings: tuple[np.ndarray, np.ndarray], world_from_cam: np.ndarray) -> np.ndarray:
