@@ -324,6 +324,19 @@ def test_another_bench_and_other_files_are_not_touched(tmp_path):
 
 
 @pytest.mark.usefixtures("_few")
+def test_a_bench_that_is_interrupted_before_it_has_measured_says_so(foggy, tmp_path, monkeypatch):
+    """Not that it needs more time: that is a mistake of the user, this is not."""
+
+    def interrupting(session: Session, kind: str, **content: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Session, "record", interrupting)
+    result = run_bench(foggy, tmp_path / "bench")
+    assert (result.exit_code, result.stdout) == (INTERRUPTED, "")
+    assert "Error" not in result.stderr
+
+
+@pytest.mark.usefixtures("_few")
 def test_an_interrupted_bench_reports_what_it_has_and_goes_on(foggy, tmp_path, monkeypatch):
     folder, record = tmp_path / "bench", Session.record
 

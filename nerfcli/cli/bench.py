@@ -46,12 +46,12 @@ def bench(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure speed against error on this scene and machine: which settings are worth their time.
+    """Measure speed against error on this scene and machine.
 
-    Renders one trained field with many settings and trains with many settings. Each has its time (median and quartiles
-    of interleaved repeats), peak memory, size, error against the held-out photos and, apart from that, against a
-    converged rendering of the same field. Says which are in the Pareto set, what makes the others pointless, and what
-    to use. Nothing else should run meanwhile.
+    Which settings are worth their time? Renders one trained field with many settings and trains with many settings.
+    Each has its time (median and quartiles of interleaved repeats), peak memory, size, error against the held-out
+    photos and, apart from that, against a converged rendering of the same field. Says which are in the Pareto set, what
+    makes the others pointless, and what to use. Nothing else should run meanwhile.
 
     Writes SOURCE-bench/ with bench.html (plots, and the pictures behind each point), bench.csv and bench.json. An
     interrupted bench reports what it has; the same command goes on.
@@ -118,6 +118,8 @@ def bench_one(
         except KeyboardInterrupt as error:
             interrupted = error
     page, content = write_report(records)
+    if interrupted is not None and not content["rendering"] and not content["training"]:
+        raise interrupted
     _print(content, console)
     if interrupted is not None:
         console.note(f"{page} tells what was measured so far; the same command goes on")
