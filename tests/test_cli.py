@@ -83,6 +83,7 @@ def test_help_lists_every_command_and_the_exit_codes():
     result = nerfcli("--help")
     assert result.exit_code == 0
     assert all(re.search(rf"^\s+{command}\b", result.stdout, re.M) for command in (*COMMANDS, *WITHOUT_INPUT))
+    assert "..." not in result.stdout.split("Commands:")[1]  # what a command is for is told whole
     assert "130 interrupted; 143 ended by SIGTERM" in re.sub(r"\s+", " ", result.stdout)
     for line in result.stdout.splitlines():
         if line.strip().startswith("nerfcli "):

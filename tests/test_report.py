@@ -121,7 +121,16 @@ def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
 def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
     look, _ = seen
     text = page_html([facts()], [look], depth=_meta())
-    for told in ("23.46 dB", "0.7500", "1.50 M", "0.25 s", "8.0 MB", "300 MB", "conditional depth along the optical"):
+    for told in (
+        "23.46 dB",
+        "0.7500",
+        "1.50 M",
+        "0.25 s",
+        "8.0 MB",
+        "300 MB",
+        "conditional depth along the optical",
+        ">20<",
+    ):
         assert told in text
     assert not re.search(r"(src|href)=\"?http", text)
     data = re.search(r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL)

@@ -77,12 +77,12 @@ def ablate(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure what each component is worth on a scene: trainings with it and without it, on the held-out photos.
+    """Measure what each component of the model is worth on a scene.
 
-    The model that `train --model auto` chooses is compared with models that have one component less, or one more: the
-    same time or steps, the same seeds. Each difference comes with its 95 % interval over the seeds and a verdict. This
-    is a measurement: nothing is chosen by it. Masks are not varied, as they change what is measured. Components are
-    those of `nerfcli train --help`.
+    Trainings with it and without it are compared on the held-out photos: the one that `train --model auto` chooses
+    beside models that have one component less, or one more: the same time or steps, the same seeds. Each difference
+    comes with its 95 % interval over the seeds and a verdict. This is a measurement: nothing is chosen by it. Masks are
+    not varied, as they change what is measured. Components are those of `nerfcli train --help`.
 
     PSNR is that of some 16,000 random pixels of the held-out photos: the same ones for all models of a seed, others for
     each seed, so that the interval includes the choice of pixels. For a table of a paper add --whole: whole photos and

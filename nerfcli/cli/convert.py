@@ -97,11 +97,12 @@ def convert(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert a capture's cameras, poses and points to another format, and prove that nothing changed.
+    """Convert a capture to another format, and prove it.
 
-    What was written is read back by other programs' code (pycolmap, OpenCV, SciPy), every 3D point is projected by
-    both, and the largest residual is told; above --tolerance the exit code is 7 and nothing is kept. What the format
-    cannot hold is listed, and refused without --allow-loss, but for 2D features. Photos are not touched.
+    What was written, cameras, poses and points, is read back by other programs' code (pycolmap, OpenCV, SciPy), every
+    3D point is projected by both, and the largest residual is told; above --tolerance the exit code is 7 and nothing is
+    kept. What the format cannot hold is listed, and refused without --allow-loss, but for 2D features. Photos are not
+    touched.
 
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,

@@ -33,10 +33,11 @@ def doctor(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Examine photos before any long work: blur, exposure, doubles, lenses, overlap, movement, moving things.
+    """Tell what an expert would say of photos before any long work.
 
-    Prints a table on stderr and writes a page with thumbnails beside the capture, CAPTURE-doctor.html. Of a scene it
-    judges the cameras too. Each finding is good, look or bad, with its number, its threshold and what to do.
+    Blur, exposure, doubles, lenses, overlap, movement, moving things. Prints a table on stderr and writes a page with
+    thumbnails beside the capture, CAPTURE-doctor.html. Of a scene it judges the cameras too. Each finding is good, look
+    or bad, with its number, its threshold and what to do.
 
     \b
     Examples:

@@ -52,11 +52,12 @@ def evaluate(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure PSNR, SSIM and LPIPS on the photos that training did not see, with training and render time beside them.
+    """Measure runs on the photos that training did not see.
 
-    Writes RUN/metrics.json: the protocol's name, means and values per photo of 8-bit and of unrounded pictures, after a
-    correction of colours, how far each view is from the nearest training view, and which stages have seen the held-out
-    photos. With several runs of one scene, or with --seeds, mean and spread over the runs are told, too.
+    PSNR, SSIM and LPIPS, with training and render time beside them, go to RUN/metrics.json: the protocol's name, means
+    and values per photo of 8-bit and of unrounded pictures, after a correction of colours, how far each view is from
+    the nearest training view, and which stages have seen the held-out photos. With several runs of one scene, or with
+    --seeds, mean and spread over the runs are told, too.
 
     \b
     Examples:

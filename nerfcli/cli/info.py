@@ -20,7 +20,9 @@ def info(
     ],
     json: Json = False,
 ) -> None:
-    """Say what a scene or a run holds: cameras, photos, missing files, split, unit; settings, time, numbers.
+    """Say what a scene, a run or one of their files holds.
+
+    Of a scene: cameras, photos, missing files, split, unit. Of a run: settings, time, numbers.
 
     \b
     Of a depth file (TIFF, EXR, NPZ, NPY, PNG), a picture, a video or a folder of renders: which depth it is, along

@@ -21,11 +21,11 @@ Threads = Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)]
 Downscale = Annotated[str, typer.Option(help="Average photos over squares: auto, 1, 2, 4 or 8.")]
 Include = Annotated[
     list[str] | None,
-    typer.Option("--with", metavar="NAME[=VALUE]", help="A component to switch on; see below. Repeatable."),
+    typer.Option("--with", metavar="NAME[=VALUE]", help="A component to switch on; see above. Repeatable."),
 ]
 Exclude = Annotated[
     list[str] | None,
-    typer.Option("--without", metavar="NAME", help="A component to switch off; see below. Repeatable."),
+    typer.Option("--without", metavar="NAME", help="A component to switch off; see above. Repeatable."),
 ]
 ModelChoice = Annotated[
     str,

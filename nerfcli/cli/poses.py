@@ -92,11 +92,11 @@ def poses(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Estimate camera poses and intrinsics (structure from motion with pycolmap).
+    """Find camera poses and intrinsics by structure from motion.
 
-    Writes PHOTOS-scene/ with a COLMAP model, scene.json and poses_report.json. The photos are neither copied nor
-    changed. Photos that do not register are listed with the reason. Of a video, the sharpest frames are written to
-    VIDEO-frames/ first; where the camera stands still it gives none.
+    With pycolmap. Writes PHOTOS-scene/ with a COLMAP model, scene.json and poses_report.json. The photos are neither
+    copied nor changed. Photos that do not register are listed with the reason. Of a video, the sharpest frames are
+    written to VIDEO-frames/ first; where the camera stands still it gives none.
 
     A call that was interrupted is gone on from by the next one. database.db stays in the scene, so that with
     --overwrite and another setting only what depends on it is done again.

@@ -111,7 +111,7 @@ def render(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a trained run: colours, depth maps that say what they mean, opacity, videos.
+    """Render a trained run: colours, depths, opacity, videos.
 
     \b
     The depths of a ray, exact inside each interval; less opaque pixels than --min-opacity have none (NaN):

@@ -28,7 +28,7 @@ def report(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write one self-contained HTML page about a run, or about several side by side.
+    """Write a self-contained page about a run, or about several.
 
     Numbers, everything that was warned about, held-out photos beside what the run renders of them (with a border that
     moves, error maps and depth in its convention), training curves against seconds, capture, poses, speed, settings and

@@ -61,7 +61,7 @@ def run(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Do everything: poses, train, evaluate, renders of the held-out views, and an orbit video.
+    """Do everything: poses, train, evaluate, renders, an orbit video.
 
     Writes PHOTOS-scene/ and PHOTOS-scene-run/ beside the photos, or scene/ and run/ inside --output. Stages that are
     complete are kept, so an interrupted run goes on where it stopped. Components for --with and --without are those of

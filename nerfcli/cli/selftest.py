@@ -44,11 +44,12 @@ def selftest(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Try every operation on hard cases with known answers, on this machine: errors, bounds, verdicts, time.
+    """Try every operation on hard cases with known answers.
 
-    Thin fog and opaque walls, no samples and thousands, densities at overflow, points at infinity, rotations near 0 and
-    pi, lenses beyond what they can see: in float64, float32, bfloat16 and in the compiled kernels. Errors are relative;
-    beside each stands that of the formula that textbooks give. The number is that of the list of known hard cases.
+    On this machine, with errors, bounds, verdicts and time. Thin fog and opaque walls, no samples and thousands,
+    densities at overflow, points at infinity, rotations near 0 and pi, lenses beyond what they can see: in float64,
+    float32, bfloat16 and in the compiled kernels. Errors are relative; beside each stands that of the formula that
+    textbooks give. The number is that of the list of known hard cases.
 
     Ends with exit code 7 if an error is above its bound.
 

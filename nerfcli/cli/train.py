@@ -82,7 +82,7 @@ def train(
 
     SCENE is what `nerfcli poses` wrote, a COLMAP project, or a folder with transforms.json (nerfstudio, instant-ngp),
     transforms_train.json (Blender) or poses_bounds.npy (LLFF). Photos are held out as the scene says, else every 8th,
-    or by --holdout. Writes SCENE-run/. Ctrl-C saves a checkpoint; --resume goes on from it.
+    or by --holdout. Writes SCENE-run/. Ctrl-C or SIGTERM saves a checkpoint; --resume goes on from it.
 
     Components, for --with and --without: background (auto, black, constant, random, sphere: what is behind the
     field), view (0 to 3: the degree to which colours depend on the direction), exposure (none, exif, learned:
