@@ -162,12 +162,12 @@ def test_a_photo_without_pixels_to_judge_by_counts_nothing():
     assert judged(base, tried).gain_db == pytest.approx(told(0.5), abs=1e-9)
 
 
-def signs(spread: float, far: float = 0.2) -> Signs:
+def signs(spread: float, far: float = 0.05) -> Signs:
     return Signs(torch.zeros(PHOTOS, 3), spread, far)
 
 
 def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for():
-    def names(facts: Facts, spread: float = 0.3, far: float = 0.2) -> set[str]:
+    def names(facts: Facts, spread: float = 0.3, far: float = 0.05) -> set[str]:
         return {name for name, _ in proposals(Components(), signs(spread, far), facts)[0]}
 
     assert names(FITTED) == {"exposure", "background"}
@@ -193,14 +193,16 @@ def test_what_is_left_out_is_nothing_that_the_user_or_the_field_decided():
 class Scripted:
     """Trials that answer at once, with the gains in dB that a function says components have."""
 
-    def __init__(self, gain: Callable[[Components], float], *, spread: float = 0.3):
-        self.gain, self.spread = gain, spread
+    def __init__(self, gain: Callable[[Components], float], *, spread: float = 0.3, far: float = 0.05):
+        self.gain, self.spread, self.far = gain, spread, far
         self.asked: list[tuple[Components, int, int]] = []
         self.begun: list[Components] = []
 
     def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start:
         self.begun.append(components)
-        return Start({}, {}, 1.0, replace(trial(20.0 + self.gain(components)), steps=steps), signs(self.spread))
+        return Start(
+            {}, {}, 1.0, replace(trial(20.0 + self.gain(components)), steps=steps), signs(self.spread, self.far)
+        )
 
     def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:
         self.asked.append((components, seed, steps))
@@ -264,6 +266,21 @@ def test_points_are_asked_only_where_the_cameras_fit(misses, tells):
     assert not tells_points(Components(cameras="poses"), FITTED)
     assert not tells_points(Components(), replace(FITTED, fixed=("points",)))
     assert tells_points(Components(points=0.2), replace(facts, fixed=("points",)))
+
+
+@pytest.mark.parametrize(("far", "kept"), [(0.05, False), (0.15, True)])
+def test_a_sky_that_signs_speak_for_is_kept_at_a_smaller_gain(far, kept):
+    """Gains of 0.13 and 0.45 dB with two seeds: between one and two standard errors above what counts at all."""
+    scripted = Scripted(lambda c: 0.0, spread=0.0, far=far)
+    scripted.go_on = lambda start, components, *, seed, steps: trial(  # type: ignore[method-assign]
+        20.0 + seed + (0.13 if seed == 0 else 0.45) * (components.background == "sphere")
+    )
+    chosen = chosen_by(scripted, facts=replace(FITTED, fixed=("view",)))
+    (sphere,) = (decision for decision in chosen.decisions if decision.component == "background")
+    assert sphere.error_db is not None
+    assert sphere.gain_db is not None
+    assert 1.0 < (sphere.gain_db - 0.05) / sphere.error_db < 2.0
+    assert sphere.kept is kept
 
 
 def test_what_is_needed_stays():

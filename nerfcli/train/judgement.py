@@ -12,6 +12,8 @@ from nerfcli.train.trials import Trial
 
 # A gain counts if it is above this many standard errors, and above what nobody sees.
 STANDARD_ERRORS = 2.0
+# The same of a gain that signs speak for, as well as the trial.
+LIKELY_ERRORS = 1.0
 # Of a gain with one seed only, and what it would differ by with another: measured 0.03 dB on the desk, 0.15 dB on balls
 # in front of nothing, which learn faster.
 CLEAR_ERRORS, SEED_DB = 5.0, 0.1
@@ -73,7 +75,14 @@ class Rule(Protocol):
     def __call__(self, base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision: ...
 
 
-def judge_one(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
+def judge_one(
+    base: Sequence[Trial],
+    change: Change,
+    tried: Sequence[Trial],
+    *,
+    by_time: bool,
+    standard_errors: float = STANDARD_ERRORS,
+) -> Decision:
     """What paired trials say of something added to the model: it has to gain more than the noise.
 
     gain = mean over photos and seeds of 10 log10(MSE of base / MSE of candidate). Its variance is that of the mean over
@@ -87,6 +96,7 @@ def judge_one(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, 
         tried: trials with it, in the same order of seeds.
         by_time: whether it has to gain what its time would bring, too; where steps are what counts, the answer must not
             depend on how fast the machine is.
+        standard_errors: that the gain has to be above, with more than one seed.
     """
     gains = np.array([_gains(one, other) for one, other in zip(base, tried, strict=True)])
     seeds, photos = gains.shape
@@ -100,10 +110,18 @@ def judge_one(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, 
     # What twice as many steps bring to the model as it is.
     slope_db = max(0.0, float(np.mean([_gains_by_steps(trial).mean() for trial in base])))
     at_equal_time = gain - slope_db * math.log2(1.0 + cost) if by_time else gain
-    errors = STANDARD_ERRORS if seeds > 1 else CLEAR_ERRORS
+    errors = standard_errors if seeds > 1 else CLEAR_ERRORS
     against = _against(gain, error, errors=errors, trend=trend, at_equal_time=at_equal_time)
     why = against or f"gains more than {LEAST_GAIN_DB:g} dB and {errors:g} standard errors"
     return Decision(*change, gain, error, trend, cost, at_equal_time, against is None, why)
+
+
+def judge_likely(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
+    """What paired trials say of something that signs speak for: a gain above one standard error is enough.
+
+    Arguments as of `judge_one`.
+    """
+    return judge_one(base, change, tried, by_time=by_time, standard_errors=LIKELY_ERRORS)
 
 
 def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:

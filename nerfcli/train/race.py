@@ -1,8 +1,9 @@
 """Candidates against one another, within a limit of time or steps: the best first, the others beside it."""
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 from torch import Tensor
 
@@ -75,14 +76,19 @@ class Race:
         # Trials of what is kept so far, one per seed; and of what gained once beside it.
         self._base: list[Trial] = []
         self._once: dict[Change, Trial] = {}
-        self._supported: Collection[Change] = ()
+        self._rules: Mapping[Change, Rule] = {}
 
     @property
     def log_gains(self) -> Tensor | None:
         """Of the exposures that the model which won has found."""
         return self._base[0].log_gains if self._base else None
 
-    def run(self, additions: Sequence[Change], removals: Sequence[Change], supported: Collection[Change] = ()) -> None:
+    def run(
+        self,
+        additions: Sequence[Change],
+        removals: Sequence[Change],
+        rules: Mapping[Change, Rule] = MappingProxyType({}),
+    ) -> None:
         """Fill `decisions` and `kept`.
 
         All additions with one seed; then the best of them with the others unless it is clear already, and if it is
@@ -90,10 +96,10 @@ class Race:
 
         Args:
             additions, removals: changes of the model that was asked for.
-            supported: those of the additions that mend a fault which is known; see `judge_supported`.
+            rules: for those of the additions that more than a trial speaks for; else `judge_one`.
         """
         self.decisions = {change: untried(*change, NO_TIME) for change in (*additions, *removals)}
-        self._supported = supported
+        self._rules = rules
         if not self.decisions or not self._can_run(2):
             return
         self._base = [self._trial([], seed=0)]
@@ -120,11 +126,11 @@ class Race:
             trial = self._trial([change], seed=0)
             decision = self._judged(self._rule(change), change, [trial])
             self.decisions[change] = replace(decision, kept=False)
-            if change in self._supported or (decision.gain_db or 0.0) > LEAST_GAIN_DB:
+            if self._rule(change) is judge_supported or (decision.gain_db or 0.0) > LEAST_GAIN_DB:
                 self._once[change] = trial
 
     def _rule(self, addition: Change) -> Rule:
-        return judge_supported if addition in self._supported else judge_one
+        return self._rules.get(addition, judge_one)
 
     def _best(self) -> Change:
         """The one that gains most; of a component's values that gain as much as seeds differ by, the one proposed

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from nerfcli.train.camera_check import CameraCheck
 from nerfcli.train.components import CHOICES, Change, Components
-from nerfcli.train.judgement import Decision, judge_supported, untried
+from nerfcli.train.judgement import Decision, Rule, judge_likely, judge_supported, untried
 from nerfcli.train.race import Purse, Race
 from nerfcli.train.signs import Signs
 from nerfcli.train.trials import Trials
@@ -32,8 +32,8 @@ MOST_START_STEPS = 250
 # Photos whose brightness differs by less than this, in logarithms of light, are as well without exposures.
 LEAST_EXPOSURE_SPREAD = 0.06
 # A sky that fills less of the pixels is as well painted on the field. Measured 14 to 26 % where there is one,
-# 0 to 3 % on most real captures, after 120 to 500 steps.
-LEAST_FAR_SHARE = 0.01
+# 0 to 3 % on most real captures, after 120 to 500 steps. A larger share speaks for a sky, whatever the trial says.
+LEAST_FAR_SHARE, LIKELY_FAR_SHARE = 0.01, 0.1
 # Cameras whose photos agree to this are as good as the features: structure from motion leaves 0.1 to 0.4.
 LEAST_MISS_PX = 0.6
 # The focal length that matches tell is taken if it is so many standard errors and so far away from the given one, and
@@ -187,9 +187,15 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
     )
 
 
-def supported(candidates: Sequence[Change], facts: Facts) -> list[Change]:
-    """Those of the candidates that mend a fault which is known without a trial: cameras whose photos disagree."""
-    return [change for change in candidates if change[0] == "cameras" and facts.cameras is not None]
+def rules(candidates: Sequence[Change], signs: Signs, facts: Facts) -> dict[Change, Rule]:
+    """How those of the candidates are judged that more than a trial speaks for."""
+    found: dict[Change, Rule] = {}
+    for change in candidates:
+        if change[0] == "cameras" and facts.cameras is not None:
+            found[change] = judge_supported  # photos disagree
+        if change[0] == "background" and signs.far_share > LIKELY_FAR_SHARE:
+            found[change] = judge_likely
+    return found
 
 
 def removals(start: Components, facts: Facts) -> list[Change]:
@@ -248,7 +254,7 @@ def select(
             model, start = asked, without
     candidates, declined = proposals(model, start.signs, facts)
     race = Race(trials, start, purse, model)
-    race.run(candidates, removals(model, facts), supported(candidates, facts))
+    race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
     chosen = replace(model, **dict(race.kept))
     gains = race.log_gains if chosen.exposure == "learned" else None
     return Selection(chosen, (*told, *race.decisions.values(), *declined), purse.spent, gains)
