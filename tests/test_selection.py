@@ -23,7 +23,7 @@ from nerfcli.train.judgement import (
     judge_removal,
     judge_supported,
 )
-from nerfcli.train.race import NO_TIME, ONCE, REMOVAL_SHARE, Purse
+from nerfcli.train.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_SHARE, Purse
 from nerfcli.train.selection import (
     MOST_START_STEPS,
     Facts,
@@ -316,12 +316,12 @@ def test_of_two_values_of_a_component_the_better_is_kept():
 
 
 def test_what_there_was_no_time_for_stays_as_it_is():
-    """A fifth of the steps is for the start, a tenth for each of eight trials: view would need another."""
+    """A fifth of the steps is for the start, a tenth for each of eight trials: view would need others."""
     scripted = Scripted(lambda c: 0.6 * (c.exposure == "learned") + 0.4 * (c.background == "sphere"))
     chosen = chosen_by(scripted, steps=1000)
     assert len(scripted.asked) <= 8
     assert chosen.components == Components(exposure="learned", background="sphere")
-    assert {d.component: d.why for d in chosen.decisions}["view"] == ONCE
+    assert {d.component: d.why for d in chosen.decisions}["view"] == NO_TIME
 
 
 def test_too_few_steps_are_not_spent():
@@ -399,6 +399,17 @@ def test_what_gains_once_is_not_kept_where_no_time_is_left_to_try_it_again():
     assert chosen.components == Components(exposure="exif")
     assert {d.value: d.why for d in chosen.decisions if d.component == "cameras"}["poses"] == ONCE
     assert {d.component: d.why for d in chosen.decisions}["view"] == NO_TIME
+
+
+@pytest.mark.parametrize(("steps", "tried"), [(4000, True), (2000, False)])
+def test_leaving_something_out_is_tried_where_that_costs_little(steps, tried):
+    """Four trials of half a start of 250 steps have to be within 13 % of the search."""
+    scripted = Scripted(lambda c: 0.0, spread=0.0, far=0.0)
+    chosen = chosen_by(scripted, steps=steps)
+    assert chosen.components.view == (0 if tried else 3)
+    assert bool(scripted.asked) is tried
+    (view,) = (decision for decision in chosen.decisions if decision.component == "view")
+    assert (view.why == COSTS_MORE) is not tried
 
 
 def test_a_long_search_does_not_make_a_long_start():
