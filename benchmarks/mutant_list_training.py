@@ -180,7 +180,7 @@ TRAINING: tuple[Group, ...] = (
             Mutant("+ transmittance[first:]", ""),
             Mutant("first = len(transmittance) - count", "first = 0"),
             Mutant(".clamp_max(1.0)", ""),
-            Mutant("LAST_SHARE = 0.5", "LAST_SHARE = 0.5 + 1e-3"),
+            Mutant("1.0 - share / LAST_SHARE", "1.0 - share"),
             Mutant("max(1, len(drawn.numbers) // PIXELS_PER_POINT)", "1"),
         ),
     ),

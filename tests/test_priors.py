@@ -22,7 +22,7 @@ from nerfcli.train.loop import train
 from nerfcli.train.losses import opacity_entropy
 from nerfcli.train.matching import chosen_pairs
 from nerfcli.train.photos import PixelPool, load_photos
-from nerfcli.train.point_depth import LAST_SHARE, PointDepths, fading, point_depth_loss, point_depths
+from nerfcli.train.point_depth import LAST_SHARE, PointDepths, PointRays, fading, point_depth_loss, point_depths
 from nerfcli.train.preparation import prepare
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.shared import Shared
@@ -57,6 +57,7 @@ def capture(tmp_path: Path) -> Scene:
         frames.append(Frame(name, CAMERA, camera_at(0.2 * index), tmp_path / "images" / name))
         pixels, _ = CAMERA.project(POINTS - frames[index].centre)
         rows += [(index, point, pixel) for point, pixel in enumerate(pixels)]
+    rows.append((0, -1, np.array([1.0, 1.0])))  # a feature that no other photo has
     observed = Observations(*(np.array(column) for column in zip(*rows, strict=True)))
     observed.pixels[3] += (0.0, 0.5)
     (tmp_path / scenes.MODEL_FOLDER).mkdir(parents=True)
@@ -106,8 +107,8 @@ def test_points_behind_a_mask_are_not_looked_at(capture):
 
 
 def test_only_training_photos_tell_where_points_are(capture):
-    """With the second photo held out, each point is left to a single one, which tells no distance: the file does."""
-    held_out = replace(capture, test_names=frozenset({"1.png"}))
+    """With the first photo held out, each point is left to a single one, which tells no distance: the file does."""
+    held_out = replace(capture, test_names=frozenset({"0.png"}))
     one = Similarity(1.0, np.eye(3), np.zeros(3))
     tracks = tracks_in(held_out)
     assert set(tracks.photos.tolist()) == {0}
@@ -155,6 +156,18 @@ def test_the_gradient_of_the_loss_of_points_is_right():
         return point_depth_loss(weights, transmittance, middles, offsets=offsets, known=known)
 
     assert torch.autograd.gradcheck(loss, (density,))
+
+
+def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
+    one = Similarity(1.0, np.eye(3), np.zeros(3))
+    pool = pool_of(capture, "empty", similarity=one)
+    known = point_depths(tracks_in(capture), pool, one)
+    generator = torch.Generator().manual_seed(0)
+    both = PointRays(known, pool).added_to(pool.draw(80, generator), generator)
+    assert (len(both.numbers), len(both.distances), len(both.trust)) == (90, 10, 10)
+    of_pixel = dict(zip(known.numbers.tolist(), known.distances.tolist(), strict=True))
+    assert both.distances.tolist() == [of_pixel[number] for number in both.numbers[-10:].tolist()]
+    assert len(PointRays(known, pool).added_to(pool.draw(3, generator), generator).distances) == 1
 
 
 def test_points_fade_out():

@@ -197,6 +197,7 @@ class Scripted:
         self.gain, self.spread, self.far = gain, spread, far
         self.asked: list[tuple[Components, int, int]] = []
         self.begun: list[Components] = []
+        self.from_psnr: set[float] = set()
 
     def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start:
         self.begun.append(components)
@@ -206,6 +207,7 @@ class Scripted:
 
     def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:
         self.asked.append((components, seed, steps))
+        self.from_psnr.add(start.trial.psnr)
         return trial(20.0 + seed + self.gain(components))
 
 
@@ -239,6 +241,7 @@ def test_points_that_photos_share_are_in_the_model_from_the_start_unless_they_lo
     assert [model.points for model in scripted.begun] == [0.1, 0.0]
     assert chosen.components.points == (0.1 if kept else 0.0)
     assert {model.points for model, _, _ in scripted.asked} == {chosen.components.points}
+    assert list(scripted.from_psnr) == pytest.approx([20.0 + (gain if kept else 0.0)])
     (decision,) = (decision for decision in chosen.decisions if decision.component == "points")
     assert (decision.kept, decision.gain_db) == (kept, pytest.approx(told(gain), abs=1e-9))
 

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.scene import Scene
 from nerfcli.train.extent import Extent, choose_extent, lacks_depth
-from nerfcli.train.matching import MOST_PHOTOS, chosen_pairs, match
+from nerfcli.train.matching import MOST_PHOTOS, Matches, chosen_pairs, match
 from nerfcli.train.photos import Photo
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.tracks import Tracks, places_of, tracks_of_matches
@@ -184,6 +185,28 @@ def test_photos_that_do_not_agree_tell_nothing():
         0,
         3,
     )
+
+
+def test_a_point_that_a_single_photo_is_left_to_have_seen_is_none():
+    """Rays that pass each other 0.03 apart, 1 before one camera and 10 before the other: 4.5 px off in the first photo,
+    0.45 in the second, which alone knows no distance. A third, on the other side of the first, hides it until it is
+    found to be wrong itself."""
+    centres = np.array([[0.3, 0.0, 0.0], [0.0, 0.0, -9.0], [-0.3, 0.0, 0.0]])
+    rays = np.array([[0.0, 0.03, 1.0], [0.3, 0.0, 10.0], [0.6, 0.06, 1.0]])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for count in (2, 3):
+        surface = triangulate(frames_at(centres), Tracks(np.arange(count), np.zeros(count, int), rays[:count]))
+        assert np.isnan(surface.points).all()
+        assert np.isnan(surface.misses_px).all()
+
+
+def test_matches_where_a_lens_has_no_direction_have_no_ray():
+    lens = SimpleNamespace(bearings=lambda pixels: (np.ones((len(pixels), 3)), pixels[:, 0] < 50))
+    photo = SimpleNamespace(frame=SimpleNamespace(camera=lens, world_from_cam=np.eye(4)))
+    pixels = np.array([[20.0, 1.0], [90.0, 1.0]])
+    tracks = tracks_of_matches([photo, photo], [Matches((0, 1), (pixels, pixels))])  # type: ignore[list-item]
+    assert np.isfinite(tracks.rays).all(axis=1).tolist() == [True, False] * 2
+    assert tracks.points.tolist() == [0, 1, 0, 1]
 
 
 def test_a_wrong_sighting_among_right_ones_is_left_out():
