@@ -152,7 +152,7 @@ def test_a_video_that_is_cut_short_is_told(clip, tmp_path, name):
 
 
 def test_what_a_thread_says_amid_the_line_of_another_is_heard():
-    """As ffmpeg printed it, 5 times in 2,000 runs with eight at once."""
+    """As ffmpeg printed it, in 74 of 2,000 runs with eight at once and 3 of 400 beside other work."""
     torn = b"[Parsed_showinfo_0 @ 0x7f68] [info] n: 11 pts_time:0.366667 stream 0, offset 0x17d0: partial file\n"
     decoder = _Decoder(cast(Any, SimpleNamespace(stderr=io.BytesIO(torn), wait=lambda: 0)))
     decoder.finish()
