@@ -224,6 +224,15 @@ def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     assert "points=0.1: kept, 3 pixels see points whose distance is known" in told
 
 
+@pytest.mark.parametrize("limit", [{"budget_seconds": None, "steps": 10}, {"budget_seconds": 1.0}])
+def test_a_short_training_does_not_wait_for_photos_to_be_compared(capture, tmp_path, monkeypatch, limit):
+    monkeypatch.setattr("nerfcli.train.shared.match", lambda *photos, **threads: pytest.fail("photos were compared"))
+    without_model = replace(capture, root=tmp_path / "elsewhere")
+    settings = TrainSettings(**limit, model="auto")
+    prepared = prepare(without_model, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    assert prepared.settings.components == Components()
+
+
 def test_comparing_photos_has_a_price_once(spheres):
     """0.7 us for each pixel of photos that are compared; nothing once it is done."""
     photos = load_photos(spheres.train_frames, factor=4, threads=1)

@@ -179,7 +179,9 @@ def _facts(
     """What is known before anything is learned, and the pixels whose distance is known, where these may be asked."""
     lacks_points = album.fills_frame and len(scene.points) == 0
     budget = settings.budget_seconds
-    has_time = budget is None or shared.matching_seconds <= MATCHING_SHARE * SEARCH_SHARE * budget
+    has_time = is_worth_a_search(budget, settings.steps) and (
+        budget is None or shared.matching_seconds <= MATCHING_SHARE * SEARCH_SHARE * budget
+    )
     facts = Facts(
         settings.field,
         has_alpha=album.colours.shape[-1] == 4,
