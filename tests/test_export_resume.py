@@ -29,7 +29,8 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 
 PIXELS = 10 * 8
-VIDEO = VideoSettings(layout="side-by-side", direction="ping-pong", fps=12)
+# A gif: the same frames give the same bytes, which no promise of the other encoders is.
+VIDEO = VideoSettings(layout="side-by-side", direction="ping-pong", fps=12, formats=("gif",))
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +135,7 @@ def test_other_videos_of_the_same_pictures_take_them(model, tmp_path):
     done: list[int] = []
     export(model, order(video=None), tmp_path / "views", on_rays=done.append)
     assert done == [3 * PIXELS, PIXELS]
-    assert not list(tmp_path.rglob("*.mp4"))
+    assert not list(tmp_path.rglob("*.gif"))
 
 
 def test_an_export_that_is_stopped_leaves_the_old_one(model, tmp_path):

@@ -101,7 +101,8 @@ def write_video(
     """Encode frames as they come; memory does not grow with their number. The file appears when it is complete.
 
     Frames of odd width or height get their last column or row twice, because video formats store colour for pairs of
-    pixels (gif does not, and keeps them as they are). The same frames give the same bytes.
+    pixels (gif does not, and keeps them as they are). The same frames give the same gif; the other encoders may write
+    a few bits otherwise on a busy machine.
 
     Args:
         path: the file to write, with the suffix of `form`.
