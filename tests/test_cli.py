@@ -329,6 +329,7 @@ def test_info_of_a_scene(capture):
     plain = nerfcli("info", capture).stdout
     assert plain.splitlines()[0] == str(capture)
     assert "  kind: blender" in plain
+    assert "None" not in plain  # how the unit is known was not written down
 
 
 def test_the_doctor_writes_a_page_beside_the_photos_and_holds_it_against_a_gate(tmp_path):

@@ -15,6 +15,7 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
+from nerfcli.cli.words import lines_of
 from nerfcli.media.depth import KEY
 from nerfcli.media.descriptions import description_of
 from nerfcli.media.exr import write_exr
@@ -29,6 +30,29 @@ def info(*arguments: str | Path) -> Result:
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result
+
+
+def test_facts_are_told_in_lines_that_a_terminal_holds():
+    facts = {
+        "kind": "run",
+        "unit": None,
+        "photos": 4,
+        "loss": 0.015097633935511112,
+        "settings": {"seed": 0, "steps": None, "model": "auto", "rate": 1e-5} | {f"setting_{i}": i for i in range(9)},
+        "decisions": ["view=0: kept", "points=0.1: " + "not kept " * 30],
+        "rescaled": [],
+        "versions": {},
+    }
+    assert lines_of(facts) == [
+        "kind: run",
+        "photos: 4",
+        "loss: 0.0150976",
+        "settings: seed 0, model auto, rate 1e-05, setting_0 0, setting_1 1, setting_2 2, setting_3 3, setting_4 4,",
+        "  setting_5 5, setting_6 6, setting_7 7, setting_8 8",
+        "decisions:",
+        "  view=0: kept",
+        "  points=0.1: " + "not kept " * 30,
+    ]
 
 
 @pytest.mark.parametrize("suffix", ALL)

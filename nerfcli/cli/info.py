@@ -1,6 +1,5 @@
 """nerfcli info: what a folder or a file is, and what is in it."""
 
-import json as json_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,7 +9,7 @@ from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.costs import cost_lines, costs_of_run
 from nerfcli.cli.options import Json
-from nerfcli.cli.words import words_of
+from nerfcli.cli.words import lines_of, words_of
 
 
 @command
@@ -52,7 +51,7 @@ def info(
             typer.echo("\n".join([str(folder), *(f"  {line}" for line in words_of(content))]))
         else:
             costs = content.pop("cost", {})
-            lines = [f"{key}: {_text(value)}" for key, value in content.items()]
+            lines = lines_of(content)
             if costs:
                 lines += [f"storage and work of the {next(iter(costs))} field, and of others of as many bytes:"]
                 lines += [f"  {line}" for line in cost_lines(costs)]
@@ -168,7 +167,3 @@ def _describe_tensors(path: Path) -> dict[str, Any]:
     _, bad = replay(path)
     again = None if bad is None else f"{bad.name}: {bad.count} of {bad.total} numbers"
     return {**facts, "failure": description["told"], "pixels": description["pixels"], "repeated_now": again}
-
-
-def _text(value: Any) -> str:
-    return json_module.dumps(value, ensure_ascii=False) if isinstance(value, dict | list) else str(value)

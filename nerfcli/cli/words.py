@@ -1,7 +1,28 @@
-"""Facts of depth files, pictures and videos as lines for people."""
+"""Facts of scenes, runs, depth files, pictures and videos as lines for people."""
 
+import json
+import textwrap
 from collections.abc import Iterator
 from typing import Any
+
+# Letters in a line; what is longer goes on in the next one, further in.
+WIDTH = 110
+
+
+def lines_of(facts: dict[str, Any]) -> list[str]:
+    """Facts by their names, a line each or folded ones, lists below their name; what is not known is not said."""
+    lines = []
+    for name, value in facts.items():
+        if value is None or value in ([], {}):
+            continue
+        if isinstance(value, list):
+            lines += [f"{name}:", *(f"  {_plain(entry)}" for entry in value)]
+        elif isinstance(value, dict):
+            listed = ", ".join(f"{key} {_plain(entry)}" for key, entry in value.items() if entry is not None)
+            lines += _folded(f"{name}: {listed}")
+        else:
+            lines.append(f"{name}: {_plain(value)}")
+    return lines
 
 
 def words_of(facts: dict[str, Any]) -> list[str]:
@@ -65,8 +86,10 @@ def _meaning(meaning: dict[str, Any]) -> Iterator[str]:
     if "rounding_max" in bounds:
         yield f"rounding to levels changed no depth by more than {bounds.pop('rounding_max'):.3g}"
     if bounds:
+        told = bounds.pop("meaning", "it bounds the rendering, not the field")
         listed = ", ".join(f"{name} {_number(value)}" for name, value in bounds.items())
-        yield f"error of the rendering: {listed}; it bounds the rendering, not the field"
+        yield from _folded(f"error of the rendering: {listed}")
+        yield from _folded(told)
     yield from _camera(meaning.get("view", {}))
     made = {**meaning.get("provenance", {})}
     if made or meaning.get("nerfcli"):
@@ -83,6 +106,16 @@ def _camera(view: dict[str, Any]) -> Iterator[str]:
     yield f"{line}, parameters {parameters}"
     if pose:
         yield f"its centre in the world: {' '.join(f'{row[3]:.6g}' for row in pose[:3])}"
+
+
+def _folded(text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def _number(value: Any) -> str:
