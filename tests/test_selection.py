@@ -162,8 +162,11 @@ def test_a_photo_without_pixels_to_judge_by_counts_nothing():
     assert judged(base, tried).gain_db == pytest.approx(told(0.5), abs=1e-9)
 
 
-def signs(spread: float, far: float = 0.05) -> Signs:
-    return Signs(torch.zeros(PHOTOS, 3), spread, far)
+SKY = (15.0, 24.0)
+
+
+def signs(spread: float, far: float = 0.05, sky: tuple[float, float] = SKY) -> Signs:
+    return Signs(torch.zeros(PHOTOS, 3), spread, far, sky)
 
 
 def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for():
@@ -177,6 +180,12 @@ def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for
     assert names(FITTED, far=0.009) == {"exposure"}
     (near,) = proposals(Components(), signs(0.3, 0.004), replace(FITTED, fixed=("cameras",)))[1]
     assert near.in_words() == "background=sphere: not tried, 0.4% of the pixels have most of their light from far away"
+    for sky, is_tried in (((15.0, 15.9), False), ((15.0, 16.1), True), ((23.0, 22.9), True), ((math.inf,) * 2, True)):
+        tried, declined = proposals(Components(), signs(0.3, 0.05, sky), FITTED)
+        assert (("background", "sphere") in tried) == is_tried
+        if not is_tried:
+            (told,) = (one.in_words() for one in declined if one.component == "background")
+            assert told.endswith("but their colours are no matter of direction: 15.9 dB by it, 15.0 with one colour")
     (declined,) = proposals(Components(), signs(0.01), replace(FITTED, fixed=("cameras",)))[1]
     assert (declined.component, declined.kept, declined.gain_db) == ("exposure", False, None)
     assert "1.0%" in declined.in_words()

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.exposure import linear_from_srgb
+from nerfcli.train.sky import explained_by_direction
 
 # Levels that are compared in brightness: below is noise, above the sensor is full.
 DARKEST, BRIGHTEST = 0.06, 0.95
@@ -26,14 +27,19 @@ class Signs:
         exposure_spread: standard deviation of the photos' brightness among them, without what the estimates' own noise
             brings.
         far_share: of the pixels, those whose light comes from where no photo sees it move, for the larger part.
+        sky_psnr: how well one colour explains these pixels, and a colour by direction, see
+            `sky.explained_by_direction`.
     """
 
     log_gains: Tensor
     exposure_spread: float
     far_share: float
+    sky_psnr: tuple[float, float]
 
 
-def signs_of(rendered: Tensor, measured: Tensor, photos: Tensor, *, from_beyond: Tensor, count: int) -> Signs:
+def signs_of(
+    rendered: Tensor, measured: Tensor, photos: Tensor, *, directions: Tensor, from_beyond: Tensor, count: int
+) -> Signs:
     """The signs in some pixels.
 
     The gain of a photo is the median over its pixels of log(measured / rendered), channel by channel: highlights and
@@ -42,13 +48,16 @@ def signs_of(rendered: Tensor, measured: Tensor, photos: Tensor, *, from_beyond:
     Args:
         rendered, measured: (N, 3) sRGB.
         photos: (N,) which photo each is of.
+        directions: (N, 3) of their rays, unit.
         from_beyond: (N,) shares of their light that come from beyond the field, had it a background.
         count: of the photos.
     """
     compared = ((measured > DARKEST) & (measured < BRIGHTEST) & (rendered > DARKEST)).cpu().numpy()
     ratios = (linear_from_srgb(measured).log() - linear_from_srgb(rendered.clamp_min(DARKEST)).log()).cpu().numpy()
     of_photo = photos.cpu().numpy()
-    far_share = float((from_beyond > 0.5).float().mean())
+    far = from_beyond > 0.5
+    far_share = float(far.float().mean())
+    sky_psnr = explained_by_direction(directions[far], measured[far], photos[far])
     gains, errors = np.zeros((count, 3)), np.full(count, np.nan)
     for photo in range(count):
         mine = of_photo == photo
@@ -60,7 +69,7 @@ def signs_of(rendered: Tensor, measured: Tensor, photos: Tensor, *, from_beyond:
             errors[photo] = _OF_MEDIAN * deviation / np.sqrt(good.sum())
     known = np.isfinite(errors)
     if known.sum() < 2:
-        return Signs(torch.zeros(count, 3), 0.0, far_share)
+        return Signs(torch.zeros(count, 3), 0.0, far_share, sky_psnr)
     gains[known] -= gains[known].mean(0)
     excess = gains[known].mean(-1).var(ddof=1) - np.square(errors[known]).mean()
-    return Signs(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_share)
+    return Signs(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_share, sky_psnr)

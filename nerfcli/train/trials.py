@@ -9,7 +9,7 @@ The held-out photos of the scene take no part in this: what is chosen by looking
 import math
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,18 +18,17 @@ import torch
 from torch import Tensor
 
 from nerfcli.errors import UserError
-from nerfcli.field.background import SphereBackground
 from nerfcli.field.hash_field import HashField
-from nerfcli.train.adam import Adam
 from nerfcli.train.components import Components
 from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
-from nerfcli.train.photos import Photo, PixelPool, Pool
+from nerfcli.train.photos import Photo, PixelPool
 from nerfcli.train.point_depth import PointDepths, PointRays
 from nerfcli.train.room import IN_MEMORY, Room
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.signs import Signs, signs_of
+from nerfcli.train.sky import paint
 
 # Photos are judged by squares of this side, or of a quarter of a small photo's: single pixels between known neighbours
 # would judge interpolation.
@@ -38,8 +37,9 @@ BLOCK_SHARE = 0.06
 JUDGED_PIXELS = 8192
 # Of the whole schedule, what is over when the first training stops and the others go on.
 FORK_SHARE = 0.6
-# How a background that begins late is painted.
-PAINT_RATE, PAINT_STEPS = 0.3, 30
+# After so many steps it is known how many there will be, within this factor: of a machine that something else slowed
+# down, too. Where they are too few, the rest would be in vain.
+PROBE_STEPS, PROBE_FACTOR = 10, 1.25
 # The choice of blocks and pixels: the same for all candidates of a scene, and not that of any training.
 SEED = 20_211
 
@@ -145,7 +145,7 @@ class Trials:
             components: what is in the model.
             steps: to go at most.
             seconds: to take; how many steps were gone then is in the answer.
-            fewest: steps, for which it takes up to twice as long.
+            fewest: steps, for which it takes up to twice as long; it ends at once where these are surely out of reach.
         """
         fitting = self._fitting(components, seed=self._settings.seed, log_gains=None, cameras_from=0.0)
         took: list[float] = []
@@ -154,7 +154,10 @@ class Trials:
             enough = fitting.step / fewest if fewest else math.inf
             return max(fitting.step / steps, sum(took) / (2.0 * seconds), min(sum(took) / seconds, enough))
 
-        while share() < 1.0:
+        def is_in_vain() -> bool:
+            return len(took) == PROBE_STEPS and statistics.median(took) * fewest > 2.0 * PROBE_FACTOR * seconds
+
+        while share() < 1.0 and not is_in_vain():
             took.append(self._advance(fitting, FORK_SHARE * share()))
         drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
         with torch.no_grad():
@@ -164,6 +167,7 @@ class Trials:
             rendered,
             measured,
             self._pool.photo_of(drawn.numbers),
+            directions=drawn.directions,
             from_beyond=fitting.light_from_beyond(drawn, distance=math.inf if reach is None else reach),
             count=len(self._counts),
         )
@@ -187,7 +191,7 @@ class Trials:
         fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_SHARE)
         self._take_up(fitting, start)
         if fitting.parts.background is not None:
-            paint(fitting.parts.background, self._pool)
+            paint(fitting.parts.background, self._draws())
         seconds, halfway = [], None
         for done in range(steps):
             if halfway is None and 2 * done >= steps:
@@ -199,6 +203,17 @@ class Trials:
         exposure = fitting.parts.exposure
         found = exposure.log_gains().detach().clone() if exposure is not None else None
         return Trial(errors, errors if halfway is None else halfway, self._counts, took, steps, found)
+
+    def _draws(self) -> Callable[[], tuple[Tensor, Tensor]]:
+        """Directions and colours of pixels of all photos, as if nothing stood before what is far away: what a field
+        without a background put there is cut away when it gets one."""
+        generator = torch.Generator(device=self._pool.colours.device).manual_seed(SEED)
+
+        def seen() -> tuple[Tensor, Tensor]:
+            drawn = self._pool.draw(JUDGED_PIXELS, generator)
+            return drawn.directions, drawn.colours[:, :3]
+
+        return seen
 
     def _fitting(self, components: Components, *, seed: int, log_gains: Tensor | None, cameras_from: float) -> Fitting:
         settings = replace(self._settings, components=components, seed=seed)
@@ -236,21 +251,6 @@ class Trials:
         rendered, measured = fitting.compare(self._judged)
         errors = (rendered.clamp(0.0, 1.0) - measured).square().sum(-1).double().cpu().numpy()
         return np.bincount(self._photos, errors, len(self._counts))
-
-
-def paint(background: SphereBackground, pool: Pool) -> None:
-    """Give each direction about the median colour of the pixels that look along it, as if nothing stood before it.
-
-    What a field without a background put there is cut away when it gets one.
-    """
-    generator = torch.Generator(device=pool.colours.device).manual_seed(SEED)
-    adam = Adam(background.parameters())
-    for _ in range(PAINT_STEPS):
-        drawn = pool.draw(JUDGED_PIXELS, generator)
-        adam.zero_grad()
-        (background(drawn.directions) - drawn.colours[:, :3]).abs().sum().backward()
-        adam.step(PAINT_RATE)
-    adam.zero_grad()
 
 
 def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarray:

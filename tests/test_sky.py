@@ -1,0 +1,88 @@
+"""Colours by direction: what is painted, and whether they tell a sky from surfaces."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfcli.field.background import SphereBackground
+from nerfcli.train.sky import explained_by_direction, paint
+
+PHOTOS = 12
+PIXELS = 150
+
+
+def directions_of(count: int, seed: int) -> Tensor:
+    """Uniform on the half of the sphere in front of a wall."""
+    directions = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
+    directions[:, 2] = directions[:, 2].abs()
+    return torch.nn.functional.normalize(directions, dim=-1)
+
+
+def gradient(directions: Tensor) -> Tensor:
+    """A sky that becomes brighter to one side."""
+    return 0.5 + 0.4 * directions[:, :1] * torch.tensor([1.0, 0.5, -0.5])
+
+
+def test_a_painted_background_has_the_colours_of_its_directions():
+    """Directions in one half of the sphere see one colour, in the other another: painted are both."""
+    generator = torch.Generator().manual_seed(0)
+
+    def seen() -> tuple[Tensor, Tensor]:
+        directions = torch.nn.functional.normalize(torch.randn(4096, 3, generator=generator), dim=-1)
+        return directions, torch.where(
+            directions[:, 2:] > 0, torch.tensor([0.2, 0.4, 0.9]), torch.tensor([0.5, 0.3, 0.1])
+        )
+
+    background = SphereBackground()
+    paint(background, seen)
+    up, down = background(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])).detach()
+    assert up.tolist() == pytest.approx([0.2, 0.4, 0.9], abs=0.08)
+    assert down.tolist() == pytest.approx([0.5, 0.3, 0.1], abs=0.08)
+    assert background.logits.grad is None or not background.logits.grad.any()
+
+
+def seen_by_photos(colour: Callable[[Tensor, Tensor], Tensor], *, noise: float = 0.02) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels of photos from the corners of a square of side 2; `colour` is that along directions from places."""
+    generator = torch.Generator().manual_seed(1)
+    photos = torch.arange(PHOTOS).repeat_interleave(PIXELS)
+    centres = torch.cat([2.0 * torch.rand(PHOTOS, 2, generator=generator) - 1.0, torch.zeros(PHOTOS, 1)], dim=1)
+    directions = directions_of(len(photos), seed=2)
+    colours = colour(centres[photos], directions) + noise * torch.randn(len(photos), 3, generator=generator)
+    return directions, colours.clamp(0.0, 1.0), photos
+
+
+def stripes(places: Tensor, directions: Tensor) -> Tensor:
+    """A wall 1 in front of the photos, in stripes as wide as their centres are apart."""
+    on_wall = places + directions / directions[:, 2:].clamp_min(0.1)
+    return 0.5 + 0.4 * torch.sin(4.0 * on_wall[:, :1]).sign().expand(-1, 3)
+
+
+def test_directions_tell_the_colours_of_a_sky_and_not_those_of_surfaces():
+    one, painted = explained_by_direction(*seen_by_photos(lambda places, directions: gradient(directions)))
+    assert painted > max(25.0, one + 6.0)
+    one, painted = explained_by_direction(*seen_by_photos(stripes))
+    assert painted < one + 0.5 < 10.0
+
+
+@pytest.mark.parametrize("level", [0.5, 0.8, 1.0, 0.0])
+def test_a_sky_of_one_colour_is_told_by_directions_too(level):
+    """Overcast, burnt out or black; noise of a small camera, 2 % of the range, is 34 dB."""
+    seen = seen_by_photos(lambda places, directions: torch.full((len(places), 3), level))
+    assert min(explained_by_direction(*seen)) > 30.0
+
+
+def test_too_few_pixels_tell_nothing():
+    directions, colours, photos = seen_by_photos(stripes)
+    few = torch.cat([torch.nonzero(photos % 2 == 0)[:, 0], torch.nonzero(photos % 2 == 1)[:11, 0]])
+    none = torch.zeros(0, dtype=torch.long)
+    for chosen in (few, none):
+        assert explained_by_direction(directions[chosen], colours[chosen], photos[chosen]) == (math.inf, math.inf)
+
+
+def test_it_is_told_the_same_where_no_gradients_are_kept():
+    with torch.no_grad():
+        told = explained_by_direction(*seen_by_photos(stripes))
+    assert told == explained_by_direction(*seen_by_photos(stripes))
