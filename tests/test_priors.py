@@ -17,6 +17,7 @@ from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.scene import Scene
+from nerfcli.train.camera_check import CameraCheck
 from nerfcli.train.components import Components
 from nerfcli.train.loop import train
 from nerfcli.train.losses import opacity_entropy
@@ -24,6 +25,7 @@ from nerfcli.train.matching import chosen_pairs
 from nerfcli.train.photos import PixelPool, load_photos
 from nerfcli.train.point_depth import LAST_SHARE, PointDepths, PointRays, fading, point_depth_loss, point_depths
 from nerfcli.train.preparation import prepare
+from nerfcli.train.selection import Facts
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.shared import Shared
 from nerfcli.train.tracks import Tracks, tracks_of_model
@@ -231,6 +233,25 @@ def test_a_short_training_does_not_wait_for_photos_to_be_compared(capture, tmp_p
     settings = TrainSettings(**limit, model="auto")
     prepared = prepare(without_model, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
     assert prepared.settings.components == Components()
+
+
+@pytest.mark.parametrize("cameras", ["focal", "all", "poses", "fixed"])
+def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capture, tmp_path, monkeypatch):
+    """Of the components that are asked for, without a search; poses alone leave lenses as they are."""
+    check = CameraCheck(-0.019, 0.0006, (0.26, 0.14), 900)
+    facts = Facts("hash", has_alpha=False, has_exif=False, cameras=check, fixed=("cameras",))
+    monkeypatch.setattr("nerfcli.train.preparation._facts", lambda *asked, **known: (facts, None))
+    settings = TrainSettings(budget_seconds=None, steps=10, components=Components(cameras=cameras), model="default")
+    told: list[str] = []
+    prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=told.append)
+    learns = cameras in ("focal", "all")
+    assert prepared.log_focal == (check.log_focal if learns else 0.0)
+    assert any("ask for lenses -1.88%" in line for line in told) == learns
+    refined = prepared.fitting().parts.cameras
+    if learns:
+        assert refined is not None
+        assert refined.lenses is not None
+        assert refined.lenses.values.min().item() == pytest.approx(check.log_focal)
 
 
 def test_comparing_photos_has_a_price_once(spheres):

@@ -180,7 +180,12 @@ def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for
     assert names(FITTED, far=0.009) == {"exposure"}
     (near,) = proposals(Components(), signs(0.3, 0.004), replace(FITTED, fixed=("cameras",)))[1]
     assert near.in_words() == "background=sphere: not tried, 0.4% of the pixels have most of their light from far away"
-    for sky, is_tried in (((15.0, 15.9), False), ((15.0, 16.1), True), ((23.0, 22.9), True), ((math.inf,) * 2, True)):
+    for sky, is_tried in (
+        ((15.0, 15.9), False),
+        ((15.0, 16.1), True),
+        ((23.0, 22.9), True),
+        ((math.inf, math.inf), True),
+    ):
         tried, declined = proposals(Components(), signs(0.3, 0.05, sky), FITTED)
         assert (("background", "sphere") in tried) == is_tried
         if not is_tried:
@@ -391,6 +396,11 @@ def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
     assert told in decision.in_words()
     assert with_known_focal(Components(), replace(facts, fixed=("cameras",))) == (Components(), 0.0, [])
     assert with_known_focal(Components(), FITTED) == (Components(), 0.0, [])
+    for asked in (Components(cameras="focal"), Components(cameras="all")):
+        components, log_focal, decisions = with_known_focal(asked, replace(facts, fixed=("cameras",)))
+        assert components == asked  # it is not doubted, and begins where features say
+        assert log_focal == (check.log_focal if kept else 0.0)
+        assert [one.in_words().startswith(f"cameras={asked.cameras}: kept, ") for one in decisions] == [True] * kept
 
 
 def test_what_is_clear_is_not_tried_again_and_what_is_surely_missed_neither():

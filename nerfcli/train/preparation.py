@@ -24,6 +24,7 @@ from nerfcli.train.photos import Album, PixelPool, load_album
 from nerfcli.train.point_depth import PointDepths, PointRays, point_depths
 from nerfcli.train.room import Room, needs_of, room_for
 from nerfcli.train.selection import (
+    LEARN_FOCAL,
     SEARCH_SHARE,
     Facts,
     Selection,
@@ -145,7 +146,7 @@ def prepare(
     )
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
-    selection, known = None, None
+    selection, known, log_focal = None, None, 0.0
     if begun is not None:
         settings = replace(settings, components=begun.components)
     elif settings.model == "auto":
@@ -154,7 +155,12 @@ def prepare(
         selection = _search(
             scene, album, extent, settings, facts=facts, known=known, room=room, began=began, notify=notify
         )
-        settings = replace(settings, components=selection.components)
+        settings, log_focal = replace(settings, components=selection.components), selection.log_focal
+    elif settings.components.cameras in LEARN_FOCAL:
+        facts, _ = _facts(scene, album, extent, settings, pool=pool, shared=shared)
+        _, log_focal, decisions = with_known_focal(settings.components, facts)
+        for decision in decisions:
+            notify(decision.in_words())
     extent = extent.before(settings.components.background)
     reference, gains = _exposures(scene, settings.components, notify=notify)
     if selection is not None and selection.log_gains is not None:
@@ -169,7 +175,6 @@ def prepare(
             )
         notify(f"{len(known.numbers)} pixels see a point whose distance is known")
         points = PointRays(known, pool)
-    log_focal = selection.log_focal if selection is not None else 0.0
     return Prepared(settings, factor, room, extent, pool, selection, reference, gains, log_focal, points)
 
 

@@ -42,6 +42,8 @@ LEAST_MISS_PX = 0.6
 # The focal length that matches tell is taken if it is so many standard errors and so far away from the given one, and
 # makes the misses so much smaller.
 FOCAL_ERRORS, LEAST_FOCAL, MISS_SHARE = 5.0, 0.003, 0.85
+# Values of "cameras" with which focal lengths learn.
+LEARN_FOCAL = ("focal", "all")
 
 
 @dataclass(frozen=True)
@@ -104,25 +106,27 @@ def with_known_focal(asked: Components, facts: Facts) -> tuple[Components, float
     """The model with the focal length that matched features tell, if they surely tell another than the given one; the
     logarithm of its factor, which is 0 elsewhere; and the decision about it.
 
-    Trials cannot decide this: a model that has begun with a wrong length is bent to fit, and stays so for long.
+    Trials cannot decide this: a model that has begun with a wrong length is bent to fit, and stays so for long. For the
+    same reason a model that is asked for with lenses that learn begins with the length that features tell.
     """
-    check = facts.cameras
-    if check is None or "cameras" in facts.fixed:
+    check, learns = facts.cameras, asked.cameras in LEARN_FOCAL
+    if check is None or ("cameras" in facts.fixed and not learns):
         return asked, 0.0, []
     given, changed = check.misses_px
-    if not math.isfinite(check.error):
-        told = f"not tried, {check.matches} matched features miss by {given:.2f} px, and by more with other lenses"
-        return asked, 0.0, [untried("cameras", "focal", told)]
-    told = (
-        f"{check.matches} matched features ask for lenses {math.expm1(check.log_focal):+.2%} +- {check.error:.2%} as "
-        f"long, and miss by {given:.2f} px as they are, by {changed:.2f} px then"
-    )
+    if math.isfinite(check.error):
+        told = (
+            f"{check.matches} matched features ask for lenses {math.expm1(check.log_focal):+.2%} +- {check.error:.2%} "
+            f"as long, and miss by {given:.2f} px as they are, by {changed:.2f} px then"
+        )
+    else:
+        told = f"{check.matches} matched features miss by {given:.2f} px, and by more with other lenses"
     is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error)
     # Wrong poses ask for any length: one that is right leaves nothing to ask for.
     is_sure = is_sure and changed < min(MISS_SHARE * given, LEAST_MISS_PX)
     if is_sure:
-        return replace(asked, cameras="focal"), check.log_focal, [untried("cameras", "focal", told, kept=True)]
-    return asked, 0.0, [untried("cameras", "focal", f"not tried, {told}")]
+        value = asked.cameras if learns else "focal"
+        return replace(asked, cameras=value), check.log_focal, [untried("cameras", value, told, kept=True)]
+    return asked, 0.0, [] if learns else [untried("cameras", "focal", f"not tried, {told}")]
 
 
 def tells_points(asked: Components, facts: Facts) -> bool:
