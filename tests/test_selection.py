@@ -33,7 +33,7 @@ from nerfcli.train.selection import (
     removals,
     select,
     tells_points,
-    with_known_focal,
+    with_known_cameras,
 )
 from nerfcli.train.signs import Signs
 from nerfcli.train.trials import Start, Trial
@@ -382,25 +382,48 @@ def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
         (CameraCheck(-0.019, 0.005, (0.26, 0.14), 900), False),  # not sure
         (CameraCheck(0.045, 0.006, (0.22, 0.26), 900), False),  # sure, but nothing fits better
         (CameraCheck(0.002, 0.0001, (0.26, 0.14), 900), False),  # next to nothing
-        (CameraCheck(0.08, 0.007, (2.1, 1.7), 900), False),  # poses are wrong, too
-        (CameraCheck(0.0, math.inf, (2.1, 2.1), 900), False),  # no length within reach is best
+        (CameraCheck(0.08, 0.007, (1.15, 1.1), 900), False),  # poses are wrong, too
+        (CameraCheck(0.0, math.inf, (1.1, 1.1), 900), False),  # no length within reach is best
     ],
 )
 def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
     facts = replace(FITTED, cameras_known=None, cameras=check)
-    components, log_focal, (decision,) = with_known_focal(Components(), facts)
+    components, log_focal, (decision,) = with_known_cameras(Components(), facts)
     assert components == Components(cameras="focal" if kept else "fixed")
     assert log_focal == (check.log_focal if kept else 0.0)
     assert decision.kept == kept
-    told = f"{math.expm1(check.log_focal):+.2%}" if math.isfinite(check.error) else "miss by 2.10 px"
+    told = f"{math.expm1(check.log_focal):+.2%}" if math.isfinite(check.error) else "miss by 1.10 px"
     assert told in decision.in_words()
-    assert with_known_focal(Components(), replace(facts, fixed=("cameras",))) == (Components(), 0.0, [])
-    assert with_known_focal(Components(), FITTED) == (Components(), 0.0, [])
+    assert with_known_cameras(Components(), replace(facts, fixed=("cameras",))) == (Components(), 0.0, [])
+    assert with_known_cameras(Components(), FITTED) == (Components(), 0.0, [])
     for asked in (Components(cameras="focal"), Components(cameras="all")):
-        components, log_focal, decisions = with_known_focal(asked, replace(facts, fixed=("cameras",)))
+        components, log_focal, decisions = with_known_cameras(asked, replace(facts, fixed=("cameras",)))
         assert components == asked  # it is not doubted, and begins where features say
         assert log_focal == (check.log_focal if kept else 0.0)
         assert [one.in_words().startswith(f"cameras={asked.cameras}: kept, ") for one in decisions] == [True] * kept
+
+
+@pytest.mark.parametrize("error", [0.007, math.inf])
+def test_poses_with_which_features_surely_miss_are_refined_without_a_trial(error):
+    facts = replace(FITTED, cameras_known=None, cameras=CameraCheck(0.02, error, (2.3, 1.3), 900))
+    components, log_focal, (focal, poses) = with_known_cameras(Components(), facts)
+    assert (components, log_focal) == (Components(cameras="poses"), 0.0)
+    assert (focal.value, focal.kept, poses.value, poses.kept) == ("focal", False, "poses", True)
+    assert poses.in_words() == (
+        "cameras=poses: kept, 900 matched features miss by 1.30 px, whatever the length of lenses"
+    )
+    assert not [change for change in proposals(components, signs(0.0), facts)[0] if change[0] == "cameras"]
+    assert with_known_cameras(Components(), replace(facts, fixed=("cameras",)))[0] == Components()
+    between = replace(facts, cameras=CameraCheck(0.02, error, (2.3, 1.19), 900))
+    assert with_known_cameras(Components(), between)[0] == Components()
+
+
+def test_poses_that_are_decided_on_learn_in_no_trial():
+    scripted = Scripted(lambda c: 0.5 * (c.exposure == "learned"))
+    facts = replace(FITTED, cameras_known=None, cameras=CameraCheck(0.0, math.inf, (2.3, 2.3), 900))
+    chosen = select(scripted, Components(cameras="poses"), facts, seconds=None, steps=4000)  # type: ignore[arg-type]
+    assert chosen.components == Components(cameras="poses", exposure="learned", view=0)
+    assert {model.cameras for model in (*scripted.begun, *(model for model, _, _ in scripted.asked))} == {"fixed"}
 
 
 def test_what_is_clear_is_not_tried_again_and_what_is_surely_missed_neither():

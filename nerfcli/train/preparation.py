@@ -31,7 +31,7 @@ from nerfcli.train.selection import (
     is_worth_a_search,
     select,
     tells_points,
-    with_known_focal,
+    with_known_cameras,
     with_points,
 )
 from nerfcli.train.settings import TrainSettings, automatic_downscale
@@ -158,7 +158,7 @@ def prepare(
         settings, log_focal = replace(settings, components=selection.components), selection.log_focal
     elif settings.components.cameras in LEARN_FOCAL:
         facts, _ = _facts(scene, album, extent, settings, pool=pool, shared=shared)
-        _, log_focal, decisions = with_known_focal(settings.components, facts)
+        _, log_focal, decisions = with_known_cameras(settings.components, facts)
         for decision in decisions:
             notify(decision.in_words())
     extent = extent.before(settings.components.background)
@@ -226,7 +226,7 @@ def _search(
         for decision in decisions:
             notify(decision.in_words())
         return Selection(components, tuple(decisions), time.perf_counter() - began)
-    asked, log_focal, measured = with_known_focal(settings.components, facts)
+    asked, log_focal, measured = with_known_cameras(settings.components, facts)
     trials = Trials(
         album.photos,
         extent,
