@@ -213,8 +213,10 @@ class Scripted:
         self.begun: list[Components] = []
         self.from_psnr: set[float] = set()
 
-    def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start:
+    def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start | None:
         self.begun.append(components)
+        if steps < fewest:
+            return None
         return Start(
             {}, {}, 1.0, replace(trial(20.0 + self.gain(components)), steps=steps), signs(self.spread, self.far)
         )

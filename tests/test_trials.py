@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ import torch
 from nerfcli.field.exposure import exposed
 from nerfcli.train.components import Components
 from nerfcli.train.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
-from nerfcli.train.fitting import DETAILED_STEPS
+from nerfcli.train.fitting import DETAILED_STEPS, Fitting
 from nerfcli.train.photos import load_album
 from nerfcli.train.room import IN_MEMORY
 from nerfcli.train.settings import TrainSettings
@@ -56,24 +56,37 @@ def test_trials_with_the_same_seed_are_the_same_and_leave_their_start_alone(tria
     assert not np.array_equal(first.errors, trials.go_on(start, Components(view=0), seed=4, steps=4).errors)
 
 
+def clock(monkeypatch: pytest.MonkeyPatch, seconds: Iterable[float]) -> list[int]:
+    """Every step takes the next of these seconds, and is done nothing in; gives the steps that were gone."""
+    times, gone = iter(seconds), []
+
+    def advance(self: Trials, fitting: Fitting, share: float) -> float:
+        fitting.step += 1
+        gone.append(fitting.step)
+        return next(times)
+
+    monkeypatch.setattr(Trials, "_advance", advance)
+    return gone
+
+
 def test_a_start_takes_longer_for_the_fewest_steps_but_twice_as_long_at_most(trials, monkeypatch):
     """A clock on which every step takes a second."""
-    monkeypatch.setattr(
-        Trials, "_advance", lambda self, fitting, share: (setattr(fitting, "step", fitting.step + 1), 1.0)[1]
-    )
-    for fewest, steps in ((0, 10), (7, 10), (14, 14), (24, 20)):
+    gone = clock(monkeypatch, itertools.repeat(1.0))
+    for fewest, steps in ((0, 10), (7, 10), (14, 14)):
         assert trials.begin(Components(), steps=1000, seconds=10.0, fewest=fewest).steps == steps
-    assert trials.begin(Components(), steps=5, seconds=10.0, fewest=50).steps == 5
+    assert trials.begin(Components(), steps=1000, seconds=10.0, fewest=24) is None
+    assert gone[-1] == 20
+    assert trials.begin(Components(), steps=5, seconds=10.0, fewest=50) is None
+    assert gone[-1] == 5
 
 
 def test_a_start_that_cannot_come_to_the_fewest_steps_ends_at_once(trials, monkeypatch):
     """Steps of a second, but for every fifth, which something else on the machine makes ten times as long."""
-    seconds = itertools.cycle([1.0, 1.0, 1.0, 1.0, 10.0])
-    monkeypatch.setattr(
-        Trials, "_advance", lambda self, fitting, share: (setattr(fitting, "step", fitting.step + 1), next(seconds))[1]
-    )
-    assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=260).steps == 10
-    assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=240).steps > 10
+    gone = clock(monkeypatch, itertools.cycle([1.0, 1.0, 1.0, 1.0, 10.0]))
+    assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=260) is None
+    assert gone[-1] == 10
+    assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=240) is None
+    assert gone[-1] > 60  # there was hope
 
 
 def test_cameras_learn_from_the_fork_on(trials, start):

@@ -276,11 +276,12 @@ def select(
         seconds=math.inf if seconds is None else START_SHARE * seconds,
         fewest=FEWEST_STEPS,
     )
-    purse.take(start.steps)
-    if start.steps < FEWEST_STEPS:
+    if start is None:
         return Selection(model, tuple(told), purse.spent)
+    purse.take(start.steps)
     if told:
         without = trials.begin(_without_poses(asked), steps=start.steps)
+        assert without is not None  # it has no fewest steps
         purse.take(without.steps)
         change = (told[0].component, told[0].value)
         told = [judge_supported([without.trial], change, [start.trial], by_time=purse.is_time)]

@@ -138,7 +138,7 @@ class Trials:
         self._points = PointRays(usable, self._pool) if usable is not None and len(usable.numbers) else None
         self._room = room
 
-    def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start:
+    def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start | None:
         """Train from the beginning to `FORK_SHARE` of a schedule.
 
         Args:
@@ -146,6 +146,9 @@ class Trials:
             steps: to go at most.
             seconds: to take; how many steps were gone then is in the answer.
             fewest: steps, for which it takes up to twice as long; it ends at once where these are surely out of reach.
+
+        Returns:
+            None where it did not come to the fewest steps.
         """
         fitting = self._fitting(components, seed=self._settings.seed, log_gains=None, cameras_from=0.0)
         took: list[float] = []
@@ -159,6 +162,8 @@ class Trials:
 
         while share() < 1.0 and not is_in_vain():
             took.append(self._advance(fitting, FORK_SHARE * share()))
+        if fitting.step < fewest:
+            return None
         drawn = self._pool.draw(JUDGED_PIXELS, fitting.generator)
         with torch.no_grad():
             rendered, measured = fitting.compare(drawn)
