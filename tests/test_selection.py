@@ -207,7 +207,7 @@ def test_what_is_left_out_is_nothing_that_the_user_or_the_field_decided():
 class Scripted:
     """Trials that answer at once, with the gains in dB that a function says components have."""
 
-    def __init__(self, gain: Callable[[Components], float], *, spread: float = 0.3, far: float = 0.05):
+    def __init__(self, gain: Callable[[Components], float], *, spread: float = 0.1, far: float = 0.05):
         self.gain, self.spread, self.far = gain, spread, far
         self.asked: list[tuple[Components, int, int]] = []
         self.begun: list[Components] = []
@@ -446,6 +446,26 @@ def test_what_gains_once_is_not_kept_where_no_time_is_left_to_try_it_again():
     assert chosen.components == Components(exposure="exif")
     assert {d.value: d.why for d in chosen.decisions if d.component == "cameras"}["poses"] == ONCE
     assert {d.component: d.why for d in chosen.decisions}["view"] == NO_TIME
+
+
+def test_what_gains_once_is_tried_again_before_there_is_no_time_for_that():
+    """Six trials beside two starts: one without a change, three with changes, and the two that the first needs; the
+    fourth change would take one of those."""
+    facts = replace(POINTED, has_exif=True, cameras_known=None)
+    scripted = Scripted(lambda c: 0.35 * (c.exposure == "exif") + 0.5 * (c.background == "sphere"))
+    chosen = chosen_by(scripted, steps=1000, facts=facts)
+    assert len(scripted.asked) == 6
+    assert chosen.components == Components(points=0.1, exposure="exif")
+    assert {d.component: d.why for d in chosen.decisions}["background"] == NO_TIME
+
+
+@pytest.mark.parametrize(("spread", "seeds"), [(0.1, 2), (0.12, 1)])
+def test_exposures_that_signs_speak_for_are_clear_with_one_seed(spread, seeds):
+    """0.4 dB: four standard errors with one seed. Where photos differ much in brightness, two are enough."""
+    scripted = Scripted(lambda c: 0.4 * (c.exposure == "learned"), spread=spread, far=0.0)
+    chosen = chosen_by(scripted, facts=replace(FITTED, fixed=("view",)))
+    assert chosen.components == Components(exposure="learned")
+    assert len(scripted.asked) == 2 * seeds
 
 
 @pytest.mark.parametrize(("steps", "tried"), [(4000, True), (2000, False)])

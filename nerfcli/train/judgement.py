@@ -82,6 +82,7 @@ def judge_one(
     *,
     by_time: bool,
     standard_errors: float = STANDARD_ERRORS,
+    clear_errors: float = CLEAR_ERRORS,
 ) -> Decision:
     """What paired trials say of something added to the model: it has to gain more than the noise.
 
@@ -96,7 +97,7 @@ def judge_one(
         tried: trials with it, in the same order of seeds.
         by_time: whether it has to gain what its time would bring, too; where steps are what counts, the answer must not
             depend on how fast the machine is.
-        standard_errors: that the gain has to be above, with more than one seed.
+        standard_errors, clear_errors: that the gain has to be above, with more than one seed and with one.
     """
     gains = np.array([_gains(one, other) for one, other in zip(base, tried, strict=True)])
     seeds, photos = gains.shape
@@ -110,18 +111,19 @@ def judge_one(
     # What twice as many steps bring to the model as it is.
     slope_db = max(0.0, float(np.mean([_gains_by_steps(trial).mean() for trial in base])))
     at_equal_time = gain - slope_db * math.log2(1.0 + cost) if by_time else gain
-    errors = standard_errors if seeds > 1 else CLEAR_ERRORS
+    errors = standard_errors if seeds > 1 else clear_errors
     against = _against(gain, error, errors=errors, trend=trend, at_equal_time=at_equal_time)
     why = against or f"gains more than {LEAST_GAIN_DB:g} dB and {errors:g} standard errors"
     return Decision(*change, gain, error, trend, cost, at_equal_time, against is None, why)
 
 
 def judge_likely(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """What paired trials say of something that signs speak for: a gain above one standard error is enough.
+    """What paired trials say of something that signs speak for: a gain above one standard error is enough, or above two
+    with one seed.
 
     Arguments as of `judge_one`.
     """
-    return judge_one(base, change, tried, by_time=by_time, standard_errors=LIKELY_ERRORS)
+    return judge_one(base, change, tried, by_time=by_time, standard_errors=LIKELY_ERRORS, clear_errors=STANDARD_ERRORS)
 
 
 def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:

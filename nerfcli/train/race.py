@@ -131,10 +131,14 @@ class Race:
             self._is_confirmed(change, judge_removal)
 
     def _try_once(self, changes: Sequence[Change]) -> None:
-        """Each with the first seed, beside what is kept: those that may gain are in `_once` then."""
+        """Each with the first seed, beside what is kept: those that may gain are in `_once` then.
+
+        What gains is tried with the other seeds before others are tried at all, where there is no time for both.
+        """
+        reserved = 0
         for change in changes:
             self._once.pop(change, None)
-            if not self._can_run(1):
+            if not self._can_run(1 + reserved):
                 if self.kept:
                     self._drop(change, ONCE)
                 continue
@@ -143,6 +147,7 @@ class Race:
             self.decisions[change] = replace(decision, kept=False)
             if self._rule(change) is judge_supported or (decision.gain_db or 0.0) > LEAST_GAIN_DB:
                 self._once[change] = trial
+                reserved = 0 if decision.kept else SEEDS - len(self._base) + SEEDS - 1
 
     def _rule(self, addition: Change) -> Rule:
         return self._rules.get(addition, judge_one)
