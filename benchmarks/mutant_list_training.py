@@ -255,7 +255,7 @@ TRAINING: tuple[Group, ...] = (
     Group(
         "train/newton.py",
         ("tests/test_refinement.py",),
-        "undamped or hardly or find_back",
+        "undamped or hardly or formula",
         (),
         (
             Mutant("(2.0 * losses + _LEAST_LOSS)", "(0.5 * losses + _LEAST_LOSS)"),
@@ -274,7 +274,7 @@ TRAINING: tuple[Group, ...] = (
     Group(
         "train/refinement.py",
         ("tests/test_refinement.py", "tests/test_priors.py"),
-        "frames_are or picture_moves or mean or gradient or rates or rays or find_back or moved or cameras_of or begin",
+        "rates or rays or moved or begin or mean or held_once or whole_way or needs",
         (),
         (
             Mutant("_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP)", "1.0"),
@@ -291,7 +291,7 @@ TRAINING: tuple[Group, ...] = (
     Group(
         "train/gauge.py",
         ("tests/test_refinement.py",),
-        "mean or similarity or place or spot or right",
+        "mean or similarity or place or spot or right or stay",
         (),
         (
             Mutant("_ROUNDS if len(before) >= LEAST_TOLD else 0", "0"),

@@ -34,7 +34,7 @@ from nerfcli.train.lens_change import bearings_by_change, changeable, changed
 from nerfcli.train.loop import train
 from nerfcli.train.newton import NewtonSteps
 from nerfcli.train.photos import PixelPool, load_photos
-from nerfcli.train.refinement import LAST_SHARE, PoseRefinement, Refinement, rate_at
+from nerfcli.train.refinement import LAST_SHARE, LENS_RATE, PoseRefinement, Refinement, rate_at
 from nerfcli.train.run_folder import STATE, read_cameras, read_given_cameras
 from nerfcli.train.settings import TrainSettings
 from nerfcli.train.whitening import BETAS, DAMPING, EPS, WhitenedAdam, whitening
@@ -265,6 +265,13 @@ def test_cameras_in_one_place_have_no_scale(count):
     np.testing.assert_allclose(without_mean(before, after), before, atol=1e-3)
 
 
+def test_cameras_that_stay_where_they_are_have_moved_by_nothing():
+    poses = random_poses(np.random.default_rng(0), 8)
+    found = mean_similarity(poses, poses)
+    np.testing.assert_array_equal(without_mean(poses, poses), poses)
+    assert (found.scale, found.rotation.tolist()) == (1.0, np.eye(3).tolist())
+
+
 def test_whitened_steps_move_what_is_seen_alike():
     """The closed form for independent parameters: one over their sizes, less the damping."""
     sizes = np.array([1e-3, 1.0, 50.0])
@@ -316,6 +323,105 @@ def test_what_hardly_moved_is_held_and_what_moved_far_is_not():
     found = steps.change(torch.zeros_like(so_far), so_far, damping=0.0, holding=1.0)
     assert (found[:, :3] / so_far[:, :3] < -0.8).all()
     assert (found[:, 3:] / so_far[:, 3:]).abs().max() < 0.05
+
+
+@pytest.mark.parametrize(("damping", "holding", "scale"), [(1.0, 0.0, 1.0), (0.1, 0.05, 0.3), (0.3, 1e-3, 1e-3)])
+def test_a_step_is_the_one_that_the_formula_says(damping, holding, scale):
+    """(H + damping diag(H) + L)^-1 (slope + L so_far) in NumPy, for moves and turns of every size."""
+    steps, _, slope = newton(np.random.default_rng(0), np.array([1, 1e-1, 1e-2, 1, 10, 100]))
+    so_far = torch.from_numpy(np.random.default_rng(1).normal(scale=scale, size=(3, 6)))
+    found = steps.change(slope, so_far, damping=damping, holding=holding)
+    curvature = (steps.curvature / steps.weight).numpy()
+    diagonal = np.diagonal(curvature, axis1=1, axis2=2)
+    squares = 1e3 * so_far.numpy() ** 2  # pixels
+    spread = np.array([squares[:, :3].sum(1).mean()] * 3 + [squares[:, 3:].sum(1).mean()] * 3)
+    held = holding * diagonal.mean(0) / np.maximum(spread, 0.05) ** 2
+    for photo in range(3):
+        matrix = curvature[photo] + np.diag(damping * diagonal[photo] + held)
+        wanted = -np.linalg.solve(matrix, slope[photo].numpy() + held * so_far[photo].numpy())
+        np.testing.assert_allclose(found[photo].numpy(), wanted, rtol=1e-6, atol=1e-12)
+
+
+# One ray without a slope or a loss, of the first photo.
+NO_RAYS = (
+    torch.zeros(1, 6, dtype=torch.float64),
+    torch.zeros(1, dtype=torch.float64),
+    torch.zeros(1, dtype=torch.long),
+)
+
+
+def steps_of(monkeypatch: pytest.MonkeyPatch, twist: float) -> list[dict[str, float]]:
+    """What steps are asked for with: each of them wants all poses to go by a twist."""
+    asked: list[dict[str, float]] = []
+
+    def change(self: NewtonSteps, slope: torch.Tensor, so_far: torch.Tensor, **settings: float) -> torch.Tensor:
+        asked.append(settings)
+        return torch.tensor([[twist, 0, 0, 0, -twist, 0], [0, twist, 0, 0, 0, twist]], dtype=torch.float64).repeat(2, 1)
+
+    monkeypatch.setattr(NewtonSteps, "change", change)
+    return asked
+
+
+def test_poses_are_damped_less_and_less_and_held_once_it_is_known_what_was_wrong(monkeypatch):
+    asked = steps_of(monkeypatch, 1e-9)
+    refinement = PoseRefinement(random_poses(np.random.default_rng(0), 4), [Camera.pinhole(40, 30, 40.0)] * 4)
+    shares = (0.11, 0.2, 0.21, 0.35, 0.5, 0.8, 0.97)
+    for share in shares:
+        refinement.step(*NO_RAYS, share, rate=1.0)
+    damping, holding = ([one[name] for one in asked] for name in ("damping", "holding"))
+    assert damping[:2] == pytest.approx([1.0, 1.0])
+    assert damping[-2:] == pytest.approx([0.1, 0.1])
+    assert damping == sorted(damping, reverse=True)
+    assert holding[:2] == [0.0, 0.0]
+    assert holding[3:] == pytest.approx([np.sqrt(1e-3 * 0.05), 0.05, 0.05, 0.05])
+    assert holding[2] == pytest.approx(1e-3, rel=0.2)
+
+
+def test_poses_go_by_the_rate_of_the_whole_way(monkeypatch):
+    """To first order a tenth of the rate is a tenth of the way."""
+    steps_of(monkeypatch, 1e-7)
+    ways = []
+    for rate in (1.0, 0.1):
+        refinement = PoseRefinement(random_poses(np.random.default_rng(0), 4), [Camera.pinhole(40, 30, 40.0)] * 4)
+        refinement.step(*NO_RAYS, 0.5, rate=rate)
+        ways.append(refinement.motions.numpy() - np.eye(4))
+    assert np.abs(ways[0]).max() > 1e-8
+    np.testing.assert_allclose(ways[1], 0.1 * ways[0], atol=1e-13)
+
+
+def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
+    """Poses: the gradient of every ray's own loss, not of their mean. Lenses: the turns of the poses as they are now,
+    and their own rate."""
+    pool = pool_of(small)
+    refinement = Refinement("all", pool)
+    assert refinement.poses is not None
+    lenses = refinement.lenses
+    assert lenses is not None
+    turns = np.stack([transform_from_twist(np.array([0, 0, 0, 0.1 * i, 0, 0])) for i in range(1, 4)])
+    refinement.poses.motions.copy_(torch.from_numpy(turns))
+    given: dict[str, torch.Tensor | float] = {}
+
+    def lens_gradient(numbers: torch.Tensor, photos: torch.Tensor, **rays: torch.Tensor) -> torch.Tensor:
+        given["turns"] = rays["turns"]
+        return torch.ones_like(lenses.values)
+
+    monkeypatch.setattr(lenses, "gradient", lens_gradient)
+    monkeypatch.setattr(lenses, "step", lambda gradient, rate: given.update(lens_rate=rate))
+    monkeypatch.setattr(refinement.poses, "gradients", lambda *rays, **slopes: slopes["by_origin"].repeat(1, 2))
+    monkeypatch.setattr(
+        refinement.poses, "step", lambda slopes, losses, photos, share, *, rate: given.update(slopes=slopes, rate=rate)
+    )
+    numbers = torch.arange(50)
+    drawn = refinement.refined(pool.rays_of(numbers))
+    drawn = drawn._replace(origins=drawn.origins.requires_grad_(), directions=drawn.directions.requires_grad_())
+    losses = (drawn.origins + drawn.directions).square().sum(-1)
+    losses.mean().backward()
+    refinement.step(drawn, losses.detach(), 0.3, factor=0.5)
+    rays_now = refinement.poses.poses()[:, :3, :3]
+    np.testing.assert_allclose(given["turns"], rays_now)
+    assert (given["rate"], given["lens_rate"]) == (0.5, pytest.approx(0.5 * LENS_RATE))
+    own = 2.0 * (drawn.origins + drawn.directions).detach().double()
+    torch.testing.assert_close(given["slopes"], own.repeat(1, 2), rtol=1e-5, atol=1e-6)
 
 
 def test_rates_rise_from_nothing_and_end_at_nothing():

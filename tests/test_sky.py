@@ -74,6 +74,13 @@ def test_a_sky_of_one_colour_is_told_by_directions_too(level):
     assert min(explained_by_direction(*seen)) > 30.0
 
 
+def test_directions_that_nobody_has_told_have_the_one_colour():
+    """Photos that look left tell, those that look right are explained."""
+    directions, colours, photos = seen_by_photos(lambda places, directions: torch.full((len(places), 3), 0.9))
+    directions[:, 0] = directions[:, 0].abs() * (1 - 2 * (photos % 2))
+    assert min(explained_by_direction(directions, colours, photos)) > 25.0
+
+
 def test_too_few_pixels_tell_nothing():
     directions, colours, photos = seen_by_photos(stripes)
     few = torch.cat([torch.nonzero(photos % 2 == 0)[:, 0], torch.nonzero(photos % 2 == 1)[:11, 0]])

@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,6 +88,19 @@ def test_a_start_that_cannot_come_to_the_fewest_steps_ends_at_once(trials, monke
     assert gone[-1] == 10
     assert trials.begin(Components(), steps=1000, seconds=100.0, fewest=240) is None
     assert gone[-1] > 60  # there was hope
+
+
+def test_a_trial_has_its_cameras_learn_from_the_fork_on(trials, start, monkeypatch):
+    begun: list[float] = []
+    make = Trials._fitting
+
+    def fitting(self: Trials, components: Components, *, cameras_from: float, **others: Any) -> Fitting:
+        begun.append(cameras_from)
+        return make(self, components, cameras_from=cameras_from, **others)
+
+    monkeypatch.setattr(Trials, "_fitting", fitting)
+    trials.go_on(start, Components(view=0), seed=0, steps=0)
+    assert begun == [0.02]  # what the start has forked at
 
 
 def test_cameras_learn_from_the_fork_on(trials, start):
