@@ -42,7 +42,7 @@ LEAST_SKY_DB, LEAST_SKY_PSNR = 1.0, 22.0
 # Cameras whose photos agree to this are as good as the features: structure from motion leaves 0.1 to 0.4.
 LEAST_MISS_PX = 0.6
 # Poses with which they miss by this, whatever the lenses, are wrong; in between, a trial decides. Turned by half a
-# degree, photos of the desk miss by 1.6 to 2.3, at 400 pixels of width.
+# degree, photos of the desk miss by 1.5 to 2.3, at 400 pixels of width.
 SURELY_MISSED_PX = 1.2
 # The focal length that matches tell is taken if it is so many standard errors and so far away from the given one, and
 # makes the misses so much smaller.
