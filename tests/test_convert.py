@@ -122,6 +122,18 @@ CAMERAS = {
 }
 
 
+@pytest.mark.parametrize("program", ["nerfstudio", "instant-ngp"])
+def test_programs_that_read_transforms_name_it(program, tmp_path):
+    source = npz_of(tmp_path, capture_of([PINHOLE]))
+    named = nerfcli("convert", source, tmp_path / "program.json", "--to", program, "--json")
+    assert named.exit_code == 0, named.stderr
+    assert json.loads(named.stdout)["to"] == "transforms"
+    nerfcli("convert", source, tmp_path / "form.json", "--to", "transforms")
+    cameras = [json.loads((tmp_path / name).read_text())["frames"] for name in ("program.json", "form.json")]
+    assert cameras[0] == cameras[1]
+    assert cameras[0]
+
+
 @pytest.mark.parametrize("form", [name for name in FORMATS_WRITTEN if name != "ply"])
 def test_colmap_to_a_format_and_back_moves_no_pixel(form, tmp_path):
     capture = capture_of(CAMERAS.get(form, EVERYTHING))

@@ -10,7 +10,6 @@ from nerfcli.interrupts import hear_signals
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,  # plain text: half the start-up time, and readable in a pipe
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
@@ -57,4 +56,4 @@ def main() -> None:
     # libgomp reads it when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     hear_signals()
-    app()
+    app(prog_name="nerfcli")  # and not "python -m nerfcli", which no shell could complete

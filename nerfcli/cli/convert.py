@@ -27,6 +27,8 @@ FORMATS_WRITTEN = (
     "npz",
     "ply",
 )
+# Programs whose name people type for the format that they read.
+PROGRAMS = {"nerfstudio": "transforms", "instant-ngp": "transforms"}
 # Names of files that say nothing of the capture.
 COMMON_STEMS = ("transforms", "reconstruction", "bundle", "poses_bounds", "scene", "cameras", "images")
 # Hypotheses of a question in the table of --detect.
@@ -41,7 +43,9 @@ def convert(
     target: Annotated[
         Path | None, typer.Argument(metavar="OUT", help="File or folder to write; with -, the folder of the results.")
     ] = None,
-    to: Annotated[str | None, typer.Option(help=", ".join(FORMATS_WRITTEN))] = None,
+    to: Annotated[
+        str | None, typer.Option(help=f"{', '.join(FORMATS_WRITTEN)}; {' or '.join(PROGRAMS)} for transforms.")
+    ] = None,
     detect: Annotated[bool, typer.Option("--detect", help="Write nothing; tell which convention IN follows.")] = False,
     axes: Annotated[str | None, typer.Option(help=f"Camera axes of the poses in OUT: {_AXES}.")] = None,
     pixel_center: Annotated[
@@ -108,8 +112,8 @@ def convert(
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
                       reality-capture, bundler, tum, kitti, npz, camera-path (of nerfstudio's viewer), run (what
                       nerfcli train wrote, with refined cameras); recognised by their files
-    Formats written:  nerfcli (a scene folder as poses writes it), colmap, colmap-text, transforms, blender, llff,
-                      opensfm, tum, kitti, npz (all of it), ply (points)
+    Formats written:  nerfcli (a scene folder as poses writes it), colmap, colmap-text, transforms (nerfstudio,
+                      instant-ngp), blender, llff, opensfm, tum, kitti, npz (all of it), ply (points)
 
     \b
     Inside, camera axes are OpenCV's (x right, y down, z forward) and the first pixel's centre is (0.5, 0.5).
@@ -145,6 +149,7 @@ def convert(
         def work(path: Path, one_of_many: bool) -> None:
             detect_one(path, images=images, intrinsics=intrinsics, doubt=doubt, console=console)
     else:
+        to = PROGRAMS.get(to or "", to)
         if to is None or to not in FORMATS_WRITTEN:
             raise typer.BadParameter(f"{to!r}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         if target is None:

@@ -1,0 +1,91 @@
+"""What an installed nerfcli is besides its commands: its licence, completion in the shell, the order of imports."""
+
+import ast
+import hashlib
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import nerfcli
+
+ROOT = Path(nerfcli.__file__).parent
+PROJECT = ROOT.parent
+
+
+def in_python(code: str) -> subprocess.CompletedProcess[str]:
+    """What a Python of its own says to some code."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+
+
+# zlib before pycolmap
+
+
+def test_compression_works_after_pycolmap():
+    # Without nerfcli's import of zlib this ends by SIGABRT (free(): invalid pointer), with pycolmap 4.2.1.
+    result = in_python(
+        "import nerfcli, pycolmap, zlib; "
+        "text = bytes(range(256)) * 400; assert zlib.decompress(zlib.compress(text)) == text; print('the same')"
+    )
+    assert (result.returncode, result.stdout) == (0, "the same\n"), result.stderr[:200]
+
+
+def test_zlib_comes_first_for_every_module_that_imports_pycolmap():
+    """A package's __init__ runs before any of its modules: no other place can come before the import in there."""
+    first = next(node for node in ast.parse((ROOT / "__init__.py").read_text("utf-8")).body[1:])
+    assert isinstance(first, ast.Import)
+    assert [alias.name for alias in first.names] == ["zlib"]
+    users = [path for path in ROOT.rglob("*.py") if "import pycolmap" in path.read_text("utf-8")]
+    assert len(users) > 10
+    for path in users:  # parts of the package: none of them is a program that could be started without it
+        assert all((folder / "__init__.py").exists() for folder in path.parents if folder.is_relative_to(ROOT))
+
+
+# Licence
+
+
+def test_the_licence_is_apache_2_and_the_metadata_says_so():
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert (project["license"], project["license-files"]) == ("Apache-2.0", ["LICENSE"])
+    words = " ".join((PROJECT / "LICENSE").read_text("utf-8").split())
+    # Of https://www.apache.org/licenses/LICENSE-2.0.txt, whatever its spaces.
+    assert (
+        hashlib.sha256(words.encode()).hexdigest() == "0ffddef9e48f8a09aed5caf2d44f7ba1c1be2d9b8e0a6f693b1635b2d5566645"
+    )
+
+
+# Completion
+
+
+def completed(words: str, *, shell: str = "bash") -> list[str]:
+    """What the shell offers at the end of a line."""
+    environment = {**os.environ, "_NERFCLI_COMPLETE": f"complete_{shell}", "COMP_WORDS": words}
+    environment |= {"COMP_CWORD": str(len(words.split(" ")) - 1), "_TYPER_COMPLETE_ARGS": words}
+    command = [sys.executable, "-m", "nerfcli"]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+
+
+def test_the_shell_completes_commands_and_options():
+    assert completed("nerfcli ev") == ["evaluate"]
+    assert completed("nerfcli train --field") == ["--field", "--field-memory"]
+
+
+@pytest.mark.parametrize("option", ["--show-completion", "--install-completion"])
+def test_completion_is_shown_and_installed_for_the_shell_that_asks(option, tmp_path):
+    # A shell that has more to do than this command is its parent process, by which it is recognised.
+    line = f"{sys.executable} -m nerfcli {option}; exit $?"
+    result = subprocess.run(
+        ["bash", "-c", line], env={**os.environ, "HOME": str(tmp_path)}, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    if option == "--show-completion":
+        script = result.stdout
+        assert not list(tmp_path.iterdir())
+    else:
+        script = (tmp_path / ".bash_completions" / "nerfcli.sh").read_text()
+        assert "nerfcli.sh" in (tmp_path / ".bashrc").read_text()
+    assert "_NERFCLI_COMPLETE=complete_bash" in script
+    assert script.rstrip().splitlines()[-1].endswith(" nerfcli")  # complete ... nerfcli
