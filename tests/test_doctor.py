@@ -156,6 +156,23 @@ def test_mixed_lenses_and_zooms_are_told_but_not_a_phone_on_its_side(clean):
         assert (found.verdict, found.names) == (LOOK, ("00.jpg",)), odd
 
 
+def test_exif_of_another_picture_is_named(clean):
+    """Recorded as 4032x3024, and stored in another shape; a photo that was only made smaller is none."""
+    exif = replace(clean.facts[0].exif, make="Maker", model="One", focal_mm=4.0, focal_35mm=28.0)
+    resized = replace(exif, taken_px=(4032, 3024))
+    cropped = replace(exif, taken_px=(4032, 2268))
+
+    def focal_length(*exifs: Exif) -> Finding:
+        return inventory.focal_length([replace(f, exif=e) for f, e in zip(clean.facts, exifs, strict=False)])
+
+    assert focal_length(exif, resized).verdict == GOOD
+    assert focal_length(exif, resized).summary == "0.81 times the longer side by EXIF (2 photos)"
+    found = focal_length(resized, cropped)
+    assert (found.verdict, found.names) == (LOOK, ("01.jpg",))
+    assert "EXIF is of 4032x2268 pixels" in found.summary
+    assert "give intrinsics" in found.advice
+
+
 # Whole captures
 
 

@@ -5,7 +5,7 @@ everything is real.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,9 @@ from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
 from nerfcli.poses import merging
 from nerfcli.poses.acceptance import judge, leave_out_contradicting
+from nerfcli.poses.database import register_photos
 from nerfcli.poses.examine import Examined, examine
+from nerfcli.poses.features import match
 from nerfcli.poses.job import Job
 from nerfcli.poses.ladder import Climb, climb
 from nerfcli.poses.lens_family import as_fisheye
@@ -235,6 +237,26 @@ def test_a_fisheye_of_which_nothing_is_known_is_recognised(tmp_path: Path):
     (camera,) = climbed.models[0].cameras.values()
     assert camera.is_perspective_fisheye()
     assert camera.mean_focal_length() == pytest.approx(UNKNOWN_FISHEYE.params[0], rel=0.02)
+
+
+def test_a_focal_length_that_exif_tells_wrong_is_left_out(tmp_path: Path):
+    """Six times too long, as a stale resolution of the sensor makes it: without it all photos are placed, and right."""
+    views = synthetic.ring(8, [WIDE], seed=0, turn_deg=120)
+    synthetic.write_database(tmp_path / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
+    job = synthetic.synthetic_job(tmp_path, views, seed=0)
+    groups = tuple(replace(group, focal_px=6 * WIDE.params[0], focal_is_prior=True) for group in job.groups)
+    told: list[str] = []
+    job = replace(job, groups=groups)
+    register_photos(job)
+    match(job, job.pairs, lambda *told: None)
+    climbed = climb(job, lambda *told: None, told.append)
+    assert [rung["what"] for rung in climbed.rungs] == ["default thresholds", "without the focal length of EXIF"]
+    assert climbed.rungs[0]["models"] == [] or max(climbed.rungs[0]["models"]) < 4
+    assert "next: without the focal length of EXIF" in told
+    assert climbed.models[0].num_reg_images() == 8
+    (camera,) = climbed.models[0].cameras.values()
+    assert camera.mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.02)
+    assert not camera.has_prior_focal_length
 
 
 def test_pairs_of_perspective_photos_ask_for_no_fisheye(solved: Solved):

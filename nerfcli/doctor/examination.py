@@ -136,6 +136,7 @@ def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unr
         inventory.enough(len(photos)),
         inventory.size(photos),
         inventory.cameras(photos),
+        inventory.focal_length(photos),
         inventory.orientation(photos),
         inventory.duplicates(photos, pairs),
         quality.sharpness(photos, lack),
@@ -173,7 +174,7 @@ def _focals(subject: Subject, photos: Sequence[PhotoFacts]) -> list[float]:
     for photo in photos:
         camera = cameras.get(photo.name)
         if camera is None:
-            focals.append(focal_px(photo.features, photo.exif.focal_35mm))
+            focals.append(focal_px(photo.features, photo.exif))
         else:
             focals.append(camera.focal_px * max(photo.features.size) / max(camera.width, camera.height))
     return focals

@@ -4,9 +4,12 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below
 from nerfcli.doctor.matching import Pair
 from nerfcli.doctor.photos import PhotoFacts
+from nerfcli.media.focal_evidence import focal_evidence
 
 FEWEST_PHOTOS = 4
 ENOUGH_PHOTOS = 20
@@ -91,6 +94,35 @@ def cameras(photos: Sequence[PhotoFacts]) -> Finding:
         "kinds: look from 2, bad from one in four photos",
         "" if verdict == GOOD else "keep one lens and one zoom, without crops; each kind is calibrated by itself",
         tuple(others),
+    )
+
+
+def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
+    """Whether the focal length that EXIF tells is that of the files, or of photos before they were cropped."""
+    found = [(photo, focal_evidence(photo.exif)) for photo in photos]
+    doubtful = [(photo.name, evidence.doubt) for photo, evidence in found if evidence.doubt]
+    shares = [
+        evidence.focal_px / evidence.whole_px[0]
+        for _, evidence in found
+        if evidence.focal_px is not None and evidence.holds
+    ]
+    if doubtful:
+        summary = f"EXIF does not fit {several(len(doubtful), 'file')}: {doubtful[0][1]}"
+    elif shares:
+        summary = f"{np.median(shares):.2f} times the longer side by EXIF ({several(len(shares), 'photo')})"
+    else:
+        summary = "EXIF does not tell it; structure from motion estimates it"
+    return Finding(
+        "focal length",
+        LOOK if doubtful else GOOD,
+        summary,
+        len(doubtful),
+        "look from 1 photo whose EXIF is of a picture with another shape",
+        "use the photos as the camera took them, or give intrinsics: EXIF's focal length is not used, and "
+        "the principal point may be anywhere in a crop"
+        if doubtful
+        else "",
+        tuple(doubtful),
     )
 
 

@@ -11,6 +11,8 @@ import numpy as np
 from nerfcli.doctor import two_views
 from nerfcli.doctor.moving import Patch, moving_patches
 from nerfcli.doctor.photos import Features, PhotoFacts
+from nerfcli.media.focal_evidence import focal_evidence
+from nerfcli.media.images import Exif
 
 # Of each photo so many features are compared at first; all of them where these link it to nothing.
 QUICK_FEATURES = 1000
@@ -123,10 +125,11 @@ def mutual_matches(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.n
     return rows[kept], nearest[kept]
 
 
-def focal_px(features: Features, focal_35mm: float | None) -> float:
+def focal_px(features: Features, exif: Exif) -> float:
     """The focal length at the features' size: as EXIF tells it, else as most phones and cameras have it."""
     longer = max(features.size)
-    return longer * (focal_35mm / 36 if focal_35mm else 1.0)
+    known_px = focal_evidence(exif).focal_px
+    return longer * (1.0 if known_px is None else known_px / max(exif.width, exif.height))
 
 
 def _median(values: np.ndarray) -> float:

@@ -43,6 +43,8 @@ _DAMAGED = (
     *(OSError, EOFError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError),
     *(struct.error, zlib.error, Image.DecompressionBombError),
 )
+# Of EXIF's FocalPlaneResolutionUnit; 4 and 5 are no standard, but some cameras write them.
+_RESOLUTION_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FORMATS = "JPEG, PNG, TIFF, WebP or BMP"
 _SRGB = ImageCms.createProfile("sRGB")
 # Two colour spaces that agree within this many of 255 levels on a grid of colours are the same one.
@@ -56,7 +58,8 @@ class Exif:
     focal_35mm is the equivalent focal length on 36 x 24 mm film. orientation is 1...8, 1 where absent.
     width and height are those of the upright picture. gps is (latitude_deg, longitude_deg, altitude in metres
     or None), north and east positive. taken is when, in seconds of the camera's own clock, comparable between photos of
-    one camera.
+    one camera. taken_px is the (width, height) that EXIF records for the picture, as the camera stored it;
+    sensor_px_per_mm how many of its pixels there are on a millimetre of the sensor.
     """
 
     make: str | None
@@ -72,6 +75,8 @@ class Exif:
     gps: tuple[float, float, float | None] | None
     taken: float | None = None
     f_number: float | None = None
+    taken_px: tuple[int, int] | None = None
+    sensor_px_per_mm: float | None = None
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -199,6 +204,8 @@ def read_exif(path: Path) -> Exif:
         gps=_position(gps),
         taken=_clock(camera.get(ExifTags.Base.DateTimeOriginal), camera.get(ExifTags.Base.SubsecTimeOriginal)),
         f_number=_positive(camera.get(ExifTags.Base.FNumber)),
+        taken_px=_recorded_size(camera),
+        sensor_px_per_mm=_sensor_resolution(camera),
     )
 
 
@@ -336,6 +343,20 @@ def _number(value: Any) -> float | None:
 def _positive(value: Any) -> float | None:
     number = _number(value)
     return number if number is not None and number > 0 else None
+
+
+def _recorded_size(camera: dict[int, Any]) -> tuple[int, int] | None:
+    width = _positive(camera.get(ExifTags.Base.ExifImageWidth))
+    height = _positive(camera.get(ExifTags.Base.ExifImageHeight))
+    if width is None or height is None or min(width, height) < 1:
+        return None
+    return int(width), int(height)
+
+
+def _sensor_resolution(camera: dict[int, Any]) -> float | None:
+    resolution = _positive(camera.get(ExifTags.Base.FocalPlaneXResolution))
+    unit_mm = _RESOLUTION_UNITS_MM.get(camera.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    return resolution / unit_mm if resolution and unit_mm else None
 
 
 def _clock(value: Any, fraction: Any) -> float | None:

@@ -7,6 +7,7 @@ from typing import Any
 from nerfcli.cameras.calibration import Calibrated, Calibration, Picture, calibrated
 from nerfcli.cameras.orientation import counted, rescaling, rescaling_told
 from nerfcli.errors import UserError
+from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import Exif
 from nerfcli.poses.intrinsics import START_FISHEYE, START_MODEL
 from nerfcli.poses.job import CameraGroup
@@ -38,11 +39,18 @@ class Grouped:
 
 
 def group_photos(photos: Photos, *, model: str) -> Grouped:
-    """Groups by EXIF and upright size; model: COLMAP's name, or "auto" for the one that EXIF suggests to start from."""
+    """Groups by EXIF and upright size; model: COLMAP's name, or "auto" for the one that EXIF suggests to start from.
+
+    Where EXIF is of another picture than the file, its focal length is where the adjustment starts, but no prior.
+    """
     numbers = {name: number for number, name in enumerate(photos.names)}
-    groups = []
+    groups, notes = [], []
     for names in camera_groups(photos.photos):
         first = photos.photos[numbers[names[0]]]
+        evidence = focal_evidence(first.exif)
+        if evidence.doubt and (first.exif.focal_mm or first.exif.focal_35mm):
+            which = f"{first.name} and {len(names) - 1} more photos" if len(names) > 1 else first.name
+            notes.append(f"no focal length is taken from EXIF for {which}: {evidence.doubt}")
         groups.append(
             CameraGroup(
                 photos=tuple(numbers[name] for name in names),
@@ -50,12 +58,14 @@ def group_photos(photos: Photos, *, model: str) -> Grouped:
                 width=first.width,
                 height=first.height,
                 choose=model == "auto",
+                focal_px=evidence.focal_px,
+                focal_is_prior=evidence.focal_px is not None and evidence.holds,
             )
         )
     if len(groups) == 1:
-        return Grouped(tuple(groups), ())
+        return Grouped(tuple(groups), tuple(notes))
     described = ", ".join(f"{len(g.photos)} photos {g.width}x{g.height} {g.model}" for g in groups)
-    return Grouped(tuple(groups), (f"{len(groups)} cameras, by EXIF and size: {described}",))
+    return Grouped(tuple(groups), (f"{len(groups)} cameras, by EXIF and size: {described}", *notes))
 
 
 def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:

@@ -29,7 +29,7 @@ def register_photos(job: Job) -> None:
     not have.
     """
     job.database.parent.mkdir(parents=True, exist_ok=True)
-    cameras = {number: camera_of_group(group, job) for number, group in enumerate(job.groups, start=1)}
+    cameras = {number: camera_of_group(group) for number, group in enumerate(job.groups, start=1)}
     camera_ids = {photo: number for number, group in enumerate(job.groups, start=1) for photo in group.photos}
     wanted = {
         image_id: (file, camera_ids[number], _described(cameras[camera_ids[number]]))
@@ -67,26 +67,16 @@ def register_photos(job: Job) -> None:
             database.write_frame(frame, use_frame_id=True)
 
 
-def camera_of_group(group: CameraGroup, job: Job) -> pycolmap.Camera:
-    """Camera model of a group, and its intrinsics if they are given, or the focal length if EXIF tells it.
-
-    EXIF is read from the original: an upright copy has none. Lying or upright, the focal length in pixels is the same.
-    """
+def camera_of_group(group: CameraGroup) -> pycolmap.Camera:
+    """Camera model of a group, and its intrinsics if they are given, or the focal length if EXIF tells it."""
     if group.params is not None:
         camera = pycolmap.Camera.create_from_model_name(1, group.model, 1.0, group.width, group.height)
         camera.params = list(group.params)
         camera.has_prior_focal_length = True
         return camera
-    focal_px = 1.2 * max(group.width, group.height)
-    known = False
-    try:
-        inferred = pycolmap.infer_camera_from_image(str(Path(job.originals) / job.names[group.photos[0]]))
-        if inferred.has_prior_focal_length:
-            focal_px, known = inferred.focal_length, True
-    except (RuntimeError, ValueError):  # a file format that only our own reader knows
-        pass
+    focal_px = 1.2 * max(group.width, group.height) if group.focal_px is None else group.focal_px
     camera = pycolmap.Camera.create_from_model_name(1, group.model, focal_px, group.width, group.height)
-    camera.has_prior_focal_length = known
+    camera.has_prior_focal_length = group.focal_is_prior
     return camera
 
 

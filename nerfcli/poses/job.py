@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,8 @@ class CameraGroup:
     """Photos (by number) that share one camera: its COLMAP model and the upright size.
 
     choose: whether the model is only where to start, and a better one may be chosen. params: what is known of the
-    intrinsics, in COLMAP's order. fixed: whether they stay as they are.
+    intrinsics, in COLMAP's order. fixed: whether they stay as they are. focal_px is where the focal length starts by
+    EXIF, None if EXIF does not say; focal_is_prior: whether it may be relied on.
     """
 
     photos: tuple[int, ...]
@@ -27,6 +28,12 @@ class CameraGroup:
     choose: bool = False
     params: tuple[float, ...] | None = None
     fixed: bool = False
+    focal_px: float | None = None
+    focal_is_prior: bool = False
+
+    def without_exif(self) -> "CameraGroup":
+        """The same group as if EXIF said nothing of its focal length."""
+        return replace(self, focal_px=None, focal_is_prior=False)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,8 @@ from nerfcli.poses.view_graph import parts
 _GOOD_SHARE = 0.9
 # Below this, it is worth several times the work that was done so far.
 _FEW_SHARE = 0.75
+# Below this, what is believed of the lens beforehand is doubted.
+_LITTLE_SHARE = 0.5
 # Beyond this, comparing every pair, or searching full-size photos, takes longer than taking better photos.
 _MOST_PAIRS = 12_000
 _MOST_FULL_SIZE = 150
@@ -155,7 +157,8 @@ class _Ladder:
 def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Climb:
     """Map a job's photos, with as many attempts as it takes.
 
-    The first attempt has pycolmap's own thresholds. If its lens came out wide or it leaves out many photos, the next
+    The first attempt has pycolmap's own thresholds. If it places less than half of the photos with a focal length from
+    EXIF, the next one starts without it. If its lens came out wide or it leaves out many photos, the next
     one starts from a fisheye, where pairs of photos say that it was one. If photos that match some other one well are
     still left out, the next ones start from a pair with a smaller baseline, from the strongest pair that was left out,
     and with low angles. Then all pairs are compared that were not, and more features are sought in the photos' full
@@ -165,6 +168,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Climb:
     ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, Start())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
+    job = _without_exif(ladder, job, report, share=ladder.share(featured))
     job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
     _other_starts(ladder, job)
     compared = set(job.pairs)
@@ -206,6 +210,23 @@ def _other_starts(ladder: _Ladder, job: Job) -> None:
         if ladder.share(candidates) >= _GOOD_SHARE:
             return
         step()
+
+
+def _without_exif(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:
+    """Start without EXIF's focal lengths, if little is placed with them; the job of the better result."""
+    bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
+    if share >= _LITTLE_SHARE or bare.groups == job.groups:
+        return job
+    what = "without the focal length of EXIF"
+    ladder.announce(what)
+    register_photos(bare)  # which takes out what was verified with the other focal length
+    match(bare, bare.pairs, report)
+    ladder.attempt(what, bare, Start())
+    if ladder.best.job is bare:
+        return bare
+    register_photos(job)
+    match(job, job.pairs, report)
+    return job
 
 
 def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:

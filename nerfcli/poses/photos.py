@@ -1,11 +1,13 @@
 """The photos of a folder: which can be read, how large they are upright, and which share a camera."""
 
+import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import IMAGE_SUFFIXES, Exif, list_images, read_exif, read_image
 
 # Three views fix a scene up to scale, but nothing then checks any of them; four are the least that do.
@@ -13,6 +15,7 @@ MIN_PHOTOS = 4
 
 # Decoded photos are large; more readers than this only hold more of them in memory at once.
 _READERS = 4
+_SAME_FOCAL = 0.02
 
 
 @dataclass(frozen=True)
@@ -72,17 +75,32 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
 
 
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
-    """Names of photos that may share intrinsics: same make, model, lens, focal length and upright size.
+    """Names of photos that may share intrinsics: same make, model, lens, focal length, upright size and crop.
 
-    Photos without EXIF are told apart by their size alone. Groups and the names in them are in the order of `photos`.
+    Focal lengths within 2 % are the same one: autofocus moves them a little. Photos without EXIF are told apart by
+    their size alone. Groups and the names in them are in the order of `photos`.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
+    focals: list[float] = []
     for photo in photos:
         exif = photo.exif
+        evidence = focal_evidence(exif)
+        crop = evidence.whole_px if evidence.doubt else None
         # The 35 mm equivalent also tells digital zoom, which leaves the focal length in millimetres as it is.
-        optics = (exif.make, exif.model, exif.lens, exif.focal_mm, exif.focal_35mm)
-        groups.setdefault((*optics, photo.width, photo.height), []).append(photo.name)
+        optics = (exif.make, exif.model, exif.lens, _same_as(exif.focal_mm, focals), _same_as(exif.focal_35mm, focals))
+        groups.setdefault((*optics, crop, photo.width, photo.height), []).append(photo.name)
     return tuple(tuple(names) for names in groups.values())
+
+
+def _same_as(focal: float | None, focals: list[float]) -> float | None:
+    """The first of the focal lengths so far that is the same as this one; if there is none, this one joins them."""
+    if focal is None:
+        return None
+    for earlier in focals:
+        if abs(math.log(focal / earlier)) < _SAME_FOCAL:
+            return earlier
+    focals.append(focal)
+    return focal
 
 
 def _examine(path: Path) -> Photo | str:

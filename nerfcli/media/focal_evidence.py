@@ -1,0 +1,100 @@
+"""What EXIF says of a photo's focal length in pixels, and whether that still holds for the file.
+
+EXIF describes the picture as the camera took it. A program that crops or resizes the photo usually copies EXIF, so the
+size that it records is compared with the file's. Resizing keeps the focal length relative to the picture; cropping
+makes it longer by an unknown factor, unless one side shows that the crop was not resized.
+"""
+
+import math
+from dataclasses import dataclass
+
+from nerfcli.media.images import Exif
+
+# Diagonal of 36 x 24 mm film. CIPA DCG-001 defines the 35 mm equivalent by the diagonal; for a picture of 3:2 that is
+# the same as by the width.
+_FILM_DIAGONAL_MM = 43.27
+# Sides that agree within this are the same after rounding; JPEGs are also trimmed to whole blocks of 8 pixels.
+_SAME_SIDE = 0.003
+_ROUNDING_PX = 1.5
+# Longer over shorter side of the pictures that cameras store; of another shape, without a recorded size, it is a crop.
+_CAMERA_SHAPES = (5 / 4, 4 / 3, 3 / 2, 16 / 9)
+_SAME_SHAPE = 0.01
+# Between a fisheye and a strong telephoto lens, relative to the picture's longer side.
+_FOCAL_RANGE = (0.25, 40.0)
+# Widths of camera sensors, from small phones to medium format.
+_SENSOR_RANGE_MM = (2.5, 60.0)
+
+
+@dataclass(frozen=True)
+class FocalEvidence:
+    """The focal length of a file by its EXIF.
+
+    Args:
+        focal_px: None if EXIF does not say. Where it does not hold, that of the largest crop that fits: at least as
+            long as the true one is for a file that was resized after cropping, and a place to start from.
+        holds: whether nothing in EXIF speaks against the focal length.
+        doubt: what does, "" if nothing.
+        whole_px: (longer, shorter) side of the picture as the camera took it, at the file's scale.
+    """
+
+    focal_px: float | None
+    holds: bool
+    doubt: str
+    whole_px: tuple[float, float]
+
+
+def focal_evidence(exif: Exif) -> FocalEvidence:
+    """The focal length of a photo by its EXIF, and whether it holds for the file as it is.
+
+    From the 35 mm equivalent, by the diagonal; without one, from the focal length and the sensor's resolution. The
+    latter counts the pixels of the recorded size, whatever size the file has now.
+    """
+    file_px = (float(max(exif.width, exif.height)), float(min(exif.width, exif.height)))
+    if exif.focal_mm is None and exif.focal_35mm is None:
+        return FocalEvidence(None, True, "", file_px)
+    whole_px, doubt = _whole(file_px, exif.taken_px)
+    focal_px = _focal_px(exif, whole_px)
+    if focal_px is None:
+        return FocalEvidence(None, not doubt, doubt, whole_px)
+    shortest, longest = (share * whole_px[0] for share in _FOCAL_RANGE)
+    if not shortest <= focal_px <= longest:
+        doubt = f"EXIF says {focal_px / whole_px[0]:.3g} times the longer side, which no lens has"
+        return FocalEvidence(None, False, doubt, whole_px)
+    return FocalEvidence(focal_px, not doubt, doubt, whole_px)
+
+
+def _whole(file_px: tuple[float, float], taken_px: tuple[int, int] | None) -> tuple[tuple[float, float], str]:
+    """(longer, shorter) side of the uncropped picture at the file's scale, and why its scale is not known, or ""."""
+    longer, shorter = file_px
+    size = f"{longer:.0f}x{shorter:.0f}"
+    if taken_px is None:
+        shape = longer / shorter
+        if any(abs(shape / usual - 1) < _SAME_SHAPE for usual in _CAMERA_SHAPES):
+            return file_px, ""
+        return file_px, f"no camera takes pictures of {size} pixels: cropped after the shot"
+    taken_longer, taken_shorter = max(taken_px), min(taken_px)
+    scales = longer / taken_longer, shorter / taken_shorter
+    if _same(shorter, taken_shorter * scales[0]) or _same(longer, taken_longer * scales[1]):
+        return file_px, ""
+    whole = (float(taken_longer), float(taken_shorter))
+    if any(_same(side, taken) for side, taken in zip(file_px, whole, strict=True)):
+        return whole, ""  # one side is as the camera took it: the other one was cut, and nothing was resized
+    scale = max(scales)
+    doubt = f"EXIF is of {taken_longer}x{taken_shorter} pixels, the file has {size}: cropped after the shot"
+    return (scale * taken_longer, scale * taken_shorter), doubt
+
+
+def _focal_px(exif: Exif, whole_px: tuple[float, float]) -> float | None:
+    if exif.focal_35mm is not None:
+        return exif.focal_35mm / _FILM_DIAGONAL_MM * math.hypot(*whole_px)
+    if exif.focal_mm is None or exif.sensor_px_per_mm is None or exif.taken_px is None:
+        return None
+    taken_longer = max(exif.taken_px)
+    sensor_mm = taken_longer / exif.sensor_px_per_mm
+    if not _SENSOR_RANGE_MM[0] <= sensor_mm <= _SENSOR_RANGE_MM[1]:
+        return None  # the resolution is that of another size than the recorded one
+    return exif.focal_mm * exif.sensor_px_per_mm * whole_px[0] / taken_longer
+
+
+def _same(side: float, other: float) -> bool:
+    return abs(side - other) <= max(_ROUNDING_PX, _SAME_SIDE * other)

@@ -1,0 +1,121 @@
+"""What EXIF says of the focal length, and whether it holds for the file: against cameras and edits that are known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from PIL import ExifTags, Image
+from test_photos import NO_EXIF, photo
+
+from nerfcli.media.focal_evidence import focal_evidence
+from nerfcli.media.images import Exif, read_exif
+from nerfcli.poses.cameras import group_photos
+from nerfcli.poses.database import camera_of_group
+from nerfcli.poses.photos import Photos, camera_groups
+
+# A full-frame camera with a lens of 50 mm, by its own numbers: 50 / 36 * 5472 = 7600 pixels.
+CAMERA = replace(
+    NO_EXIF, make="A", model="B", focal_mm=50.0, sensor_px_per_mm=152.0, width=5472, height=3648, taken_px=(5472, 3648)
+)
+PHONE = replace(NO_EXIF, make="A", model="P", focal_mm=4.0, focal_35mm=28.0, width=4032, height=3024)
+
+
+def sized(exif: Exif, width: int, height: int) -> Exif:
+    return replace(exif, width=width, height=height)
+
+
+@pytest.mark.parametrize(
+    ("exif", "focal_px"),
+    [
+        (CAMERA, 7600.0),
+        (sized(CAMERA, 3648, 5472), 7600.0),  # held upright
+        (sized(CAMERA, 1600, 1067), 7600.0 * 1600 / 5472),  # resized: the resolution counts pixels that are gone
+        (replace(CAMERA, focal_35mm=50.0), 7600.0),
+        (PHONE, 28 / 43.27 * 5040),  # by the diagonal: of 4:3, the width would give 3136 px rather than 3261
+        (replace(PHONE, taken_px=(4032, 3024)), 28 / 43.27 * 5040),
+        (replace(sized(PHONE, 1008, 756), taken_px=(4032, 3024)), 28 / 43.27 * 1260),
+        (replace(sized(PHONE, 1600, 1200), taken_px=(3024, 4032)), 28 / 43.27 * 2000),
+        # Squares as high as the photo was: cut, but not resized.
+        (sized(CAMERA, 3648, 3648), 7600.0),
+        (replace(sized(PHONE, 3024, 3024), taken_px=(4032, 3024)), 28 / 43.27 * 5040),
+        (NO_EXIF, None),
+        (replace(CAMERA, focal_mm=None), None),
+        (replace(CAMERA, taken_px=None), None),
+    ],
+)
+def test_a_focal_length_that_holds(exif: Exif, focal_px: float | None):
+    """Closed form: 36 mm or 43.27 mm of film are the width or the diagonal of the whole picture."""
+    found = focal_evidence(exif)
+    assert (found.holds, found.doubt) == (True, "")
+    assert found.focal_px == (None if focal_px is None else pytest.approx(focal_px, rel=2e-3))
+
+
+@pytest.mark.parametrize(
+    ("exif", "focal_px", "words"),
+    [
+        (sized(CAMERA, 640, 640), 7600.0 * 640 / 3648, "EXIF is of 5472x3648 pixels, the file has 640x640"),
+        (replace(sized(PHONE, 1280, 720), taken_px=(4032, 3024)), 28 / 43.27 * 1600, "cropped after the shot"),
+        (sized(PHONE, 640, 640), 28 / 43.27 * 640 * 2**0.5, "no camera takes pictures of 640x640 pixels"),
+    ],
+)
+def test_a_focal_length_of_another_picture(exif: Exif, focal_px: float, words: str):
+    """Cropped and resized: what is told is that of the largest crop, and it is doubted."""
+    found = focal_evidence(exif)
+    assert not found.holds
+    assert words in found.doubt
+    assert found.focal_px == pytest.approx(focal_px, rel=2e-3)
+
+
+@pytest.mark.parametrize("exif", [replace(CAMERA, sensor_px_per_mm=3000.0), replace(CAMERA, sensor_px_per_mm=20.0)])
+def test_a_resolution_that_no_sensor_has_tells_nothing(exif: Exif):
+    """5472 pixels on 1.8 or on 274 mm: the tag counts the pixels of another size."""
+    assert focal_evidence(exif).focal_px is None
+
+
+def test_an_absurd_focal_length_is_doubted():
+    found = focal_evidence(replace(PHONE, focal_35mm=4000.0))
+    assert (found.focal_px, found.holds) == (None, False)
+    assert "EXIF says" in found.doubt
+
+
+def test_the_recorded_size_and_resolution_are_read(tmp_path: Path):
+    exif, tags = Image.Exif(), ExifTags.Base
+    camera = exif.get_ifd(ExifTags.IFD.Exif)
+    camera[tags.ExifImageWidth], camera[tags.ExifImageHeight], camera[tags.FocalLength] = 5472, 3648, 50.0
+    camera[tags.FocalPlaneXResolution], camera[tags.FocalPlaneResolutionUnit] = 152 * 25.4, 2
+    Image.new("RGB", (60, 40)).save(tmp_path / "a.jpg", exif=exif)
+    found = read_exif(tmp_path / "a.jpg")
+    assert found.taken_px == (5472, 3648)
+    assert found.sensor_px_per_mm == pytest.approx(152.0)
+    assert focal_evidence(found).focal_px == pytest.approx(7600 * 60 / 5472, rel=1e-6)
+    camera[tags.ExifImageWidth], camera[tags.FocalPlaneResolutionUnit] = 0, 9
+    Image.new("RGB", (60, 40)).save(tmp_path / "b.jpg", exif=exif)
+    odd = read_exif(tmp_path / "b.jpg")
+    assert (odd.taken_px, odd.sensor_px_per_mm) == (None, None)
+
+
+def test_cameras_start_from_exif_only_where_it_holds():
+    whole, cropped, nothing = CAMERA, sized(CAMERA, 640, 640), sized(NO_EXIF, 640, 480)
+    photos = [
+        photo(f"{n}.jpg", exif, size=(exif.width, exif.height)) for n, exif in enumerate((whole, cropped, nothing))
+    ]
+    grouped = group_photos(Photos(Path(), tuple(photos), {}), model="auto")
+    cameras = [camera_of_group(group) for group in grouped.groups]
+    assert [camera.has_prior_focal_length for camera in cameras] == [True, False, False]
+    assert [camera.mean_focal_length() for camera in cameras] == pytest.approx([7600, 7600 * 640 / 3648, 768])
+    assert grouped.notes[1:] == (
+        "no focal length is taken from EXIF for 1.jpg: EXIF is of 5472x3648 pixels, the file has 640x640: "
+        "cropped after the shot",
+    )
+    bare = [camera_of_group(group.without_exif()) for group in grouped.groups]
+    assert [camera.mean_focal_length() for camera in bare] == pytest.approx([1.2 * 5472, 768, 768])
+    assert not any(camera.has_prior_focal_length for camera in bare)
+
+
+def test_crops_of_other_pictures_are_other_cameras_and_autofocus_is_not():
+    a, b = sized(CAMERA, 640, 640), replace(sized(CAMERA, 640, 640), taken_px=(4000, 3000))
+    photos = [
+        photo(str(n), exif, size=(640, 640))
+        for n, exif in enumerate((a, b, replace(a, focal_mm=50.6), replace(a, focal_mm=52.0)))
+    ]
+    assert camera_groups(photos) == (("0", "2"), ("1",), ("3",))
