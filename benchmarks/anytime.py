@@ -24,9 +24,9 @@ from rich.table import Table
 from nerfcli import kernels
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.field.cost import field_bytes
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.heldout import PIXELS
-from nerfcli.train.settings import TrainSettings
 
 # Where in its budget a training is looked at.
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)

@@ -32,13 +32,13 @@ from nerfcli import kernels, scene
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, inverse, rotation_from_vector, vector_from_rotation
 from nerfcli.evaluate.protocol import Extras, HeldOut, evaluate_model
+from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
+from nerfcli.runs.components import Components
+from nerfcli.runs.folder import FIELD, read_cameras
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.components import Components
 from nerfcli.train.loop import Progress, train
-from nerfcli.train.photos import load_photos
-from nerfcli.train.run_folder import FIELD, read_cameras
-from nerfcli.train.settings import TrainSettings
 
 # Scene, downscale, and what is to learn. The last four need nothing: what is lost on them is the price.
 CASES = (

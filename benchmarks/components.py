@@ -23,13 +23,13 @@ from rich.table import Table
 
 from nerfcli import kernels, scene
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.photos.held_out_exposure import log_gains_of
+from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
-from nerfcli.train.components import Components, choose
-from nerfcli.train.held_out_exposure import log_gains_of
+from nerfcli.runs.components import Components, choose
+from nerfcli.runs.folder import FIELD
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import Progress, train
-from nerfcli.train.photos import load_photos
-from nerfcli.train.run_folder import FIELD
-from nerfcli.train.settings import TrainSettings
 
 # Scene, downscale, and what is compared: the first is what it is compared with. "-name" is --without.
 CASES: tuple[tuple[str, int, tuple[str, ...]], ...] = (

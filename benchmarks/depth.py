@@ -32,7 +32,7 @@ from nerfcli.render.depth import CONVENTIONS, DepthRequest, requested
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import render_rays
-from nerfcli.train.run_folder import FIELD, read_cameras
+from nerfcli.runs.folder import FIELD, read_cameras
 
 DEPTHS = (*CONVENTIONS, "quantile:0.05", "quantile:0.95")
 SHARES = (0.5, 0.05, 0.95)

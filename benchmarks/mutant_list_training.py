@@ -91,7 +91,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/camera_moves.py",
+        "runs/camera_moves.py",
         ("tests/test_refinement.py",),
         "moves_are or cameras_of",
         (),

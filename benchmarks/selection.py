@@ -21,10 +21,10 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels, scene
-from nerfcli.train.components import differences
+from nerfcli.runs.components import differences
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.preparation import prepare
 from nerfcli.train.selection import SEARCH_SHARE
-from nerfcli.train.settings import TrainSettings
 
 # What each scene needs, beside what every model has; and what may be left out of it. Points are needed where photos
 # share any, and are told apart.

@@ -20,10 +20,11 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels, scene
+from nerfcli.photos.loading import load_photos
+from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.train.extent import choose_extent
 from nerfcli.train.fitting import Fitting
-from nerfcli.train.photos import PixelPool, load_photos
-from nerfcli.train.settings import TrainSettings, automatic_downscale
+from nerfcli.train.photos import PixelPool
 
 
 def trained(folder: Path, seconds: float, threads: int) -> Fitting:

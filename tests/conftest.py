@@ -18,10 +18,10 @@ from hypothesis import settings
 from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.render.model import Model, save_model
+from nerfcli.runs.folder import CONFIG, FIELD, append_log, describe_run, write_cameras
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import train
 from nerfcli.train.normalisation import object_frame
-from nerfcli.train.run_folder import CONFIG, FIELD, append_log, describe_run, write_cameras
-from nerfcli.train.settings import TrainSettings
 
 # Relative tolerance of a chain of some dozen operations, per dtype. A looser one in a test carries its reason.
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 5e-6}

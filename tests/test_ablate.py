@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from nerfcli.ablate.results import Measured, half_interval, rows_of
 from nerfcli.ablate.variants import CHOSEN, Capture, Variant, variants
 from nerfcli.cli import app
-from nerfcli.train.components import CHOICES, Components
+from nerfcli.runs.components import CHOICES, Components
 
 ALL = Capture(has_alpha=False, has_points=True, has_exif=True)
 

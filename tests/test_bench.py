@@ -46,10 +46,10 @@ from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.pages.page import asset
 from nerfcli.render.model import Model, load_model
+from nerfcli.runs.folder import FIELD
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.normalisation import object_frame
-from nerfcli.train.run_folder import FIELD
-from nerfcli.train.settings import TrainSettings
 
 FEW = [
     RenderSetting(2),

@@ -17,8 +17,8 @@ from nerfcli.cameras.rigid import from_parts, rotation_from_vector
 from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, ShapeEvidence, random_pixels
 from nerfcli.evaluate.metrics import psnr_of, to_8_bit
 from nerfcli.evaluate.protocol import Extras, HeldOut, evaluate_model, over_white
+from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
-from nerfcli.train.photos import load_photos
 
 CAMERA = Camera.pinhole(80, 60, 70.0)
 

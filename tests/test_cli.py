@@ -29,9 +29,9 @@ from nerfcli.cli.options import seconds_from_text, thread_count
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
+from nerfcli.runs.folder import read_log
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
-from nerfcli.train.run_folder import read_log
 
 COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench")
 WITHOUT_INPUT = ("selftest",)
@@ -377,7 +377,7 @@ def test_openmp_waits_briefly_unless_the_user_says_otherwise(given, used, monkey
     monkeypatch.setenv("GOMP_SPINCOUNT", given or "")  # remembers what stood there, whatever main sets
     if given is None:
         monkeypatch.delenv("GOMP_SPINCOUNT")
-    monkeypatch.setattr(cli, "app", lambda: None)
+    monkeypatch.setattr(cli, "app", lambda prog_name: None)
     cli.main()
     assert os.environ["GOMP_SPINCOUNT"] == used
 

@@ -11,9 +11,9 @@ from nerfcli.cli import app
 from nerfcli.errors import UserError
 from nerfcli.field.encodings import spherical_harmonics
 from nerfcli.field.hash_field import HashField, HashFieldSettings
-from nerfcli.train.components import CHOICES, Components, choose, differences
+from nerfcli.runs.components import CHOICES, Components, choose, differences
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.fitting import scale_gradients
-from nerfcli.train.settings import TrainSettings
 
 
 def test_with_and_without_set_what_they_name_and_nothing_else():

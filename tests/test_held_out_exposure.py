@@ -9,12 +9,12 @@ from PIL import Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.photos.held_out_exposure import gains_between, log_gains_of
 from nerfcli.render.model import load_model
+from nerfcli.runs.components import Components
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.components import Components
-from nerfcli.train.held_out_exposure import gains_between, log_gains_of
 from nerfcli.train.loop import train
-from nerfcli.train.settings import TrainSettings
 
 
 def drifting(places: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def test_what_exif_tells_of_a_held_out_photo_goes_before_its_neighbours(monkeypa
     """Two photos, EXIF knows one of them; without exposures in the model it is asked for none."""
     frames = [Frame(name, Camera.pinhole(4, 4, 4.0), np.eye(4)) for name in ("a", "b", "c")]
     monkeypatch.setattr(
-        "nerfcli.train.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
+        "nerfcli.photos.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
     )
     told = {"a": (9.0, 9.0, 9.0), "b": (0.1, 0.2, 0.3)}
     model = SimpleNamespace(log_exposure=1.0, exposures=told)

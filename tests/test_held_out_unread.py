@@ -18,12 +18,12 @@ from conftest import SPHERES
 from nerfcli import scene as scenes
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.media.images import write_png
+from nerfcli.runs.components import Components
+from nerfcli.runs.folder import FIELD, read_log
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import loop, preparation, selection, waypoints
-from nerfcli.train.components import Components
 from nerfcli.train.loop import train
-from nerfcli.train.run_folder import FIELD, read_log
-from nerfcli.train.settings import TrainSettings
 
 HELD_OUT = "test"  # the folder of these photos in the capture
 _listeners: list[list[str]] = []

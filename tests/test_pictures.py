@@ -18,7 +18,7 @@ from nerfcli.render.depth import CONVENTIONS, DepthRequest
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.pictures import Picture, Quality, render_picture, straight_rgba
 from nerfcli.render.rays import places_in_pixel
-from nerfcli.train.run_folder import FIELD, read_cameras
+from nerfcli.runs.folder import FIELD, read_cameras
 
 BLACK = (0.0, 0.0, 0.0)
 MAPS = ("rgb", "opacity", "depth", "spread", "disagreement", "truncation_error", "valid")

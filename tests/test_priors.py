@@ -16,17 +16,18 @@ from nerfcli.cameras.formats.colmap_write import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
+from nerfcli.photos.loading import load_photos
+from nerfcli.runs.components import Components
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.camera_check import CameraCheck
-from nerfcli.train.components import Components
 from nerfcli.train.loop import train
 from nerfcli.train.losses import opacity_entropy
 from nerfcli.train.matching import chosen_pairs
-from nerfcli.train.photos import PixelPool, load_photos
+from nerfcli.train.photos import PixelPool
 from nerfcli.train.point_depth import LAST_SHARE, PointDepths, PointRays, fading, point_depth_loss, point_depths
 from nerfcli.train.preparation import prepare
 from nerfcli.train.selection import Facts
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.shared import Shared
 from nerfcli.train.tracks import Tracks, tracks_of_model
 from nerfcli.train.triangulation import triangulate

@@ -24,19 +24,20 @@ from nerfcli.cameras.rigid import (
     vector_from_rotation,
 )
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.photos.loading import load_photos
+from nerfcli.runs.camera_moves import camera_moves
+from nerfcli.runs.components import Components
+from nerfcli.runs.folder import STATE, read_cameras, read_given_cameras
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.camera_moves import camera_moves
-from nerfcli.train.components import Components
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.gauge import mean_similarity, without_mean
 from nerfcli.train.lens_change import bearings_by_change, changeable, changed
 from nerfcli.train.loop import train
 from nerfcli.train.newton import NewtonSteps
-from nerfcli.train.photos import PixelPool, load_photos
+from nerfcli.train.photos import PixelPool
 from nerfcli.train.refinement import LAST_SHARE, LENS_RATE, PoseRefinement, Refinement, rate_at
-from nerfcli.train.run_folder import STATE, read_cameras, read_given_cameras
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.whitening import BETAS, DAMPING, EPS, WhitenedAdam, whitening
 
 seeds = st.integers(0, 2**32 - 1)

@@ -10,15 +10,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nerfcli.runs.components import Components
+from nerfcli.runs.decisions import Decision, decisions_in_words
 from nerfcli.train.camera_check import CameraCheck
-from nerfcli.train.components import Components
 from nerfcli.train.judgement import (
     CLEAR_ERRORS,
     FLOOR,
     LEAST_GAIN_DB,
     MOST_LOSS_DB,
     SEED_DB,
-    Decision,
     judge_one,
     judge_removal,
     judge_supported,
@@ -27,7 +27,6 @@ from nerfcli.train.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_SHARE, Purse
 from nerfcli.train.selection import (
     MOST_START_STEPS,
     Facts,
-    decisions_in_words,
     is_worth_a_search,
     proposals,
     removals,

@@ -13,13 +13,13 @@ from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.render.model import load_model, save_model
 from nerfcli.render.pictures import render_picture
+from nerfcli.runs.folder import read_log
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import sentinel
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.loop import train
-from nerfcli.train.run_folder import read_log
 from nerfcli.train.sentinel import replay
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.watch import FirstBad, is_finite
 
 FEW = TrainSettings(budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)

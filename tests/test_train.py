@@ -27,14 +27,11 @@ from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image, write_png
+from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
-from nerfcli.scene import Scene
-from nerfcli.train import loop
-from nerfcli.train.components import Components
-from nerfcli.train.loop import Progress, train
-from nerfcli.train.photos import Drawn, PixelPool, load_photos
-from nerfcli.train.run_folder import (
+from nerfcli.runs.components import Components
+from nerfcli.runs.folder import (
     append_log,
     is_complete,
     is_same_run,
@@ -44,7 +41,11 @@ from nerfcli.train.run_folder import (
     saved_progress,
     write_cameras,
 )
-from nerfcli.train.settings import TrainSettings, automatic_downscale
+from nerfcli.runs.settings import TrainSettings, automatic_downscale
+from nerfcli.scene import Scene
+from nerfcli.train import loop
+from nerfcli.train.loop import Progress, train
+from nerfcli.train.photos import Drawn, PixelPool
 
 # A step of a few rays is enough where bits are compared, not pictures.
 FEW = TrainSettings(budget_seconds=None, steps=24, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from nerfcli.field.exposure import exposed
-from nerfcli.train.components import Components
+from nerfcli.runs.components import Components
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
 from nerfcli.train.fitting import DETAILED_STEPS, Fitting
 from nerfcli.train.photos import load_album
 from nerfcli.train.room import IN_MEMORY
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.signs import signs_of
 from nerfcli.train.trials import Start, Trials
 

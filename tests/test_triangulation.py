@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.photos.loading import Photo
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.extent import Extent, choose_extent, lacks_depth
 from nerfcli.train.matching import MOST_PHOTOS, Matches, chosen_pairs, match
-from nerfcli.train.photos import Photo
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.tracks import Tracks, places_of, tracks_of_matches
 from nerfcli.train.triangulation import triangulate
 

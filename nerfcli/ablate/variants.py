@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from nerfcli.train.components import CHOICES, Components, Value
+from nerfcli.runs.components import CHOICES, Components, Value
 
 CHOSEN, AUTO = "chosen", "auto"
 # What these change is what a held-out photo is compared with: their numbers would say nothing beside the others.

@@ -11,12 +11,12 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.protocol import HeldOut
 from nerfcli.evaluate.sampled import SampledPixels, render_sampled
 from nerfcli.media.images import downscale
+from nerfcli.photos.held_out_exposure import log_gains_of
+from nerfcli.photos.loading import downscaled_camera, load_photos
 from nerfcli.render.accuracy import TIGHT, refined
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import TOLERANCE, uniform_cuts
-from nerfcli.train.held_out_exposure import log_gains_of
-from nerfcli.train.photos import downscaled_camera, load_photos
-from nerfcli.train.settings import TrainSettings
+from nerfcli.runs.settings import TrainSettings
 
 # Every so many of the sampled pixels are rendered again with fine steps.
 QUADRATURE_EVERY = 16

@@ -11,9 +11,9 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import HeldOut
 from nerfcli.render.model import Model
+from nerfcli.runs.folder import CONFIG, FIELD, read_cameras, read_config, read_log
+from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
-from nerfcli.train.run_folder import CONFIG, FIELD, read_cameras, read_config, read_log
-from nerfcli.train.settings import TrainSettings, automatic_downscale
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 from nerfcli.render.pictures import RAYS_PER_TILE
 from nerfcli.render.tracing import TOLERANCE
-from nerfcli.train.settings import TrainSettings
+from nerfcli.runs.settings import TrainSettings
 
 # Steps and tolerances far beyond the defaults, on both sides: a curve shows where it bends only with its ends.
 _STEPS = (2.0, 4.0, 0.5, 8.0, 0.25)

@@ -14,8 +14,8 @@ import nerfcli
 from nerfcli.bench.pictures import FOLDER, slug
 from nerfcli.bench.session import Session
 from nerfcli.bench.sweep import TrainSetting, affordable
-from nerfcli.train.run_folder import FIELD
-from nerfcli.train.settings import TrainSettings
+from nerfcli.runs.folder import FIELD
+from nerfcli.runs.settings import TrainSettings
 
 # Of a process besides its training, until one has been measured: libraries, photos, kernels, held-out pixels.
 _FIRST_OVERHEAD_SECONDS = 12.0

@@ -25,9 +25,9 @@ from nerfcli.evaluate.sampled import SampledPixels, background_of
 from nerfcli.field.cost import field_bytes
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.pictures import render_picture
+from nerfcli.runs.folder import FIELD, read_log
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import Progress, train
-from nerfcli.train.run_folder import FIELD, read_log
-from nerfcli.train.settings import TrainSettings
 
 # Pictures are timed this often, unless one takes longer than the second number of seconds.
 _REPEATS, _SLOW_SECONDS = 3, 3.0

@@ -36,8 +36,8 @@ from nerfcli.errors import UserError
 if TYPE_CHECKING:
     from nerfcli.ablate.results import Measured
     from nerfcli.ablate.variants import Capture
+    from nerfcli.runs.settings import TrainSettings
     from nerfcli.scene import Scene
-    from nerfcli.train.settings import TrainSettings
 
     Measure = Callable[["_Trainings", str, TrainSettings, Path], Measured]
 
@@ -97,8 +97,8 @@ def ablate(
       nerfcli ablate photos-scene --only view --only exposure --budget 30s
       nerfcli ablate photos-scene --model default --seeds 5 --whole -o paper/ablation
     """
-    from nerfcli.train.components import CHOICES, Components, choose
-    from nerfcli.train.settings import TrainSettings
+    from nerfcli.runs.components import CHOICES, Components, choose
+    from nerfcli.runs.settings import TrainSettings
 
     if unknown := [name for name in only or () if name not in CHOICES]:
         raise typer.BadParameter(f"{unknown[0]!r}; choose from {', '.join(CHOICES)}", param_hint="--only")
@@ -142,7 +142,7 @@ class _Trainings:
         """The folder of a run, trained with these settings: now, or by an earlier call."""
         from nerfcli.ablate.results import RUNS
         from nerfcli.cli.train import train_scene, was_interrupted
-        from nerfcli.train.run_folder import STATE
+        from nerfcli.runs.folder import STATE
 
         run = self.folder / RUNS / f"{name}-{settings.seed}"
         resume = not self.overwrite and was_interrupted(self.scene, run, settings, holdout=self.rule)
@@ -179,7 +179,7 @@ def ablate_scene(
     from nerfcli import scene as scenes
     from nerfcli.ablate.results import COLUMNS, refuse_foreign, rows_of, table_of, write_results
     from nerfcli.ablate.variants import AUTO, CHOSEN, Variant, variants
-    from nerfcli.train.run_folder import chosen_components, read_config
+    from nerfcli.runs.folder import chosen_components, read_config
 
     scene, folder, console = scenes.load(trainings.scene, holdout=trainings.rule), trainings.folder, trainings.console
     if not scene.test_frames:
@@ -224,8 +224,8 @@ def _capture(scene: "Scene") -> "Capture":
     from nerfcli.ablate.variants import Capture
     from nerfcli.cameras.formats.colmap import parse_colmap
     from nerfcli.media.images import read_image
+    from nerfcli.photos.exif_exposure import mean_log_exposure, relative_log_exposures
     from nerfcli.scene import model_folder
-    from nerfcli.train.exif_exposure import mean_log_exposure, relative_log_exposures
 
     first, sparse = scene.train_frames[0].image, model_folder(scene.root)
     seen = parse_colmap(sparse).observations if sparse is not None else None
@@ -256,7 +256,7 @@ def _measured_pixels(trainings: _Trainings, name: str, settings: "TrainSettings"
     from nerfcli.cli.evaluation import held_out_photos
     from nerfcli.evaluate.sampled import SampledPixels
     from nerfcli.render.model import load_model
-    from nerfcli.train.run_folder import FIELD, read_cameras, read_config, read_log
+    from nerfcli.runs.folder import FIELD, read_cameras, read_config, read_log
 
     model, last = load_model(run / FIELD, settings.device), read_log(run)[-1]
     photos = held_out_photos(read_config(run), read_cameras(run)["test"], model=model, threads=settings.threads)

@@ -23,8 +23,8 @@ def costs_of_run(
         log: its log, whose last line tells how many samples a ray had.
     """
     from nerfcli.field.comparison import described_cost, others_of_equal_storage
+    from nerfcli.runs.settings import TrainSettings
     from nerfcli.train.footprint import pixel_footprint
-    from nerfcli.train.settings import TrainSettings
 
     factor = settings.get("downscale") or 1
     camera = frames[0].camera

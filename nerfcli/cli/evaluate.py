@@ -122,7 +122,7 @@ def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
 def hold_against(run: Path, metrics: dict[str, Any], requirements: "tuple[Requirement, ...]") -> None:
     """Raise if a requirement is not met."""
     from nerfcli.evaluate.requirements import known_numbers, unmet
-    from nerfcli.train.run_folder import read_config
+    from nerfcli.runs.folder import read_config
 
     failures = unmet(requirements, known_numbers(metrics, read_config(run))) if requirements else []
     if failures:
@@ -151,7 +151,7 @@ def evaluate_run(
     from nerfcli.evaluate.perceptual import find_perceptual
     from nerfcli.evaluate.protocol import METRICS, PROTOCOL, Extras, evaluate_model
     from nerfcli.render.model import load_model
-    from nerfcli.train.run_folder import FIELD, LOG, check_split, read_cameras, read_config, read_log
+    from nerfcli.runs.folder import FIELD, LOG, check_split, read_cameras, read_config, read_log
 
     torch.set_num_threads(threads)
     config, cameras = read_config(run), read_cameras(run)

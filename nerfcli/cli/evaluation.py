@@ -40,9 +40,9 @@ def held_out_photos(
         UserError: a photo cannot be read.
     """
     from nerfcli.evaluate.protocol import HeldOut
-    from nerfcli.train.held_out_exposure import log_gains_of
-    from nerfcli.train.photos import load_photos
-    from nerfcli.train.run_folder import chosen_components
+    from nerfcli.photos.held_out_exposure import log_gains_of
+    from nerfcli.photos.loading import load_photos
+    from nerfcli.runs.folder import chosen_components
 
     factor, masks = config["settings"]["downscale"], chosen_components(config).masks
     photos = load_photos(frames, factor=factor, threads=threads, masks=masks)
@@ -58,8 +58,8 @@ def billboards_of(
     """The model without shape of a run's training photos; None, with a line, where these cannot be read any more."""
     from nerfcli.evaluate.billboards import Billboards, reduction
     from nerfcli.evaluate.protocol import over_white
-    from nerfcli.train.photos import downscaled_camera, load_photos
-    from nerfcli.train.run_folder import chosen_components
+    from nerfcli.photos.loading import downscaled_camera, load_photos
+    from nerfcli.runs.folder import chosen_components
 
     masks, small, cameras = chosen_components(config).masks, [], []
     try:

@@ -72,7 +72,7 @@ def describe(folder: Path) -> dict[str, Any]:
         return file_facts(folder)
     if (folder / RENDERS).exists():
         return renders_facts(folder)
-    from nerfcli.train.run_folder import CONFIG
+    from nerfcli.runs.folder import CONFIG
 
     return _describe_run(folder) if (folder / CONFIG).exists() else _describe_scene(folder)
 
@@ -103,8 +103,9 @@ def _describe_run(folder: Path) -> dict[str, Any]:
     from nerfcli.evaluate.protocol import METRICS
     from nerfcli.field.cost import field_bytes
     from nerfcli.render.model import load_model
-    from nerfcli.train.camera_moves import camera_moves
-    from nerfcli.train.run_folder import (
+    from nerfcli.runs.camera_moves import camera_moves
+    from nerfcli.runs.decisions import decisions_in_words
+    from nerfcli.runs.folder import (
         FIELD,
         chosen_components,
         read_cameras,
@@ -112,7 +113,6 @@ def _describe_run(folder: Path) -> dict[str, Any]:
         read_given_cameras,
         read_log,
     )
-    from nerfcli.train.selection import decisions_in_words
 
     config = read_config(folder)
     cameras = read_cameras(folder)

@@ -144,7 +144,7 @@ def render(
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.render.model import load_model
     from nerfcli.render.pictures import Quality
-    from nerfcli.train.run_folder import FIELD
+    from nerfcli.runs.folder import FIELD
 
     chosen = tuple(dict.fromkeys(outputs.split(",")))
     if unknown := [name for name in chosen if name not in OUTPUTS]:
@@ -263,7 +263,7 @@ def render_run(
     from nerfcli.export.frames import Workers, automatic_workers, export_frames, export_part
     from nerfcli.export.order import Order, refuse_foreign
     from nerfcli.render.model import load_model
-    from nerfcli.train.run_folder import FIELD
+    from nerfcli.runs.folder import FIELD
 
     torch.set_num_threads(threads)
     model = load_model(run / FIELD, device).stretched(step)

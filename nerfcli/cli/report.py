@@ -82,7 +82,7 @@ def report_page(
     from nerfcli.report.facts import labels_of, read_facts
     from nerfcli.report.page import page_html
     from nerfcli.report.views import common_names, look_at
-    from nerfcli.train.run_folder import FIELD, read_config
+    from nerfcli.runs.folder import FIELD, read_config
 
     torch.set_num_threads(threads)
     facts, hashes = [], []

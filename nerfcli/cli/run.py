@@ -86,8 +86,8 @@ def run(
     from nerfcli.memory import default_memory_limit
     from nerfcli.poses.settings import Limits, PoseSettings
     from nerfcli.render.pictures import DepthRequest
-    from nerfcli.train.components import Components, choose
-    from nerfcli.train.settings import TrainSettings
+    from nerfcli.runs.components import Components, choose
+    from nerfcli.runs.settings import TrainSettings
 
     console = Console(quiet=quiet, json_lines=json)
     requirements, rule = requirements_of(require), holdout_rule(holdout)

@@ -40,8 +40,8 @@ from nerfcli.cli.options import (
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
+    from nerfcli.runs.settings import TrainSettings
     from nerfcli.scene import Scene
-    from nerfcli.train.settings import TrainSettings
 
 DEFAULT_BUDGET = "2m"
 NAMES_SHOWN = 8
@@ -110,8 +110,8 @@ def train(
       nerfcli train photos-scene --with cameras=poses
       nerfcli train photos-scene --field voxels --field-memory 16MB
     """
-    from nerfcli.train.components import Components, choose
-    from nerfcli.train.settings import TrainSettings
+    from nerfcli.runs.components import Components, choose
+    from nerfcli.runs.settings import TrainSettings
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
@@ -179,7 +179,7 @@ def train_scene(
     from nerfcli.cameras.orientation import rescaling_told
     from nerfcli.evaluate.protocol import METRICS
     from nerfcli.exclusive import exclusive
-    from nerfcli.train.run_folder import LOCK
+    from nerfcli.runs.folder import LOCK
 
     scene = scenes.load(folder, holdout=holdout)
     if scene.missing:
@@ -213,7 +213,7 @@ def _keeps(run: Path, scene: "Scene", settings: "TrainSettings", *, resume: bool
         UserError: it is something else, which is not ours to replace; or nothing to resume.
     """
     from nerfcli import scene as scenes
-    from nerfcli.train.run_folder import CONFIG, FIELD, LOCK, STATE, is_complete, is_same_run, read_config, split_hash
+    from nerfcli.runs.folder import CONFIG, FIELD, LOCK, STATE, is_complete, is_same_run, read_config, split_hash
 
     trained = (run / FIELD).exists()
     if resume and not trained and not (run / STATE).exists():
@@ -247,9 +247,9 @@ def _fit(
     resume: bool,
     console: Console,
 ) -> None:
+    from nerfcli.runs.folder import STATE
     from nerfcli.train.loop import Progress
     from nerfcli.train.loop import train as fit
-    from nerfcli.train.run_folder import STATE
 
     with console.progress(f"train {scene.root.name}") as update:
 
@@ -279,7 +279,7 @@ def _fit(
 def was_interrupted(folder: Path, run: Path, settings: "TrainSettings", *, holdout: str | None = None) -> bool:
     """Whether a training of this scene with these settings stopped before its end and left a checkpoint."""
     from nerfcli import scene as scenes
-    from nerfcli.train.run_folder import FIELD, is_complete, is_same_run
+    from nerfcli.runs.folder import FIELD, is_complete, is_same_run
 
     if not (run / FIELD).exists():
         return False
@@ -303,7 +303,7 @@ def train_other_seeds(run: Path, count: int, *, device: str, threads: int, conso
     from dataclasses import replace
 
     from nerfcli import scene as scenes
-    from nerfcli.train.run_folder import read_config, settings_of
+    from nerfcli.runs.folder import read_config, settings_of
 
     config = read_config(run)
     folder, holdout = Path(config["scene"]), config.get("holdout")

@@ -130,8 +130,8 @@ def chosen_frames(run: Path, views: Views, *, depth_hint: float) -> "list[Frame]
     """
     from nerfcli.cameras import paths
     from nerfcli.cameras.names import frames_named
-    from nerfcli.train.photos import downscaled_camera
-    from nerfcli.train.run_folder import read_cameras, read_config
+    from nerfcli.photos.loading import downscaled_camera
+    from nerfcli.runs.folder import read_cameras, read_config
 
     cameras, through = views.cameras, views.through
     if through is not None and cameras not in PATHS:
@@ -241,6 +241,6 @@ def _frames_of(path: Path, nerfstudio_frame: Path | None) -> "tuple[Frame, ...]"
 
 def _within(camera: "Camera", max_size: int) -> "Camera":
     """The camera of the picture made smaller, if need be, until its longer side fits."""
-    from nerfcli.train.photos import downscaled_camera
+    from nerfcli.photos.loading import downscaled_camera
 
     return downscaled_camera(camera, max(1.0, max(camera.width, camera.height) / max_size))

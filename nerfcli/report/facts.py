@@ -8,7 +8,7 @@ from typing import Any
 
 from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import METRICS
-from nerfcli.train.run_folder import FIELD, read_cameras, read_config, read_log
+from nerfcli.runs.folder import FIELD, read_cameras, read_config, read_log
 
 POSES_REPORT = "poses_report.json"
 # Photos named in a warning; the others are counted.

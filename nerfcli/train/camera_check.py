@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfcli.photos.loading import Photo
 from nerfcli.train.lens_change import FOCAL, changeable, changed
 from nerfcli.train.matching import Matches, radians_per_pixel
-from nerfcli.train.photos import Photo
 
 # Logarithms of factors of the focal length that are looked at: a wrong unit or crop is off by more, and every photo
 # shows it.

@@ -11,14 +11,14 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
 from nerfcli.field.kinds import settings_from_json
+from nerfcli.photos.held_out_exposure import gains_between
 from nerfcli.render.model import Model, save_model
+from nerfcli.runs.folder import FIELD, STATE, chosen_components, read_config, write_cameras
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
-from nerfcli.train.held_out_exposure import gains_between
 from nerfcli.train.preparation import Begun, Prepared
-from nerfcli.train.run_folder import FIELD, STATE, chosen_components, read_config, write_cameras
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.watch import that_must_be_finite
 
 STATE_FORMAT = "nerfcli training 2"

@@ -7,10 +7,10 @@ import numpy as np
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.render.model import Marching
+from nerfcli.runs.components import LEARNED_BACKGROUNDS
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.components import LEARNED_BACKGROUNDS
 from nerfcli.train.normalisation import box_frame, contracted_frame, object_frame
-from nerfcli.train.settings import TrainSettings
 
 # What is infinitely far begins behind so many radii of the unit ball: what is nearer moves from photo to photo.
 BALLS_BEFORE_BACKGROUND = 1.5

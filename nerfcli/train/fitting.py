@@ -14,13 +14,13 @@ from nerfcli.field.kinds import fresh_field
 from nerfcli.field.sizes import chosen_size
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.error_map import BEGINS, ErrorMap
 from nerfcli.train.losses import colour_losses, distortion_loss, opacity_entropy
 from nerfcli.train.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.train.parts import Parts
 from nerfcli.train.photos import Drawn, Pool
 from nerfcli.train.point_depth import PointDepths, PointRays, fading, point_depth_loss
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.watch import UNWATCHED, NonFiniteError, Watch
 
 OCCUPANCY_SIDE = 64

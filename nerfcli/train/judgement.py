@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol
+from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
-from nerfcli.train.components import Change, Value
+from nerfcli.runs.components import Change
+from nerfcli.runs.decisions import Decision
 from nerfcli.train.trials import Trial
 
 # A gain counts if it is above this many standard errors, and above what nobody sees.
@@ -24,49 +25,6 @@ MOST_LOSS_DB = 0.1
 # error is added to that of every photo.
 FLOOR = 0.1
 ROUNDING_DB = 1e-6
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What became of a candidate.
-
-    Args:
-        component, value: the change.
-        gain_db: in PSNR of pixels that were not trained on, at equal steps, the mean over photos; negative is a loss.
-            None where it was not tried, as for all numbers that follow.
-        error_db: its standard error.
-        trend_db: how much of the gain the second half of the steps brought.
-        cost: seconds of a step against those of a step without the change, minus 1.
-        gain_at_equal_time_db: the gain without what the steps would have brought that it costs.
-        kept: whether it is in the model.
-        why: in words.
-    """
-
-    component: str
-    value: Value
-    gain_db: float | None
-    error_db: float | None
-    trend_db: float | None
-    cost: float | None
-    gain_at_equal_time_db: float | None
-    kept: bool
-    why: str
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self)
-
-    def in_words(self) -> str:
-        """A line for people: "exposure=learned: +1.20 +- 0.08 dB, +3 % time: kept, gains ..."."""
-        named = f"{self.component}={str(self.value).lower()}"
-        if self.gain_db is None or self.error_db is None or self.cost is None:
-            return f"{named}: {'kept, ' if self.kept else ''}{self.why}"
-        measured = f"{self.gain_db:+.2f} +- {self.error_db:.2f} dB, {self.cost:+.0%} time"
-        return f"{named}: {measured}: {'kept' if self.kept else 'not kept'}, {self.why}"
-
-
-def untried(component: str, value: Value, why: str, *, kept: bool = False) -> Decision:
-    """A candidate that was not tried, and the reason; or one that is kept for that reason."""
-    return Decision(component, value, None, None, None, None, None, kept, why)
 
 
 class Rule(Protocol):

@@ -15,11 +15,7 @@ from nerfcli.atomic import cannot_write
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
 from nerfcli.interrupts import held_back
-from nerfcli.scene import Scene
-from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
-from nerfcli.train.fitting import Fitting
-from nerfcli.train.preparation import Prepared, prepare
-from nerfcli.train.run_folder import (
+from nerfcli.runs.folder import (
     CONFIG,
     FIELD,
     LOG,
@@ -30,8 +26,12 @@ from nerfcli.train.run_folder import (
     read_config,
     write_sealed,
 )
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene
+from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
+from nerfcli.train.fitting import Fitting
+from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.waypoints import SHARES, forget_waypoints, keep_waypoint, measure_waypoints
 
 CHECKPOINT_SECONDS = 30.0

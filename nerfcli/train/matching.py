@@ -12,7 +12,7 @@ import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.layout import centres_of, views_of
-from nerfcli.train.photos import Photo
+from nerfcli.photos.loading import Photo
 
 # Features are sought in photos whose longer side is at most this, so that it takes seconds.
 LONGER_SIDE_PX = 600

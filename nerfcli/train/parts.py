@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
-from nerfcli.train.components import LEARNED_BACKGROUNDS, Components
+from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
 from nerfcli.train.losses import over_background
 from nerfcli.train.photos import Drawn, Pool
 from nerfcli.train.refinement import Refinement, rate_at

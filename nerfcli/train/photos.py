@@ -14,28 +14,12 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
-from nerfcli.media.images import downscale, read_image
-from nerfcli.media.masks import read_mask
+from nerfcli.photos.loading import Photo, downscaled_camera, load_photo
 from nerfcli.train.footprint import pixel_footprint
 from nerfcli.train.room import IN_MEMORY, Room
 
 # In float64, the bearings of a large photo would take more than the photo.
 PIXELS_AT_A_TIME = 2**18
-
-
-@dataclass(frozen=True)
-class Photo:
-    """One photo as it is trained on.
-
-    Args:
-        frame: with the camera of the downscaled picture.
-        pixels: (H, W, 3 or 4) uint8 sRGB, straight alpha.
-        used: (H, W) bool, False where a mask says to ignore the pixel; None for all.
-    """
-
-    frame: Frame
-    pixels: np.ndarray
-    used: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -53,22 +37,6 @@ class Album:
     fills_frame: bool
 
 
-def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: str = "ignore") -> list[Photo]:
-    """Read, orient and downscale the photos of `frames`, in parallel, in order.
-
-    Args:
-        frames: with their images and masks.
-        factor: of the downscaling.
-        threads: to read with.
-        masks: what their black means: "ignore", or "empty": it then is the alpha of the photos that have a mask.
-
-    Raises:
-        UserError: a photo cannot be read, or has another size than its camera.
-    """
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        return list(pool.map(lambda frame: _load_photo(frame, factor, masks), frames))
-
-
 def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room, masks: str = "ignore") -> Album:
     """`load_photos` into one array, which stands where there is room.
 
@@ -83,7 +51,7 @@ def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room
         fills: list[bool] = []
 
         def place(index: int, colours: np.ndarray = colours) -> tuple[Photo, bool] | None:
-            photo = _load_photo(frames[index], factor, masks)
+            photo = load_photo(frames[index], factor, masks)
             has_alpha = photo.pixels.shape[-1] == 4
             if has_alpha and colours.shape[-1] == 3:
                 return None
@@ -103,36 +71,6 @@ def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room
         if len(photos) == len(frames):
             return Album(tuple(photos), colours, any(fills))
     raise AssertionError("four channels hold every photo")
-
-
-def _load_photo(frame: Frame, factor: float, masks: str) -> Photo:
-    if frame.image is None:
-        raise UserError(f"{frame.name} has no photo", "this camera can be rendered, but not trained on or evaluated")
-    if not frame.image.exists():
-        raise UserError(
-            f"the photo {frame.image.resolve()} is not there",
-            "put it back; or, where photos or run were moved, put a link to the photos' folder in its place: "
-            "a run looks for them where they were as seen from itself",
-        )
-    pixels = read_image(frame.image)
-    height, width = pixels.shape[:2]
-    if (width, height) != (frame.camera.width, frame.camera.height):
-        raise UserError(
-            f"{frame.image} is {width}x{height}, its camera says {frame.camera.width}x{frame.camera.height}",
-            "put the photo back that the poses were made from, or run nerfcli poses again",
-        )
-    used = None
-    if frame.mask is not None and masks == "empty":
-        pixels = _emptied(pixels, read_mask(frame.mask, frame.image))
-    elif frame.mask is not None:
-        # A pixel of the small picture counts only where all that it averages counts.
-        used = downscale(read_mask(frame.mask, frame.image), factor) == 255
-    return Photo(replace(frame, camera=downscaled_camera(frame.camera, factor)), downscale(pixels, factor), used)
-
-
-def downscaled_camera(camera: Camera, factor: float) -> Camera:
-    """The camera of a picture that `media.images.downscale` made smaller."""
-    return camera.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
 
 
 class Drawn(NamedTuple):
@@ -300,12 +238,6 @@ def _fill_bearings(camera: Camera, bearings: np.ndarray, room: Room) -> np.ndarr
         bearings[part], valid[part] = camera.bearings(centres)
         room.relieve()
     return valid
-
-
-def _emptied(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """RGBA: clear where the mask is black, or where the photo is clear itself."""
-    alpha = mask if pixels.shape[-1] == 3 else np.minimum(mask, pixels[..., 3])
-    return np.concatenate([pixels[..., :3], alpha[..., None]], axis=-1)
 
 
 def _one_after_another(photos: Sequence[Photo]) -> np.ndarray:

@@ -13,11 +13,13 @@ import torch
 from torch import Tensor
 
 from nerfcli.errors import UserError
+from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
+from nerfcli.runs.components import Components
+from nerfcli.runs.decisions import Selection
+from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
 from nerfcli.train.camera_check import check_cameras
-from nerfcli.train.components import Components
 from nerfcli.train.error_map import ErrorMap
-from nerfcli.train.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.train.extent import Extent, choose_extent, lacks_depth
 from nerfcli.train.fitting import Fitting
 from nerfcli.train.photos import Album, PixelPool, load_album
@@ -27,14 +29,12 @@ from nerfcli.train.selection import (
     LEARN_FOCAL,
     SEARCH_SHARE,
     Facts,
-    Selection,
     is_worth_a_search,
     select,
     tells_points,
     with_known_cameras,
     with_points,
 )
-from nerfcli.train.settings import TrainSettings, automatic_downscale
 from nerfcli.train.shared import Shared
 from nerfcli.train.trials import Trials
 from nerfcli.train.triangulation import triangulate

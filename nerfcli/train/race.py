@@ -7,17 +7,16 @@ from types import MappingProxyType
 
 from torch import Tensor
 
-from nerfcli.train.components import Change, Components
+from nerfcli.runs.components import Change, Components
+from nerfcli.runs.decisions import Decision, untried
 from nerfcli.train.judgement import (
     LEAST_GAIN_DB,
     MOST_LOSS_DB,
     SEED_DB,
-    Decision,
     Rule,
     judge_one,
     judge_removal,
     judge_supported,
-    untried,
 )
 from nerfcli.train.trials import Start, Trial, Trials
 

@@ -18,7 +18,7 @@ from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.memory import resident_bytes
-from nerfcli.train.settings import TrainSettings
+from nerfcli.runs.settings import TrainSettings
 
 # Resident memory of a step, measured: 0.35 GB at 65536 samples.
 _BYTES_PER_SAMPLE = 6000

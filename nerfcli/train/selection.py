@@ -7,15 +7,13 @@ first is in the model that the next one has to better: two components that mend 
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
-from torch import Tensor
-
+from nerfcli.runs.components import CHOICES, Change, Components
+from nerfcli.runs.decisions import Decision, Selection, untried
 from nerfcli.train.camera_check import CameraCheck
-from nerfcli.train.components import CHOICES, Change, Components
-from nerfcli.train.judgement import Decision, Rule, judge_likely, judge_supported, untried
+from nerfcli.train.judgement import Rule, judge_likely, judge_supported
 from nerfcli.train.race import Purse, Race
 from nerfcli.train.signs import Signs
 from nerfcli.train.trials import Trials
@@ -49,39 +47,6 @@ SURELY_MISSED_PX = 1.2
 FOCAL_ERRORS, LEAST_FOCAL, MISS_SHARE = 5.0, 0.003, 0.85
 # Values of "cameras" with which focal lengths learn.
 LEARN_FOCAL = ("focal", "all")
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The components that were chosen, how, and what it took.
-
-    Args:
-        components: those of the model.
-        decisions: one per candidate; none where there was too little to spend.
-        seconds: of the search.
-        log_gains: (photos, 3) of the exposures that the trials found; None where exposures are not learned.
-        log_focal: see `Fitting`.
-    """
-
-    components: Components
-    decisions: tuple[Decision, ...]
-    seconds: float
-    log_gains: Tensor | None = None
-    log_focal: float = 0.0
-
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "components": self.components.to_json(),
-            "decisions": [decision.to_json() for decision in self.decisions],
-            "seconds": self.seconds,
-        }
-
-
-def decisions_in_words(config: Mapping[str, Any]) -> list[str]:
-    """A line per decision of a run that has this RUN/config.json; none where nobody asked the scene."""
-    known = {entry.name for entry in fields(Decision)}
-    decisions = (config.get("selection") or {}).get("decisions", [])
-    return [Decision(**{k: v for k, v in one.items() if k in known}).in_words() for one in decisions]
 
 
 @dataclass(frozen=True)

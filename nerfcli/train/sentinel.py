@@ -21,9 +21,9 @@ from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.render.model import Marching
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.fitting import Fitting, StepResult
 from nerfcli.train.photos import Drawn, PixelPool
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.watch import BadTensor, FirstBad, NonFiniteError, is_finite, that_must_be_finite
 
 FAILURE_FORMAT = "nerfcli failure 1"

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from functools import cached_property
 
+from nerfcli.photos.loading import Photo
 from nerfcli.scene import Scene
 from nerfcli.train.matching import LONGER_SIDE_PX, Matches, chosen_pairs, match
-from nerfcli.train.photos import Photo
 from nerfcli.train.tracks import Tracks, tracks_of_matches, tracks_of_model
 
 # What features of a photo take on one thread, and comparing them, for each of the pixels in which they are sought:

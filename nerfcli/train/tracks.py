@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.formats.colmap import parse_colmap
+from nerfcli.photos.loading import Photo
 from nerfcli.scene import Scene, model_folder
 from nerfcli.train.matching import Matches
-from nerfcli.train.photos import Photo
 
 
 @dataclass(frozen=True)

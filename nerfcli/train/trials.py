@@ -19,14 +19,15 @@ from torch import Tensor
 
 from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashField
-from nerfcli.train.components import Components
+from nerfcli.photos.loading import Photo
+from nerfcli.runs.components import Components
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.extent import Extent
 from nerfcli.train.fitting import Fitting
-from nerfcli.train.photos import Photo, PixelPool
+from nerfcli.train.photos import PixelPool
 from nerfcli.train.point_depth import PointDepths, PointRays
 from nerfcli.train.room import IN_MEMORY, Room
-from nerfcli.train.settings import TrainSettings
 from nerfcli.train.signs import Signs, signs_of
 from nerfcli.train.sky import paint
 

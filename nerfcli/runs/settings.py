@@ -8,7 +8,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS
 from nerfcli.kernels import CONTRACTIONS
-from nerfcli.train.components import Components
+from nerfcli.runs.components import Components
 
 DOWNSCALES = (1, 2, 4, 8)
 # `--downscale auto` takes the largest pictures whose longer side is within this many pixels.

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.photos.exif_exposure import log_exposures
 from nerfcli.render.model import Model
-from nerfcli.train.exif_exposure import log_exposures
 
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -19,10 +19,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.orientation import rescaling_told
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.runs.components import Components
+from nerfcli.runs.decisions import Selection
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, fingerprint
-from nerfcli.train.components import Components
-from nerfcli.train.selection import Selection
-from nerfcli.train.settings import TrainSettings
 
 CONFIG = "config.json"
 CAMERAS = "cameras.json"

@@ -1,0 +1,1 @@
+"""Photos as they are trained on and compared with: their pixels, masks and exposures."""

@@ -1,0 +1,85 @@
+"""What a scene decided on: a candidate's gain, its error, and whether it is kept; and all of a search together."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from torch import Tensor
+
+from nerfcli.runs.components import Components, Value
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What became of a candidate.
+
+    Args:
+        component, value: the change.
+        gain_db: in PSNR of pixels that were not trained on, at equal steps, the mean over photos; negative is a loss.
+            None where it was not tried, as for all numbers that follow.
+        error_db: its standard error.
+        trend_db: how much of the gain the second half of the steps brought.
+        cost: seconds of a step against those of a step without the change, minus 1.
+        gain_at_equal_time_db: the gain without what the steps would have brought that it costs.
+        kept: whether it is in the model.
+        why: in words.
+    """
+
+    component: str
+    value: Value
+    gain_db: float | None
+    error_db: float | None
+    trend_db: float | None
+    cost: float | None
+    gain_at_equal_time_db: float | None
+    kept: bool
+    why: str
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def in_words(self) -> str:
+        """A line for people: "exposure=learned: +1.20 +- 0.08 dB, +3 % time: kept, gains ..."."""
+        named = f"{self.component}={str(self.value).lower()}"
+        if self.gain_db is None or self.error_db is None or self.cost is None:
+            return f"{named}: {'kept, ' if self.kept else ''}{self.why}"
+        measured = f"{self.gain_db:+.2f} +- {self.error_db:.2f} dB, {self.cost:+.0%} time"
+        return f"{named}: {measured}: {'kept' if self.kept else 'not kept'}, {self.why}"
+
+
+def untried(component: str, value: Value, why: str, *, kept: bool = False) -> Decision:
+    """A candidate that was not tried, and the reason; or one that is kept for that reason."""
+    return Decision(component, value, None, None, None, None, None, kept, why)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The components that were chosen, how, and what it took.
+
+    Args:
+        components: those of the model.
+        decisions: one per candidate; none where there was too little to spend.
+        seconds: of the search.
+        log_gains: (photos, 3) of the exposures that the trials found; None where exposures are not learned.
+        log_focal: see `Fitting`.
+    """
+
+    components: Components
+    decisions: tuple[Decision, ...]
+    seconds: float
+    log_gains: Tensor | None = None
+    log_focal: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "components": self.components.to_json(),
+            "decisions": [decision.to_json() for decision in self.decisions],
+            "seconds": self.seconds,
+        }
+
+
+def decisions_in_words(config: Mapping[str, Any]) -> list[str]:
+    """A line per decision of a run that has this RUN/config.json; none where nobody asked the scene."""
+    known = {entry.name for entry in fields(Decision)}
+    decisions = (config.get("selection") or {}).get("decisions", [])
+    return [Decision(**{k: v for k, v in one.items() if k in known}).in_words() for one in decisions]
