@@ -122,7 +122,7 @@ def solve(name: str, capture: Capture, *, seed: int) -> Result:
             *(auc(errors, bound) for bound in BOUNDS_DEG),
             reprojection_px=np.nan if model is None else model.compute_mean_reprojection_error(),
             lens=", ".join(cameras),
-            rungs=len(climbed.rungs),
+            rungs=len(climbed.attempts),
             cpu_seconds=seconds,
             verdict="; ".join(failures) or "accepted",
         )

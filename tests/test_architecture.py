@@ -15,10 +15,11 @@ FILES = sorted(ROOT.rglob("*.py"))
 FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 
 # A part is a folder of nerfcli or a module beside the folders. What stands on the right may be imported by the left.
-LEAVES = {"errors", "atomic", "exclusive", "memory", "interrupts", "__init__"}
+LEAVES = {"errors", "atomic", "exclusive", "memory", "interrupts", "finite", "__init__"}
 MAY_IMPORT = {
     "errors": set(),
     "atomic": set(),
+    "finite": set(),
     "exclusive": set(),
     "memory": set(),
     "interrupts": set(),

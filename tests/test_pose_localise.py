@@ -13,7 +13,7 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, View, looking_at
 
-from nerfcli.poses.acceptance import leave_out_contradicting
+from nerfcli.poses.contradictions import leave_out_contradicting
 from nerfcli.poses.job import Job
 from nerfcli.poses.localise import Attempt, left_out, localise, shared_pairs
 

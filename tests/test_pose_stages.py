@@ -85,7 +85,7 @@ def unpublished(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a call leaves that ends between the worker's last file and the scene's."""
     scene = tmp_path_factory.mktemp("unpublished") / "scene"
 
-    def interrupted(scene_dir: Path, describe: Callable[[], None]) -> None:
+    def interrupted(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool) -> None:
         raise KilledError
 
     with pytest.MonkeyPatch.context() as patched:
@@ -122,15 +122,25 @@ def test_after_kills_in_two_stages_the_result_is_the_same_to_the_last_bit(photos
     assert rows(scene, "two_view_geometries", "pair_id") == rows(whole, "two_view_geometries", "pair_id")
 
 
-def test_a_model_that_has_gone_is_made_again_whatever_its_result_says(
-    photos: Path, unpublished: Path, whole: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("damaged", "repeated"),
+    [
+        (["sparse/0"], {"check"}),
+        (["sparse/0", "mapped/0"], {"check"}),
+        (["sparse/0", "mapped/0", "models_0/0"], {"map"}),
+    ],
+)
+def test_a_damaged_model_is_made_again_from_what_is_whole(
+    photos: Path, unpublished: Path, whole: Path, tmp_path: Path, damaged: list[str], repeated: set[str]
 ):
     scene = shutil.copytree(unpublished, tmp_path / "scene")
-    images = scene / "work" / "sparse" / "0" / "images.bin"
-    images.write_bytes(images.read_bytes()[:-8])
-    stages: list[str] = []
-    estimate(photos, scene, progress=lambda stage, done, total: stages.append(stage))
-    assert "map" in stages
+    for folder in damaged:
+        images = scene / "work" / folder / "images.bin"
+        images.write_bytes(images.read_bytes()[:-8])
+    stages: set[str] = set()
+    estimate(photos, scene, progress=lambda stage, done, total: stages.add(stage))
+    assert repeated <= stages
+    assert ("map" in stages) == ("map" in repeated)
     assert model(scene) == model(whole)
 
 

@@ -15,13 +15,15 @@ import synthetic_captures as synthetic
 from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
 from nerfcli.poses import merging
-from nerfcli.poses.acceptance import judge, leave_out_contradicting
+from nerfcli.poses.acceptance import judge
+from nerfcli.poses.contradictions import leave_out_contradicting
 from nerfcli.poses.database import register_photos
 from nerfcli.poses.examine import Examined, examine
 from nerfcli.poses.features import match
 from nerfcli.poses.job import Job
-from nerfcli.poses.ladder import Climb, climb
+from nerfcli.poses.ladder import climb
 from nerfcli.poses.lens_family import as_fisheye
+from nerfcli.poses.mapped import Mapped
 from nerfcli.poses.parallax import best_turn
 from nerfcli.poses.two_views import read_verified_pairs, rotation_errors
 from nerfcli.poses.view_graph import Bottlenecks, parts
@@ -38,7 +40,7 @@ def _quiet() -> None:
 class Solved:
     views: Sequence[View]
     job: Job
-    climbed: Climb
+    climbed: Mapped
     examined: Examined
 
     @property
@@ -201,12 +203,12 @@ def test_every_rung_is_written_down_with_its_result(tmp_path: Path):
     """A boulder with too few features for any start: all cheap rungs are tried, and none places a photo."""
     views = synthetic.ring(5, [WIDE], seed=0, turn_deg=60)
     weak = solve(tmp_path, views, synthetic.boulder(70, seed=0), Noise(missed=0.1))
-    assert [rung["what"] for rung in weak.climbed.rungs] == [
+    assert [rung["what"] for rung in weak.climbed.attempts] == [
         "default thresholds",
         "start from a smaller baseline",
         "start from low angles",
     ]
-    assert all(rung["models"] == [] for rung in weak.climbed.rungs)
+    assert all(rung["models"] == [] for rung in weak.climbed.attempts)
     assert weak.examined.model is None
 
 
@@ -214,11 +216,11 @@ def test_a_photo_that_no_pair_holds_is_placed_by_what_the_model_knows(tmp_path: 
     """It has no match with any photo; its place is right, and is told among the rungs."""
     views = synthetic.ring(7, [WIDE], seed=0, turn_deg=140)
     weak = solve(tmp_path, views, synthetic.boulder(500, seed=0), pairs=lambda i, j: 3 not in (i, j))
-    assert [(rung["what"], rung["models"]) for rung in weak.climbed.rungs] == [
+    assert [(rung["what"], rung["models"]) for rung in weak.climbed.attempts] == [
         ("default thresholds", [6]),
         ("single photos, by the points that they show", [7]),
     ]
-    assert [(one["name"], one["refused"]) for one in weak.climbed.rungs[1]["photos"]] == [("00003.jpg", "")]
+    assert [(one["name"], one["refused"]) for one in weak.climbed.attempts[1]["photos"]] == [("00003.jpg", "")]
     assert (weak.examined.verdict.accepted, weak.examined.left_out) == (True, {})
     turned = weak.model.image(4).cam_from_world().rotation * weak.model.image(1).cam_from_world().rotation.inverse()
     truth = synthetic.true_model(views)
@@ -232,7 +234,7 @@ def test_a_fisheye_of_which_nothing_is_known_is_recognised(tmp_path: Path):
     views = synthetic.ring(6, [UNKNOWN_FISHEYE], seed=0, radius=2.0, turn_deg=100)
     synthetic.write_database(tmp_path / "database.db", views, scene, noise=Noise(), seed=0)
     climbed = climb(synthetic.synthetic_job(tmp_path, views, seed=0), lambda *told: None)
-    assert [rung["what"] for rung in climbed.rungs] == ["default thresholds", "start from a fisheye lens"]
+    assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "start from a fisheye lens"]
     assert climbed.models[0].num_reg_images() == 6
     (camera,) = climbed.models[0].cameras.values()
     assert camera.is_perspective_fisheye()
@@ -250,8 +252,8 @@ def test_a_focal_length_that_exif_tells_wrong_is_left_out(tmp_path: Path):
     register_photos(job)
     match(job, job.pairs, lambda *told: None)
     climbed = climb(job, lambda *told: None, told.append)
-    assert [rung["what"] for rung in climbed.rungs] == ["default thresholds", "without the focal length of EXIF"]
-    assert climbed.rungs[0]["models"] == [] or max(climbed.rungs[0]["models"]) < 4
+    assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "without the focal length of EXIF"]
+    assert climbed.attempts[0]["models"] == [] or max(climbed.attempts[0]["models"]) < 4
     assert "next: without the focal length of EXIF" in told
     assert climbed.models[0].num_reg_images() == 8
     (camera,) = climbed.models[0].cameras.values()

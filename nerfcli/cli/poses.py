@@ -78,6 +78,12 @@ def poses(
     holdout: Holdout = None,
     strict: Strict = False,
     min_registered: Annotated[float, typer.Option(help="Share of photos that must register.", min=0, max=1)] = 0.5,
+    component: Annotated[
+        int, typer.Option(help="Which model becomes the scene if the photos form several: 1 is the largest.", min=1)
+    ] = 1,
+    accept_refused: Annotated[
+        bool, typer.Option("--accept-refused", help="Write the scene even if the checks refuse the poses.")
+    ] = False,
     memory: Memory = None,
     time_limit: Annotated[
         str | None, typer.Option(help="Time it may take: 90s, 10m, 2h; then it ends, and a second call goes on.")
@@ -110,6 +116,7 @@ def poses(
       nerfcli poses photos/kitchen --strict --holdout block:0.15
       nerfcli poses statue/ --masks statue-masks/
       nerfcli poses photos/kitchen --intrinsics calibration/cameras.txt
+      nerfcli poses photos/flat -o second-room --component 2
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
     from nerfcli.holdout import DEFAULT_HOLDOUT
@@ -143,6 +150,8 @@ def poses(
         masks=str(masks.resolve()) if masks else None,
         holdout=holdout_rule(holdout) or DEFAULT_HOLDOUT,
         strict=strict,
+        component=component,
+        accept_refused=accept_refused,
     )
     limits = Limits(
         memory_bytes=memory_limit(memory),

@@ -12,23 +12,17 @@ import numpy as np
 import pycolmap
 
 from nerfcli.poses import held_out
+from nerfcli.poses.checks import Checks
+from nerfcli.poses.contradictions import Contradiction, strong_contradictions
 from nerfcli.poses.intrinsics import is_centred
 from nerfcli.poses.parallax import Turn
 from nerfcli.poses.two_views import Agreement, RotationError, VerifiedPair, agreements, rotation_errors
-from nerfcli.poses.view_graph import Bottlenecks, parts
 
 # Pairs with fewer verified matches hold nothing up and contradict nothing.
 MIN_MATCHES = 15
-# A pair with fewer may be mistaken even if no other joins its photos: measured, up to 81 between unlike walls.
-_CERTAIN_MATCHES = 100
-# A pair this strong, relative to the best chain that contradicts it, tells another story and not a mistake; up to the
-# second factor the chain is as good a story.
-_RIVAL_STRENGTH = 0.5
-_RIVAL_OF_EQUALS = 2.0
-# Share of all matches in such pairs. Measured: up to 0.013 in right models, 0.14 where the scene repeats itself.
+# Share of all matches in pairs that contradict the model strongly. Measured: up to 0.013 in right models, 0.14 where
+# the scene repeats itself.
 _MOST_RIVALS = 0.05
-# Share of the photos that may be left out because they contradict the others, which then still are a whole.
-_MOST_LEFT_OUT = 0.2
 _GROSS_DEG = 10.0
 # Measured: 0.08 at the most in right models, among them one with many mistaken pairs; 0.1 to 0.56 in wrong ones.
 _MOST_GROSS = 0.2
@@ -36,32 +30,23 @@ _LEAST_ANGLE_DEG = 1.5
 _LEAST_IN_FRONT = 0.95
 # Root mean square distance of the cameras from their middle, over the median distance to what they see.
 _LEAST_SPREAD = 0.003
-_FARTHEST = 10.0
 _FOCAL_RANGE = (0.3, 3.0)
 _MOST_HELD_OUT_PX = 4.0
 _LEAST_OBSERVATIONS = 15
 # In the report; the share counts all.
 _MOST_LISTED = 20
-
-
-@dataclass(frozen=True)
-class Contradiction:
-    """Two photos whose matches cannot be as the model says, and the strongest chain of pairs that can."""
-
-    one: str
-    other: str
-    matches: int
-    agreeing_chain: float
-
-    @property
-    def outweighs(self) -> bool:
-        """Whether the pair is stronger than what supports the model; a weak one must be so by half."""
-        return self.matches > (1.0 if self.matches >= _CERTAIN_MATCHES else 1.5) * self.agreeing_chain
-
-    @property
-    def is_rival(self) -> bool:
-        """Whether pair and chain are about as strong, and one is as likely to be mistaken as the other."""
-        return self.matches <= _RIVAL_OF_EQUALS * self.agreeing_chain
+# What is reported where it could not be measured.
+_UNKNOWN_GEOMETRY: dict[str, Any] = {
+    "triangulation_angle_deg": None,
+    "share_in_front": None,
+    "camera_spread_over_distance": None,
+}
+_UNKNOWN_HELD_OUT: dict[str, Any] = {
+    "observations": None,
+    "median_px": None,
+    "share_above_8_px": None,
+    "principal_points_central": None,
+}
 
 
 @dataclass(frozen=True)
@@ -90,52 +75,6 @@ class Verdict:
         return {"accepted": self.accepted, **asdict(self)}
 
 
-def leave_out_contradicting(
-    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]
-) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
-    """The model without the photos that its strongest evidence contradicts, and why each was left out, by image id.
-
-    Photos are held together by their pairs. Where the strongest chain of pairs runs over one that contradicts the
-    model, the smaller side may be anywhere. If all such sides together are few, they are left out; if they are many,
-    the model is not mended but left as it is, to be refused.
-    """
-    found = agreements(model, pairs)
-    placed = sorted(model.reg_image_ids())
-    contradicting = [c for c in strong_contradictions(model, found) if c.outweighs]
-    far = _far_away(model)
-    if not contradicting and not far:
-        return model, {}
-    sound = _spanning_tree(placed, found)
-    _, *sides = parts(placed, [(a.one, a.other) for a in sound if not a.contradicts]) if contradicting else [placed]
-    reasons = dict(far)
-    for photo in (photo for side in sides for photo in side if photo not in far):
-        pair = next((c for c in contradicting if model.image(photo).name in (c.one, c.other)), None)
-        if pair is None:
-            reasons[photo] = "contradicts the rest: hangs on a photo that does"
-        else:
-            other = pair.other if pair.one == model.image(photo).name else pair.one
-            reasons[photo] = f"contradicts the rest: its {pair.matches} matches with {other} cannot be"
-    if len(reasons) > _MOST_LEFT_OUT * len(placed):
-        return model, {}
-    rest = pycolmap.Reconstruction(model)
-    for photo in reasons:
-        rest.deregister_frame(rest.image(photo).frame_id)
-    return rest, reasons
-
-
-def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreement]) -> list[Contradiction]:
-    """Pairs that contradict a model and are at least half as strong as what supports it there, the strongest first."""
-    chains = Bottlenecks(
-        sorted(model.reg_image_ids()), [(a.one, a.other, a.matches * a.share) for a in found if not a.contradicts]
-    )
-    pairs = []
-    for a in sorted((a for a in found if a.contradicts), key=lambda a: -a.matches):
-        chain = chains.between(a.one, a.other)
-        if a.matches > _RIVAL_STRENGTH * chain:
-            pairs.append(Contradiction(model.image(a.one).name, model.image(a.other).name, a.matches, chain))
-    return pairs
-
-
 def judge(
     model: pycolmap.Reconstruction,
     pairs: Sequence[VerifiedPair],
@@ -146,8 +85,11 @@ def judge(
     threads: int,
     given: Collection[int] = (),
     fixed: Sequence[int] = (),
+    checks: Checks | None = None,
 ) -> Verdict:
     """Measure a model against the evidence and say whether it can be believed.
+
+    What cannot be measured is None, and speaks neither for the model nor against it.
 
     Args:
         model: a converged model.
@@ -158,15 +100,26 @@ def judge(
         threads: of the adjustment, -1 for all.
         given: ids of cameras whose intrinsics were known beforehand, whatever focal length they have.
         fixed: ids of cameras whose intrinsics stay as they are.
+        checks: runs the checks.
     """
-    found = agreements(model, pairs)
-    rotations = rotation_errors(model, pairs, seed=seed)
-    contradictions = strong_contradictions(model, found)
+    run = (Checks() if checks is None else checks).run
+    nothing: list[Any] = []
+    found: list[Agreement] = run("agreement of pairs", lambda: agreements(model, pairs), otherwise=nothing)
+    rotations: list[RotationError] = run(
+        "rotations of pairs", lambda: rotation_errors(model, pairs, seed=seed), otherwise=nothing
+    )
+    contradictions: list[Contradiction] = run(
+        "contradictions", lambda: strong_contradictions(model, found), otherwise=nothing
+    )
     total = sum(a.matches for a in found)
     share = sum(c.matches for c in contradictions) / total if total else 0.0
-    geometry = _geometry(model)
+    geometry = run("geometry of points and cameras", lambda: _geometry(model), otherwise=_UNKNOWN_GEOMETRY)
     focal = [_focal_measure(camera) for camera in _cameras_in_use(model)]
-    held = _held_out_measure(model, seed=seed, threads=threads, fixed=fixed)
+    held = run(
+        "unused observations",
+        lambda: _held_out_measure(model, seed=seed, threads=threads, fixed=fixed),
+        otherwise=_UNKNOWN_HELD_OUT,
+    )
     measures = {
         "pairs": _pair_measure(found),
         "strong_contradictions": [asdict(c) for c in contradictions[:_MOST_LISTED]],
@@ -191,32 +144,6 @@ def nothing_placed(turn: Turn | None) -> Verdict:
     """The verdict on a capture without a model: all that is known is whether the camera moved."""
     measures = {"parallax_px": None if turn is None else turn.parallax_px}
     return Verdict(measures, tuple(_no_baseline(turn, {"camera_spread_over_distance": None})))
-
-
-def _spanning_tree(placed: Sequence[int], found: Sequence[Agreement]) -> list[Agreement]:
-    """The strongest pairs that hold all photos together, as few as can be."""
-    taken: list[Agreement] = []
-    chains = {photo: {photo} for photo in placed}
-    for a in sorted(found, key=lambda a: -a.matches):
-        if chains[a.one] is not chains[a.other]:
-            taken.append(a)
-            joined = chains[a.one] | chains[a.other]
-            for photo in joined:
-                chains[photo] = joined
-    return taken
-
-
-def _far_away(model: pycolmap.Reconstruction) -> dict[int, str]:
-    """Photos much farther from the middle of all than the others are."""
-    photos = sorted(model.reg_image_ids())
-    centres = np.array([model.image(photo).projection_center() for photo in photos])
-    distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
-    radius = np.median(distances)
-    return {
-        photo: f"contradicts the rest: {distance / radius:.0f} times as far away as the others"
-        for photo, distance in zip(photos, distances, strict=True)
-        if radius > 0 and distance > _FARTHEST * radius
-    }
 
 
 def _geometry(model: pycolmap.Reconstruction) -> dict[str, Any]:

@@ -7,7 +7,9 @@ from typing import Any
 
 import pycolmap
 
-from nerfcli.poses.acceptance import MIN_MATCHES, Verdict, judge, leave_out_contradicting, nothing_placed
+from nerfcli.poses.acceptance import MIN_MATCHES, Verdict, judge, nothing_placed
+from nerfcli.poses.checks import Checks
+from nerfcli.poses.contradictions import leave_out_contradicting
 from nerfcli.poses.intrinsics import Candidate, choose_lenses
 from nerfcli.poses.job import Job
 from nerfcli.poses.localise import shared_pairs
@@ -41,26 +43,40 @@ def examine(
     report: Callable[[str, int, int], None],
     *,
     localised: Sequence[int] = (),
+    checks: Checks | None = None,
 ) -> Examined:
-    """Choose lenses, leave out what contradicts, adjust, judge, and measure the uncertainty of the largest model.
+    """Choose lenses, leave out what contradicts, adjust, judge, and measure the uncertainty of the first model.
 
-    localised: ids of images that are held by no pair but by points of the model.
+    A check that cannot be computed is left out and listed in `details["not_computed"]`; the others go on.
+
+    Args:
+        models: as the mapper left them; the first one is examined.
+        job: that they were made for.
+        report: called with ("check", done, total).
+        localised: ids of images that are held by no pair but by points of the model.
+        checks: runs the checks.
     """
+    checks = Checks() if checks is None else checks
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
     strong = [pair for pair in pairs if pair.matches >= FEW_MATCHES]
-    turn = best_turn(strong, sizes)
+    turn = checks.run("parallax", lambda: best_turn(strong, sizes), otherwise=None)
     joined = parts(job.image_ids, [(pair.one, pair.other) for pair in strong])
     details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
     if not models:
-        return Examined(None, nothing_placed(turn), {}, {}, details)
+        return Examined(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})
     numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
     report("check", 0, 4)
-    held = shared_pairs(models[0], localised, min_matches=MIN_MATCHES)
-    model, left_out = leave_out_contradicting(models[0], [*pairs, *held])
+    mapped = with_pose_only(models[0])
+
+    def without_contradicting() -> tuple[pycolmap.Reconstruction, dict[int, str]]:
+        held = shared_pairs(mapped, localised, min_matches=MIN_MATCHES)
+        return leave_out_contradicting(mapped, [*pairs, *held])
+
+    model, left_out = checks.run("contradicting photos", without_contradicting, otherwise=(mapped, {}))
     report("check", 1, 4)
-    model, tried = _with_lenses(model, job)
+    model, tried = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=(model, []))
     details["lenses"] = [asdict(candidate) for candidate in tried]
     report("check", 2, 4)
     verdict = judge(
@@ -72,14 +88,27 @@ def examine(
         threads=job.threads,
         given=job.given_cameras,
         fixed=job.fixed_cameras,
+        checks=checks,
     )
     report("check", 3, 4)
-    blur = {}
+    blur: dict[int, float] = {}
     if verdict.accepted and model.num_reg_images() <= _MOST_PHOTOS_FOR_BLUR:
-        blur = pose_blur_px(model, threads=job.threads, fixed=job.fixed_cameras)
+        blur = checks.run(
+            "pose uncertainty",
+            lambda: pose_blur_px(model, threads=job.threads, fixed=job.fixed_cameras),
+            otherwise=blur,
+        )
     report("check", 4, 4)
     reasons = {numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
+    details["not_computed"] = checks.not_computed
     return Examined(model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details)
+
+
+def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Copy a model without the images that have no pose: pycolmap's covariance raises on them."""
+    copy = pycolmap.Reconstruction(model)
+    copy.tear_down()
+    return copy
 
 
 def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> tuple[pycolmap.Reconstruction, list[Candidate]]:

@@ -54,7 +54,8 @@ class Job:
     they are found, pairs has them too. rung: "" or the name of an attempt with other features, which has its own
     database and stages: `replace(job, rung="full-size", max_image_size=...)`. masks: one per photo, or none at all for
     a capture without masks; their pictures are in mask_folder. held_out: photos that are placed when all else is fixed.
-    The rest is as in `PoseSettings`.
+    component: which of the models becomes the scene, 1 for the largest. skipped_checks: (name, reason) of checks that
+    ended an earlier process. The rest is as in `PoseSettings`.
     """
 
     folder: str
@@ -72,6 +73,8 @@ class Job:
     masks: tuple[LaidOutMask, ...] = ()
     rung: str = ""
     held_out: tuple[int, ...] = ()
+    component: int = 1
+    skipped_checks: tuple[tuple[str, str], ...] = ()
 
     @property
     def photos(self) -> Path:
@@ -115,10 +118,16 @@ def write_job(path: Path, job: Job) -> None:
 
 
 def read_job(path: Path) -> Job:
-    """A job that `write_job` wrote."""
-    content = json.loads(path.read_text(encoding="utf-8"))
+    """Read a job that `write_job` wrote."""
+    return job_from_json(json.loads(path.read_text(encoding="utf-8")))
+
+
+def job_from_json(content: dict[str, Any]) -> Job:
+    """Make a job of what `dataclasses.asdict` made of one, after a way through JSON."""
+    content = dict(content)
     content["groups"] = tuple(_group(group) for group in content["groups"])
     content["pairs"] = tuple((i, j) for i, j in content["pairs"])
+    content["skipped_checks"] = tuple((check, why) for check, why in content["skipped_checks"])
     for name in ("files", "names", "keys", "held_out"):
         content[name] = tuple(content[name])
     content["masks"] = tuple(LaidOutMask(**mask) for mask in content["masks"])

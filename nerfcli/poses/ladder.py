@@ -6,7 +6,7 @@ for more matches and more features.
 
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from nerfcli.poses.intrinsics import field_of_view_deg
 from nerfcli.poses.job import Job, Report, Tell
 from nerfcli.poses.lens_family import as_fisheye
 from nerfcli.poses.localise import left_out, localise
+from nerfcli.poses.mapped import Mapped
 from nerfcli.poses.mapping import Start, map_photos
 from nerfcli.poses.merging import merge_models
 from nerfcli.poses.pairs import all_pairs
@@ -46,23 +47,9 @@ LOW_ANGLES = Start(
 )
 
 
-@dataclass(frozen=True)
-class Climb:
-    """What the ladder led to: the models, largest first, the job whose features and matches they are of, the rungs.
-
-    A rung is {"what", "models": sizes, largest first}; the one that looks for single photos has "photos" too: what was
-    found for each. localised: ids of the images that are placed by the model's points, without a pair that holds them.
-    """
-
-    models: list[pycolmap.Reconstruction]
-    job: Job
-    rungs: list[dict[str, Any]]
-    localised: tuple[int, ...] = ()
-
-
 class _Ladder:
     def __init__(self, job: Job, report: Report, tell: Tell) -> None:
-        self.best = Climb([], job, [])
+        self.best = Mapped([], job, [])
         self.rungs: list[dict[str, Any]] = []
         self._report = report
         self._tell = tell
@@ -102,7 +89,7 @@ class _Ladder:
     def attempt_instead(self, what: str, job: Job, start: Start) -> None:
         """Map once; the result counts if it places as many photos as the best so far, which rests on something else."""
         best = self.best
-        self.best = Climb([], job, [])
+        self.best = Mapped([], job, [])
         self.attempt(what, job, start)
         if _placed(self.best.models) < _placed(best.models):
             self.best = best
@@ -147,14 +134,14 @@ class _Ladder:
     def _take(self, what: str, models: list[pycolmap.Reconstruction], job: Job) -> None:
         self.rungs.append({"what": what, "models": [model.num_reg_images() for model in models]})
         if _placed(models) > _placed(self.best.models):
-            self.best = Climb(models, job, self.rungs)
+            self.best = Mapped(models, job, self.rungs)
 
     def share(self, candidates: int) -> float:
         """Of the photos that can be placed, the share that the best model places."""
         return _placed(self.best.models) / max(candidates, 1)
 
 
-def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Climb:
+def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     """Map a job's photos, with as many attempts as it takes.
 
     The first attempt has pycolmap's own thresholds. If it places less than half of the photos with a focal length from
@@ -194,7 +181,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Climb:
     ladder.find_left_out("single photos, by the points that they show")
     if len(ladder.rungs) > 1:
         ladder.tell_results()
-    return replace(ladder.best, rungs=ladder.rungs)
+    return replace(ladder.best, attempts=ladder.rungs)
 
 
 def _other_starts(ladder: _Ladder, job: Job) -> None:

@@ -1,15 +1,18 @@
 """From matches to a model: one run of the incremental mapper, and COLMAP files."""
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 from nerfcli.poses.job import Job, Report
+from nerfcli.poses.mapped import file_keys, mapping_key, read_models, write_models
 from nerfcli.poses.reasons import FEW_MATCHES
-from nerfcli.poses.stages import file_key
+from nerfcli.poses.stages import file_key, stage_key
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,20 @@ def describe_cameras(model: pycolmap.Reconstruction, job: Job) -> list[dict[str,
     ]
 
 
+def with_colours(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
+    """Return the model with colours for its points: a copy if most have none, as after a merger.
+
+    Raises:
+        RuntimeError, ValueError: pycolmap cannot read a photo.
+    """
+    black = sum(not np.any(point.color) for point in model.points3D.values())
+    if 2 * black <= model.num_points3D():
+        return model
+    copy = pycolmap.Reconstruction(model)
+    copy.extract_colors_for_all_images(str(job.photos), num_threads=job.threads)
+    return copy
+
+
 def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
     """Write sparse/0 into the job's folder, with the photos' own names."""
     names = dict(zip(job.files, job.names, strict=True))
@@ -73,7 +90,27 @@ def _model_folder(job: Job) -> Path:
 def map_photos(
     job: Job, report: Report, *, attempt: int, start: Start, base: pycolmap.Reconstruction | None = None
 ) -> list[pycolmap.Reconstruction]:
-    """One run of the incremental mapper, from nothing or from a model; its models, largest first, errors filled in."""
+    """Run the incremental mapper once, from nothing or from a model, unless an earlier call has done so.
+
+    Returns:
+        Its models as they are on disk, largest first, errors filled in.
+    """
+    output = Path(job.folder) / f"{job.rung}models_{attempt}"
+    base_folder = output.with_name(f"{output.name}_base")
+    if base is not None:
+        base_folder.mkdir(exist_ok=True)
+        base.write(str(base_folder))
+    key = stage_key(mapping_key(job), attempt, asdict(start), base is not None and file_keys(base_folder))
+    if (found := read_models(output, key)) is None:
+        models = _run_mapper(job, report, _options(job, attempt=attempt, start=start), base and base_folder)
+        write_models(output, models, key)
+        found = read_models(output, key)
+    if found is None:
+        raise OSError(f"the models in {output} cannot be read back")
+    return found[0]
+
+
+def _options(job: Job, *, attempt: int, start: Start) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = job.threads
     seed = job.seed + attempt
@@ -91,13 +128,12 @@ def map_photos(
     options.mapper.abs_pose_min_num_inliers = FEW_MATCHES
     if start.init_pair:
         options.init_image_id1, options.init_image_id2 = start.init_pair
-    output = Path(job.folder) / f"{job.rung}models_{attempt}"
-    output.mkdir(exist_ok=True)
-    base_folder = ""
-    if base is not None:
-        base_folder = str(output / "base")
-        (output / "base").mkdir(exist_ok=True)
-        base.write(base_folder)
+    return options
+
+
+def _run_mapper(
+    job: Job, report: Report, options: pycolmap.IncrementalPipelineOptions, base_folder: Path | None
+) -> list[pycolmap.Reconstruction]:
     placed = 0
 
     def started() -> None:
@@ -110,15 +146,16 @@ def map_photos(
         placed += 1
         report("map", min(placed, len(job.files)), len(job.files))
 
-    models = pycolmap.incremental_mapping(
-        str(job.database),
-        str(job.photos),
-        str(output),
-        options=options,
-        input_path=base_folder,
-        initial_image_pair_callback=started,
-        next_image_callback=placed_one,
-    )
+    with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
+        models = pycolmap.incremental_mapping(
+            str(job.database),
+            str(job.photos),
+            output,
+            options=options,
+            input_path="" if base_folder is None else str(base_folder),
+            initial_image_pair_callback=started,
+            next_image_callback=placed_one,
+        )
     for model in models.values():
         model.update_point_3d_errors()
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)

@@ -1,7 +1,7 @@
 """What became of each photo: the content of poses_report.json."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -41,7 +41,9 @@ class PosesReport:
     seconds: per stage, of the call that wrote the report; what an earlier one left is not in them. models: the sizes of
     all models found, the kept one first. attempts: what each rung of the ladder gave. matching: the rule for pairs, and
     their number. points: how many the kept model has. intrinsics: what was given of them, see `cameras.Grouped`.
-    strict: how held-out photos were placed afterwards, see `strict.place_held_out`.
+    strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components: each model's photos and
+    why it is apart from the largest, in the order of sizes, by which `--component` counts. not_computed: checks that
+    could not be computed, and why. not_finite: where the report has null for a number that was not finite.
     """
 
     registered: int
@@ -62,6 +64,9 @@ class PosesReport:
     parts: tuple[int, ...]
     intrinsics: dict[str, Any] | None = None
     strict: dict[str, Any] | None = None
+    components: tuple[dict[str, Any], ...] = ()
+    not_computed: dict[str, str] = field(default_factory=dict)
+    not_finite: dict[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and dictionaries."""
@@ -108,7 +113,32 @@ def make_report(
         parts=tuple(result["parts"]),
         intrinsics=intrinsics,
         strict=result.get("strict"),
+        components=tuple(_with_names(component, photos) for component in result["components"]),
+        not_computed=result["not_computed"],
+        not_finite=result["not_finite"],
     )
+
+
+def closing_notes(report: PosesReport) -> list[str]:
+    """Return what the user should know of a result that is kept, a sentence each."""
+    notes = []
+    if len(report.parts) > 1:
+        sizes = " + ".join(str(size) for size in report.parts)
+        notes.append(f"the photos fall into parts that share no matches: {sizes} photos")
+    for number, component in enumerate(report.components, start=1):
+        if number == report.settings.component:
+            continue
+        names = component["photos"]
+        some = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
+        why = f": {component['apart']}" if component["apart"] else ""
+        notes.append(f"component {number} has {component['size']} photos ({some}){why}; --component {number} takes it")
+    for check, why in report.not_computed.items():
+        notes.append(f"a check could not be computed ({check}): {why}")
+    return notes
+
+
+def _with_names(component: Mapping[str, Any], photos: Photos) -> dict[str, Any]:
+    return {**component, "photos": [photos.names[number] for number in component["photos"]]}
 
 
 def _blur_summary(images: Iterable[ImageReport]) -> dict[str, Any] | None:

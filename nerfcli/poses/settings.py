@@ -35,7 +35,8 @@ class PoseSettings:
     min_registered: the share of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a text
     file with two names per line, these pairs are compared and no others. masks: a folder of masks, see `media.masks`.
     holdout: the rule by which photos are held out, see `nerfcli.holdout`. strict: whether these are placed afterwards,
-    with all that the others gave fixed, see `strict`.
+    with all that the others gave fixed, see `strict`. component: which of the models that share no frame becomes the
+    scene, 1 for the largest. accept_refused: whether a model that the checks refuse becomes the scene all the same.
     """
 
     max_image_size: int = QUALITIES["default"][0]
@@ -49,6 +50,8 @@ class PoseSettings:
     masks: str | None = None
     holdout: str = DEFAULT_HOLDOUT
     strict: bool = False
+    component: int = 1
+    accept_refused: bool = False
 
 
 @dataclass(frozen=True)
@@ -73,5 +76,7 @@ def check_settings(settings: PoseSettings) -> None:
         raise ValueError(f"camera_model must be one of {', '.join(CAMERA_MODELS)}, got {settings.camera_model}")
     if not 0 <= settings.min_registered <= 1:
         raise ValueError(f"min_registered must be within 0...1, got {settings.min_registered}")
+    if settings.component < 1:
+        raise ValueError(f"component must be 1 or more, got {settings.component}")
     if settings.pairing not in PAIRINGS:
         raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {settings.pairing}")

@@ -105,7 +105,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     whole["models"][0] = sorted([*whole["models"][0], *placed])
     whole["left_out"] |= reasons
     whole["evidence"] = evidence(job)
-    whole["pairs"] = len(training.pairs) + len(across)
+    whole["pairs"] = result["pairs"] + len(across)
     whole["strict"] = {
         "held_out": [job.names[number] for number in job.held_out],
         "placed": {found.name: {"inliers": found.inliers, "error_px": found.error_px} for found in placed.values()},
@@ -197,6 +197,10 @@ def _renumbered(job: Job, training: Job, result: Mapping[str, Any]) -> dict[str,
         **result,
         "models": [sorted(number[index] for index in model) for model in result["models"]],
         "evidence": [by_number.get(index, nothing) for index in range(len(job.files))],
+        "components": [
+            {**component, "photos": sorted(number[index] for index in component["photos"])}
+            for component in result["components"]
+        ],
         **{
             key: {str(number[int(index)]): value for index, value in result[key].items()}
             for key in ("left_out", "pose_blur_px")

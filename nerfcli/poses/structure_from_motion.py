@@ -8,8 +8,8 @@ of the photos that are stored lying down, in the work folder.
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from nerfcli.errors import UserError
 from nerfcli.holdout import names_held_out
 from nerfcli.media.images import list_images
 from nerfcli.poses.cameras import GivenIntrinsics, Grouped, group_by_given, group_photos
+from nerfcli.poses.checks import UNDERWAY
 from nerfcli.poses.job import Job, write_job
 from nerfcli.poses.layout import lay_out
 from nerfcli.poses.masks import lay_out_masks
@@ -26,12 +27,12 @@ from nerfcli.poses.pairs import Pairing, choose_pairs
 from nerfcli.poses.pairs_file import read_pairs
 from nerfcli.poses.photos import Photos, find_photos
 from nerfcli.poses.plan import Plan, make_plan
-from nerfcli.poses.report import PosesReport, make_report, refusal
+from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusal
 from nerfcli.poses.settings import Limits, PoseSettings, check_settings
 from nerfcli.poses.stages import file_key
 from nerfcli.poses.strict import held_out_last
-from nerfcli.poses.supervise import run_worker
-from nerfcli.poses.workspace import is_in_the_making, publish, workspace
+from nerfcli.poses.supervise import WorkerDiedError, run_worker
+from nerfcli.poses.workspace import POINTS_FILE, is_in_the_making, keep_refused, publish, workspace
 
 
 def estimate_poses(
@@ -79,15 +80,7 @@ def estimate_poses(
     with workspace(scene_dir) as space:
         work = space.folder
         job = _prepare(photos, settings, grouped=grouped, pairing=pairing, work=work, notify=notify)
-        write_job(work / "job.json", job)
-        run_worker(
-            work / "job.json",
-            threads=settings.threads,
-            progress=progress,
-            limits=limits,
-            lock=space.lock,
-            notify=notify,
-        )
+        _work(job, work, limits=limits, lock=space.lock, progress=progress, notify=notify)
         result = _read_json(work / "result.json")["content"]  # that the worker has written or found whole
         result["seconds"]["total"] = round(time.perf_counter() - start, 3)
         matching = {"rule": pairing.rule, "pairs": result["pairs"]}
@@ -96,8 +89,12 @@ def estimate_poses(
         if Path(settings.holdout).is_file():
             matching["holdout_key"] = file_key(Path(settings.holdout))
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
+        if settings.component > max(len(report.models), 1):
+            raise _no_such_component(report, photos_dir)
         if error := refusal(report, photos_dir):
-            raise _refused(error, report, scene_dir)
+            if not (settings.accept_refused and report.models):
+                raise _refused(error, report, scene_dir)
+            notify(f"accepted all the same, as --accept-refused says: {error.message}")
 
         def describe() -> None:
             write_json(scene_dir / "poses_report.json", report.to_json())
@@ -113,11 +110,9 @@ def estimate_poses(
                 split=_split(report, settings.holdout),
             )
 
-        publish(scene_dir, describe)
-    if len(report.parts) > 1:
-        notify(f"the photos fall into parts that share no matches: {_sizes(report.parts)} photos")
-    for size in report.models[1:]:
-        notify(f"{size} photos form another model, which shares too little with the kept one of {report.models[0]}")
+        publish(scene_dir, describe, keep_models=len(report.models) > 1)
+    for note in closing_notes(report):
+        notify(note)
     return report
 
 
@@ -162,17 +157,52 @@ def _is_same(scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given
     pairs_key = None if settings.pairs_file is None else file_key(Path(settings.pairs_file))
     holdout_key = file_key(Path(settings.holdout)) if Path(settings.holdout).is_file() else None
     known = report.get("intrinsics")
+    wanted_settings = asdict(settings)
+    for name in ("threads", "accept_refused"):
+        del wanted_settings[name]
     if (known and (known["use"], known["key"])) != (given and (given.use, given.calibration.key)):
         return False
     made_with = asdict(PoseSettings()) | report["settings"]  # a setting that it does not know yet had its default
-    wanted = {key: value for key, value in asdict(settings).items() if key != "threads"}
     return (
         made.resolve() == photos_dir.resolve()
         and sorted(image["name"] for image in report["images"]) == sorted(names)
         and report["matching"].get("pairs_file_key") == pairs_key
         and report["matching"].get("holdout_key") == holdout_key
-        and all(made_with[key] == value for key, value in wanted.items())
+        and all(made_with[key] == value for key, value in wanted_settings.items())
     )
+
+
+def _work(
+    job: Job,
+    work: Path,
+    *,
+    limits: Limits,
+    lock: int,
+    progress: Callable[[str, int, int], None],
+    notify: Callable[[str], None],
+) -> None:
+    """Run the worker; where a check ends it, run it again without that check, for the model is on disk by then."""
+    since = time.monotonic()
+    while True:
+        (work / UNDERWAY).unlink(missing_ok=True)
+        write_job(work / "job.json", job)
+        try:
+            run_worker(
+                work / "job.json",
+                threads=job.threads,
+                progress=progress,
+                limits=limits,
+                since=since,
+                lock=lock,
+                notify=notify,
+            )
+            return
+        except WorkerDiedError as error:
+            if not (work / UNDERWAY).exists():
+                raise
+            check = _read_json(work / UNDERWAY)["check"]
+            notify(f"a check could not be computed ({check}): {error.message}; the others go on without it")
+            job = replace(job, skipped_checks=(*job.skipped_checks, (check, error.message)))
 
 
 def _prepare(
@@ -204,6 +234,7 @@ def _prepare(
         threads=settings.threads,
         masks=lay_out_masks(photos, files, masks, folder=work / "masks", notify=notify) if masks else (),
         held_out=tuple(sorted(photos.names.index(name) for name in held_out)),
+        component=settings.component,
     )
     return held_out_last(job)
 
@@ -232,15 +263,28 @@ def _check_destination(scene_dir: Path, photos_dir: Path) -> None:
 
 
 def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
-    """The error for a result that is not kept; its numbers stay for the user to read, but nothing of a scene."""
+    """Make the error for a result that is refused; its numbers and its model stay, but nothing that is a scene."""
     older = (scene_dir / scene.SCENE_FILE).is_file()
-    path = (scene_dir / "work" if older else scene_dir) / "poses_report.json"
+    folder = scene_dir / "work" if older else scene_dir
+    path = folder / "poses_report.json"
     write_json(path, report.to_json())
-    return UserError(error.message, f"{error.hint}; all numbers are in {path}", error.exit_code)
+    if not report.models:
+        return UserError(error.message, f"{error.hint}; all numbers are in {path}", error.exit_code)
+    model = keep_refused(scene_dir, folder)
+    hint = (
+        f"{error.hint}; the numbers are in {path}, the refused model of {report.registered} photos is in {model} "
+        f"({POINTS_FILE} opens in any viewer of meshes), and --accept-refused makes it the scene"
+    )
+    return UserError(error.message, hint, error.exit_code)
 
 
-def _sizes(models: Sequence[int]) -> str:
-    return " + ".join(str(size) for size in models) or "none"
+def _no_such_component(report: PosesReport, photos_dir: Path) -> UserError:
+    sizes = " + ".join(str(component["size"]) for component in report.components) or "no"
+    count = len(report.components)
+    return UserError(
+        f"there is no component {report.settings.component}: the photos of {photos_dir} form {count} ({sizes} photos)",
+        f"choose --component 1 to {count}" if count else "leave out --component",
+    )
 
 
 def _read_json(path: Path) -> dict[str, Any]:

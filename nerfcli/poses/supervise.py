@@ -32,12 +32,17 @@ _LOOK_EVERY_SECONDS = 0.1
 _FULL_DISK_BYTES = 2_000_000
 
 
+class WorkerDiedError(UserError):
+    """The worker ended by itself, neither at a limit nor for want of room on the disk."""
+
+
 def run_worker(
     job_path: Path,
     *,
     threads: int,
     progress: Callable[[str, int, int], None],
     limits: Limits = Limits(),
+    since: float | None = None,
     lock: int | None = None,
     notify: Callable[[str], None] = lambda note: None,
 ) -> None:
@@ -48,11 +53,13 @@ def run_worker(
         threads: for OpenMP inside pycolmap, -1 for all.
         progress: told (stage, done, total).
         limits: the worker is ended when it goes beyond one of them.
+        since: the time of `time.monotonic` from which the limit of time counts; None for now.
         lock: a descriptor that the worker inherits.
         notify: told what the user should know, one sentence at a time.
 
     Raises:
-        UserError: the worker died or was ended; the text says while doing what, and its last words.
+        WorkerDiedError: the worker died; the text says while doing what, and its last words.
+        UserError: it was ended at a limit, or the disk is full.
     """
     log = job_path.with_name("worker.log")
     package_root = str(Path(nerfcli.__file__).parent.parent)
@@ -74,7 +81,7 @@ def run_worker(
             # Ctrl-C on a terminal goes to its whole process group; only we answer it, by ending the worker.
             start_new_session=True,
         )
-        guard = _Guard(worker, limits)
+        guard = _Guard(worker, limits, time.monotonic() if since is None else since)
         try:
             assert worker.stdout is not None
             for line in worker.stdout:
@@ -109,17 +116,17 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
             f"free space on the disk, or choose another one with -o; {_GO_ON}",
         )
     if returncode == -signal.SIGKILL:
-        return UserError(
+        return WorkerDiedError(
             f"structure from motion was killed while {stage}, most likely for want of memory",
             f"{_LESS_MEMORY}; {_GO_ON}",
             OUT_OF_MEMORY,
         )
     if "bad_alloc" in log or "MemoryError" in log:
-        return UserError(
+        return WorkerDiedError(
             f"structure from motion ran out of memory while {stage}", f"{_LESS_MEMORY}; {_GO_ON}", OUT_OF_MEMORY
         )
     how = signal.Signals(-returncode).name if returncode < 0 else f"exit status {returncode}"
-    return UserError(
+    return WorkerDiedError(
         f"structure from motion died ({how}) while {stage}: {_last_words(log)}",
         "try once more with one thread; if it dies again, leave out the photos that came last, or report it",
     )
@@ -128,11 +135,11 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
 class _Guard:
     """Watches a worker from a thread, and ends it when it goes beyond a limit; `reached` then says which."""
 
-    def __init__(self, worker: subprocess.Popen[bytes], limits: Limits):
+    def __init__(self, worker: subprocess.Popen[bytes], limits: Limits, since: float):
         self.reached: str | None = None
         self._worker = worker
         self._limits = limits
-        self._end = None if limits.seconds is None else time.monotonic() + limits.seconds
+        self._end = None if limits.seconds is None else since + limits.seconds
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()

@@ -18,19 +18,21 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-import nerfcli
+from nerfcli.finite import finite
+from nerfcli.poses.checks import Checks
+from nerfcli.poses.components import describe_components
 from nerfcli.poses.database import discard_if_damaged, evidence, name_images
 from nerfcli.poses.examine import examine
 from nerfcli.poses.features import extract, match, start_matching
 from nerfcli.poses.job import Job, Report, Tell, read_job
 from nerfcli.poses.ladder import climb
-from nerfcli.poses.mapping import describe_cameras, model_keys, photo_numbers, write_model
+from nerfcli.poses.mapped import Mapped, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
 from nerfcli.poses.retrieval import with_neighbours
 from nerfcli.poses.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.strict import place_held_out, training_part
@@ -51,44 +53,98 @@ def main(job_path: str) -> None:
 
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
-    """Extraction, matching, mapping; each goes on from what is there."""
-    discard_if_damaged(job.database)
-    if job.held_out:
-        _solve_strictly(job, report, tell)
+    """Extract, match, map, check; each goes on from what earlier calls left."""
+    result, key = Path(job.folder) / RESULT, result_key(job)
+    if _is_complete(job, key):
+        _name_images(job)
         return
-    seconds: dict[str, float] = {}
-    job = _matched(job, report, seconds=seconds)
-    result, key = Path(job.folder) / RESULT, mapping_key(job)
-    if not _is_complete(job, key):
-        result.unlink(missing_ok=True)
-        write_stage(result, key, _map(job, report, tell, seconds=seconds))
-    name_images(job)
+    result.unlink(missing_ok=True)
+    found = _solve_strictly(job, report, tell) if job.held_out else _estimate(job, report, tell)
+    found, replaced = finite(found)
+    found["not_finite"] = replaced
+    write_stage(result, key, found)
+    _name_images(job)
 
 
-def _solve_strictly(job: Job, report: Report, tell: Tell) -> None:
-    """All that with the training photos alone; the held-out ones are placed in what comes of it."""
-    result, key = Path(job.folder) / RESULT, mapping_key(job)
-    if not _is_complete(job, key):
-        result.unlink(missing_ok=True)
-        seconds: dict[str, float] = {}
-        training = _matched(training_part(job), report, seconds=seconds)
-        found = _map(training, report, tell, seconds=seconds)
-        with _timed(seconds, "place"):
-            found = place_held_out(job, training, found, report)
-        found["model_files"] = model_keys(job)  # which the held-out photos are in now
-        write_stage(result, key, found)
-    name_images(job)
+def result_key(job: Job) -> str:
+    """Return a hash of all that the result depends on."""
+    return stage_key(mapping_key(job), job.component, job.skipped_checks)
 
 
-def _matched(job: Job, report: Report, *, seconds: dict[str, float]) -> Job:
-    """Features and matches; the job with its pairs complete."""
+def _solve_strictly(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
+    """Estimate from the training photos alone, then place the held-out ones in the model."""
+    training = training_part(job)
+    found = _estimate(training, report, tell)
+    with _timed(found["seconds"], "place"):
+        found = place_held_out(job, training, found, report)
+    found["model_files"] = model_keys(job)  # which the held-out photos are in now
+    return found
+
+
+def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
+    """Write `sparse/0` if there is a model, and return what the report needs."""
+    seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
+    mapped = _mapped(job, report, tell, seconds=seconds)
+    checks = Checks(Path(job.folder), skip=dict(job.skipped_checks))
+    with _timed(seconds, "check"):
+        wanted, others = _split(mapped.models, job.component)
+        examined = examine(wanted, mapped.job, report, localised=mapped.localised, checks=checks)
+    model = examined.model
+    placed = [] if model is None else photo_numbers(model, job)
+    result: dict[str, Any] = {
+        "seconds": seconds,
+        "attempts": mapped.attempts,
+        "evidence": evidence(mapped.job),
+        "pairs": len(mapped.job.pairs),
+        "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
+        "models": [placed, *(photo_numbers(other, job) for other in others)] if mapped.models else [],
+        "left_out": {str(number): reason for number, reason in examined.left_out.items()},
+        "pose_blur_px": {str(number): px for number, px in examined.blur_px.items()},
+        "verdict": examined.verdict.to_json(),
+        "components": describe_components(mapped.models, mapped.job),
+        **examined.details,
+    }
+    if model is not None:
+        model = _coloured(model, job, checks)
+        result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
+        result["cameras"] = describe_cameras(model, job)
+        result["points"] = model.num_points3D()
+        write_model(model, job)
+    result["model_files"] = model_keys(job) if model is not None else {}
+    return result
+
+
+def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> Mapped:
+    """Return the models of an earlier call if they are whole, or map the photos; they are on disk when this returns."""
+    discard_if_damaged(job.database)
+    key = mapping_key(job)
+    mapped = read_mapped(job, key)
+    if mapped is not None:
+        tell("the photos are mapped already: only the checks are left")
+        return mapped
     with _timed(seconds, "extract"):
         extract(job, report)
     with _timed(seconds, "match"):
-        job = with_neighbours(job, report)
-        start_matching(job, job.pairs)
-        match(job, job.pairs, report)
-    return job
+        matched = with_neighbours(job, report)
+        start_matching(matched, matched.pairs)
+        match(matched, matched.pairs, report)
+    with _timed(seconds, "map"):
+        write_mapped(climb(matched, report, tell), key)
+    mapped = read_mapped(job, key)
+    if mapped is None:
+        raise OSError(f"the models in {job.folder} cannot be read back")
+    return mapped
+
+
+def _coloured(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> pycolmap.Reconstruction:
+    return checks.run("colours of points", lambda: with_colours(model, job), otherwise=model)
+
+
+def _split(
+    models: list[pycolmap.Reconstruction], component: int
+) -> tuple[list[pycolmap.Reconstruction], list[pycolmap.Reconstruction]]:
+    """Return the wanted model, as a list of one or none, and the others."""
+    return models[component - 1 : component], [*models[: component - 1], *models[component:]]
 
 
 def _is_complete(job: Job, key: str) -> bool:
@@ -97,41 +153,10 @@ def _is_complete(job: Job, key: str) -> bool:
     return there is not None and there["model_files"].items() <= model_keys(job).items()
 
 
-def mapping_key(job: Job) -> str:
-    """A hash of all that the model depends on."""
-    content = asdict(job)
-    for name in ("folder", "originals", "threads"):
-        del content[name]
-    return stage_key(content, nerfcli.__version__, pycolmap.__version__)
-
-
-def _map(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> dict[str, Any]:
-    """Writes `sparse/0` if there is a model and returns what the report needs."""
-    with _timed(seconds, "map"):
-        climbed = climb(job, report, tell)
-    with _timed(seconds, "check"):
-        examined = examine(climbed.models, climbed.job, report, localised=climbed.localised)
-    model = examined.model
-    placed = [] if model is None else photo_numbers(model, job)
-    result: dict[str, Any] = {
-        "seconds": seconds,
-        "attempts": climbed.rungs,
-        "evidence": evidence(climbed.job),
-        "pairs": len(climbed.job.pairs),
-        "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
-        "models": [placed, *(photo_numbers(other, job) for other in climbed.models[1:])] if climbed.models else [],
-        "left_out": {str(number): reason for number, reason in examined.left_out.items()},
-        "pose_blur_px": {str(number): px for number, px in examined.blur_px.items()},
-        "verdict": examined.verdict.to_json(),
-        **examined.details,
-    }
-    if model is not None:
-        result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
-        result["cameras"] = describe_cameras(model, job)
-        result["points"] = model.num_points3D()
-        write_model(model, job)
-    result["model_files"] = model_keys(job) if model is not None else {}
-    return result
+def _name_images(job: Job) -> None:
+    """Give the images of the database the photos' own names, if it is there."""
+    if job.database.exists():
+        name_images(job)
 
 
 @contextmanager

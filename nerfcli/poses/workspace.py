@@ -2,6 +2,7 @@
 
     SCENE/work/          what is complete so far: see `stages`
     SCENE/database.db    features and matches, for the next time; COLMAP reads it
+    SCENE/refused-model/ instead of a scene: what the checks refused
     SCENE/scene.json     written last: with it the folder is a scene
 
 Whoever works in the folder holds its lock. A process that is killed lets go of it, and the next one goes on.
@@ -16,9 +17,13 @@ from pathlib import Path
 from nerfcli.atomic import atomic_folder, clear_leftovers
 from nerfcli.exclusive import exclusive
 from nerfcli.poses.job import database_path
+from nerfcli.poses.mapped import FIRST
 from nerfcli.scene import SCENE_FILE
 
 _LOCK = "poses.lock"
+# A model that the checks refuse; nothing takes a folder of this name for a scene.
+REFUSED = "refused-model"
+POINTS_FILE = "points.ply"
 
 
 @dataclass(frozen=True)
@@ -48,19 +53,38 @@ def is_in_the_making(scene_dir: Path) -> bool:
     return (scene_dir / "work" / _LOCK).is_file()
 
 
-def publish(scene_dir: Path, describe: Callable[[], None]) -> None:
+def publish(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool) -> None:
     """Put the model that the worker left into its place; then `describe` writes the report and, last, scene.json.
 
     Until then the folder is no scene, and calling again goes on from the complete model.
+
+    Args:
+        scene_dir: the scene's folder.
+        describe: writes the report and scene.json.
+        keep_models: whether the mapped models stay in the work folder, for another component of them.
     """
     work = scene_dir / "work"
     (scene_dir / SCENE_FILE).unlink(missing_ok=True)
     with atomic_folder(scene_dir / "sparse") as sparse:
         shutil.copytree(work / "sparse" / "0", sparse / "0")
     describe()
+    shutil.rmtree(scene_dir / REFUSED, ignore_errors=True)
+    kept = {FIRST} if keep_models else set()
     for path in work.iterdir():
-        if path.suffix not in (".json", ".lock") or path.stem in ("job", "result"):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if path.name in kept or (path.suffix in (".json", ".lock") and path.stem not in ("job", "result")):
+            continue
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def keep_refused(scene_dir: Path, folder: Path) -> Path:
+    """Copy the model that the worker left to `folder`/refused-model, with its points as PLY, and return where it is."""
+    import pycolmap
+
+    found = scene_dir / "work" / "sparse" / "0"
+    with atomic_folder(folder / REFUSED) as target:
+        shutil.copytree(found, target, dirs_exist_ok=True)
+        pycolmap.Reconstruction(str(found)).export_PLY(str(target / POINTS_FILE))
+    return folder / REFUSED
 
 
 def database_bytes(scene_dir: Path) -> int:

@@ -1,0 +1,296 @@
+"""Checks never lose a model: whatever is wrong with it, they end with a report that JSON can hold.
+
+Models are synthetic (benchmarks/synthetic_captures.py) and then damaged: photos without a pose, one point or none,
+coordinates that are not finite, cameras in one place or on a line.
+"""
+
+import json
+import math
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+import synthetic_captures as synthetic
+from corner import NAMES, write_capture
+from examples import examples
+from hypothesis import given
+from hypothesis import strategies as st
+from synthetic_captures import LONG, WIDE, Noise
+
+from nerfcli import scene as scenes
+from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.finite import finite
+from nerfcli.poses import acceptance, examine
+from nerfcli.poses.checks import UNDERWAY, Checks
+from nerfcli.poses.components import describe_components
+from nerfcli.poses.job import Job
+from nerfcli.poses.ladder import climb
+from nerfcli.poses.mapped import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.report import PosesReport, closing_notes
+from nerfcli.poses.settings import PoseSettings
+from nerfcli.poses.structure_from_motion import estimate_poses
+from nerfcli.poses.worker import solve
+
+ONE_THREAD = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
+PLACES = st.sampled_from([0.0, 1e-300, 1.0, 1e30, math.inf, -math.inf, math.nan])
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
+    """Eight photos of two cameras, mapped: the models are in the work folder."""
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    folder = tmp_path_factory.mktemp("capture")
+    views = synthetic.ring(8, [WIDE, LONG], seed=0, turn_deg=160)
+    scene = synthetic.boulder(700, seed=0)
+    synthetic.write_database(folder / "database.db", views, scene, noise=Noise(outliers=0.1), seed=0)
+    job = synthetic.synthetic_job(folder, views, seed=0)
+    write_mapped(climb(job, lambda *progress: None), mapping_key(job))
+    return job
+
+
+def mapped_model(job: Job) -> pycolmap.Reconstruction:
+    mapped = read_mapped(job, mapping_key(job))
+    assert mapped is not None
+    return mapped.models[0]
+
+
+def examined(model: pycolmap.Reconstruction, job: Job, checks: Checks | None = None) -> dict[str, Any]:
+    """What the report gets of a model, after a way through JSON."""
+    found = examine.examine([model], job, lambda *progress: None, checks=checks)
+    content = {"verdict": found.verdict.to_json(), "blur": found.blur_px, "left_out": found.left_out, **found.details}
+    content, _ = finite(content)
+    return json.loads(json.dumps(content, allow_nan=False))
+
+
+@given(
+    without_pose=st.sets(st.integers(1, 8), max_size=8),
+    points=st.sampled_from([0, 1, 2, 15, 10_000]),
+    place=PLACES,
+    moved=st.integers(0, 3),
+)
+@examples(12)
+def test_a_damaged_model_is_reported_and_ends_nothing(
+    job: Job, without_pose: set[int], points: int, place: float, moved: int
+):
+    model = mapped_model(job)
+    for image_id in without_pose:
+        model.deregister_frame(model.image(image_id).frame_id)
+    for point_id in sorted(model.point3D_ids())[points:]:
+        model.delete_point3D(point_id)
+    for point_id in sorted(model.point3D_ids())[:moved]:
+        model.point3D(point_id).xyz = np.array([place, 1.0, place])
+    content = examined(model, job)
+    assert set(content["verdict"]) == {"accepted", "measures", "failures"}
+    if len(without_pose) == 8:
+        assert content["verdict"]["measures"]["observations_per_photo"] == {"median": 0.0, "least": 0}
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_cameras_in_one_place_or_on_a_line_are_refused_or_reported(job: Job, spread: float):
+    """Evidence: all centres are put at the origin, or on the x axis; the verdict has numbers and no exception."""
+    model = mapped_model(job)
+    for index, image_id in enumerate(sorted(model.reg_image_ids())):
+        image = model.image(image_id)
+        rotation = image.cam_from_world().rotation
+        centre = np.array([spread * index, 0.0, 0.0])
+        model.frame(image.frame_id).rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ centre))
+    content = examined(model, job)
+    assert not content["verdict"]["accepted"]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
+def test_degenerate_intrinsics_are_reported(job: Job, value: float):
+    model = mapped_model(job)
+    camera = model.cameras[1]
+    camera.params = [value, *camera.params[1:]]
+    content = examined(model, job)
+    assert isinstance(content["not_computed"], dict)
+
+
+def test_photos_without_a_pose_do_not_end_the_covariance(job: Job):
+    """pycolmap's covariance raises on a frame without a pose; the lens models and the uncertainty do without it."""
+    model = mapped_model(job)
+    model.deregister_frame(model.image(3).frame_id)
+    content = examined(model, job)
+    assert content["not_computed"] == {}
+    assert content["verdict"]["accepted"]
+    assert sorted(content["blur"]) == ["0", "1", "3", "4", "5", "6", "7"]
+
+
+def test_a_check_that_raises_is_listed_and_the_others_go_on(job: Job, monkeypatch: pytest.MonkeyPatch):
+    def broken(*arguments: object, **options: object) -> None:
+        raise ValueError("[frame.h:188] Check failed: no pose\nstack")
+
+    monkeypatch.setattr(acceptance, "rotation_errors", broken)
+    monkeypatch.setattr(examine, "pose_blur_px", broken)
+    content = examined(mapped_model(job), job)
+    why = "ValueError: [frame.h:188] Check failed: no pose"
+    assert content["not_computed"] == {"rotations of pairs": why, "pose uncertainty": why}
+    assert content["verdict"]["measures"]["rotations"] == {"pairs": 0, "median_deg": None, "gross_share": None}
+    assert content["verdict"]["measures"]["pairs"]["judged"] > 10
+
+
+def test_a_skipped_check_is_not_started(job: Job, tmp_path: Path):
+    checks = Checks(tmp_path, skip={"pose uncertainty": "it ended the process"})
+    content = examined(mapped_model(job), job, checks)
+    assert content["not_computed"] == {"pose uncertainty": "it ended the process"}
+    assert content["blur"] == {}
+    assert not (tmp_path / UNDERWAY).exists()
+
+
+def test_a_result_that_is_not_finite_is_written_as_null(job: Job, monkeypatch: pytest.MonkeyPatch):
+    infinite = dict.fromkeys(range(1, 9), math.inf)
+    monkeypatch.setattr(examine, "pose_blur_px", lambda model, **options: infinite)
+    solve(job, lambda *progress: None, lambda note: None)
+    content = json.loads((Path(job.folder) / "result.json").read_text(encoding="utf-8"))["content"]
+    assert set(content["pose_blur_px"].values()) == {None}
+    assert content["not_finite"]["pose_blur_px.0"] == "inf"
+
+
+def test_finite_leaves_finite_content_as_it_is():
+    content = {"a": [1, 2.5, None, "x", True], "b": {"c": (1.0, -0.0)}}
+    assert finite(content) == ({"a": [1, 2.5, None, "x", True], "b": {"c": [1.0, -0.0]}}, {})
+    assert finite([math.nan, {"x": -math.inf}]) == ([None, {"x": None}], {"0": "nan", "1.x": "-inf"})
+
+
+def test_components_say_what_joins_them(job: Job):
+    """Photos 1...5 and 6...8 of one capture: their pairs are in the database, so that is what is said."""
+    first, second = mapped_model(job), mapped_model(job)
+    for image_id in range(1, 9):
+        model = first if image_id > 5 else second
+        model.deregister_frame(model.image(image_id).frame_id)
+    largest, other = describe_components([first, second], job)
+    assert (largest["size"], largest["photos"], largest["apart"]) == (5, [0, 1, 2, 3, 4], None)
+    assert (other["size"], other["photos"]) == (3, [5, 6, 7])
+    assert "pairs of photos join it with the largest" in other["apart"]
+
+
+# From here on the whole command, on the room corner of `corner`.
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos") / "corner"
+    write_capture(folder)
+    (folder / "notes.jpg").unlink()
+    return folder
+
+
+def estimate(
+    photos: Path,
+    scene: Path,
+    settings: PoseSettings = ONE_THREAD,
+    *,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> tuple[PosesReport, list[str]]:
+    notes: list[str] = []
+    report = estimate_poses(photos, scene, settings=settings, notify=notes.append, progress=progress)
+    return report, notes
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
+def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The worker aborts in the covariance, as C++ may; the scene is there, and says which check it lacks."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(
+        "import os\nfrom nerfcli.poses import uncertainty\nuncertainty.pose_blur_px = lambda *a, **o: os.abort()\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
+    stages: list[str] = []
+    report, notes = estimate(
+        photos, tmp_path / "scene", progress=lambda stage, done, total: stages.append(f"{stage} {done}")
+    )
+    assert report.registered == len(NAMES)
+    assert "SIGABRT" in report.not_computed["pose uncertainty"]
+    assert sum("a check could not be computed (pose uncertainty)" in note for note in notes) == 2
+    assert stages.count("check 0") == 2
+    assert len([stage for stage in stages if stage == "map 2"]) == 1  # mapped once
+    assert scenes.load(tmp_path / "scene").frames
+
+
+@pytest.fixture(scope="module")
+def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for PYTHONPATH with which every model is refused."""
+    site = tmp_path_factory.mktemp("site")
+    (site / "sitecustomize.py").write_text(
+        "from nerfcli.poses import acceptance\n"
+        "judge = acceptance.judge\n"
+        "def refuse(*a, **o):\n"
+        "    failure = acceptance.Failure('it is wrong', 'so', 'do better')\n"
+        "    return acceptance.Verdict(judge(*a, **o).measures, (failure,))\n"
+        "acceptance.judge = refuse\n"
+    )
+    return site
+
+
+def test_a_refused_model_stays_and_can_be_accepted(
+    photos: Path, tmp_path: Path, refusing: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("PYTHONPATH", str(refusing))
+    scene = tmp_path / "scene"
+    with pytest.raises(UserError, match=r"not to be trusted: it is wrong: so") as caught:
+        estimate(photos, scene)
+    assert caught.value.exit_code == TOO_FEW_PHOTOS
+    assert "--accept-refused" in caught.value.hint
+    kept = pycolmap.Reconstruction(str(scene / "refused-model"))
+    assert kept.num_reg_images() == len(NAMES)
+    assert (scene / "refused-model" / "points.ply").read_bytes().startswith(b"ply")
+    with pytest.raises(UserError, match="scene"):
+        scenes.load(scene)
+    stages: list[str] = []
+    report, notes = estimate(
+        photos,
+        scene,
+        replace(ONE_THREAD, accept_refused=True),
+        progress=lambda stage, done, total: stages.append(stage),
+    )
+    assert {"map", "match", "extract", "check"}.isdisjoint(stages)  # nothing is done again
+    assert not report.verdict["accepted"]
+    assert any("as --accept-refused says" in note for note in notes)
+    assert not (scene / "refused-model").exists()
+    assert len(scenes.load(scene).frames) == len(NAMES)
+
+
+def test_a_component_that_is_not_there_is_bad_input(photos: Path, tmp_path: Path):
+    settings = replace(ONE_THREAD, component=3)
+    with pytest.raises(UserError, match=r"there is no component 3: the photos of .* form 1 \(\d+ photos\)"):
+        estimate(photos, tmp_path / "scene", settings)
+
+
+def test_after_the_time_limit_in_a_check_only_the_checks_are_left(photos: Path, tmp_path: Path):
+    """The limit is what is left after mapping, by a progress that waits; the next call maps nothing."""
+
+    class EndedError(Exception):
+        pass
+
+    def end_in_check(stage: str, done: int, total: int) -> None:
+        if stage == "check":
+            raise EndedError
+
+    with pytest.raises(EndedError):
+        estimate(photos, tmp_path / "scene", progress=end_in_check)
+    assert pycolmap.Reconstruction(str(tmp_path / "scene/work/mapped/0")).num_reg_images() == len(NAMES)
+    stages: set[str] = set()
+    report, notes = estimate(photos, tmp_path / "scene", progress=lambda stage, done, total: stages.add(stage))
+    assert report.registered == len(NAMES)
+    assert stages == {"read", "check"}
+    assert "the photos are mapped already: only the checks are left" in notes
+
+
+def test_closing_notes_name_components_and_checks(photos: Path, tmp_path: Path):
+    report, _ = estimate(photos, tmp_path / "scene")
+    first = report.components[0]
+    two = replace(
+        report,
+        components=(first, {"size": 2, "photos": ["x.jpg", "y.jpg"], "apart": "no photo of it matches"}),
+        not_computed={"pose uncertainty": "ValueError: singular"},
+    )
+    assert closing_notes(two) == [
+        "component 2 has 2 photos (x.jpg ... y.jpg): no photo of it matches; --component 2 takes it",
+        "a check could not be computed (pose uncertainty): ValueError: singular",
+    ]
