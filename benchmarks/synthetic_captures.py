@@ -105,6 +105,23 @@ def room(count: int, *, seed: int) -> Scene:
     return Scene(points * [4.0, 4.0, 2.0], normals, np.arange(count))
 
 
+def wall(count: int, *, seed: int, size: float = 6.0, depth: float = 0.0) -> Scene:
+    """A square that faces +z, with points up to `depth` before it; of depth 0 it is a plane."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, size=(count, 3)) * [size / 2, size / 2, 0.0]
+    points[:, 2] = rng.uniform(0, depth, count)
+    return Scene(points, np.tile([0.0, 0.0, 1.0], (count, 1)), np.arange(count))
+
+
+def courtyard(count: int, *, seed: int, radius: float = 9.0) -> Scene:
+    """The inside of a round wall of height 4 that is uneven by a metre."""
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(0, 2 * np.pi, count)
+    outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
+    points = outward * rng.uniform(radius - 1, radius, size=(count, 1)) + rng.uniform(-2, 2, (count, 1)) * [0, 0, 1]
+    return Scene(points, -outward, np.arange(count))
+
+
 def together(one: Scene, other: Scene) -> Scene:
     """Both; nothing of the one looks like anything of the other."""
     return Scene(
@@ -151,6 +168,44 @@ def panorama(count: int, lens: Lens, *, turn_deg: float = 300) -> list[View]:
     return [
         View(lens, looking_at(centre, centre + np.array([np.cos(a), np.sin(a), 0.1 * np.sin(3 * a)]))) for a in angles
     ]
+
+
+def walk(count: int, lens: Lens, *, radius: float = 5.0) -> list[View]:
+    """A walk round a circle, looking outward: the last photos see what the first ones saw."""
+    angles = 2 * np.pi * np.arange(count) / count
+    directions = np.column_stack([np.cos(angles), np.sin(angles), 0.1 * np.sin(3 * angles)])
+    return [View(lens, looking_at(radius * d, (radius + 1) * d)) for d in directions]
+
+
+def above(count: int, lens: Lens, *, seed: int, height: float = 5.0, tilt: float = 0.0) -> list[View]:
+    """Photos towards -z from a grid at about one height, as of a drone.
+
+    tilt: how far the point looked at is from the one below the camera, as a share of the height.
+    """
+    rng = np.random.default_rng(seed)
+    side = int(np.ceil(np.sqrt(count)))
+    views = []
+    for index in range(count):
+        x, y = (index // side, index % side) - np.full(2, (side - 1) / 2)
+        centre = np.array([x, y, height * rng.uniform(0.98, 1.02)])
+        aim = rng.normal(scale=0.01, size=2) + tilt * rng.uniform(-1, 1, size=2)
+        # A hair off the vertical, where "up" would be undefined.
+        views.append(View(lens, looking_at(centre, centre + height * np.array([*aim, -1.0]))))
+    return views
+
+
+def each_its_own(views: Sequence[View], *, seed: int) -> list[View]:
+    """The same photos, each by a camera of its own, of another focal length."""
+    rng = np.random.default_rng(seed)
+    return [
+        replace(view, lens=replace(view.lens, params=(view.lens.params[0] * factor, *view.lens.params[1:])))
+        for view, factor in zip(views, rng.uniform(0.8, 1.3, len(views)), strict=True)
+    ]
+
+
+def turned_away(views: Sequence[View]) -> list[View]:
+    """From the same places, looking the other way."""
+    return [View(view.lens, looking_at(view.centre, view.centre - view.cam_from_world[2, :3])) for view in views]
 
 
 def seen(view: View, scene: Scene) -> tuple[NDArray[np.int64], Array]:
