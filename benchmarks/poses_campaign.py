@@ -19,8 +19,10 @@ a row is not run again. Writes OUT.csv and prints a table. The interpreter runs 
 points, so that two versions are compared by two calls.
 
 How to read it: CPU seconds are those of the command and its children, which differ little on a machine that others use
-too. ATE and rotations are as in poses.py. The lens error is how far pixels move when the true lens is replaced by the
-one found, over a grid of the photo, after the rotation that makes them agree best: RMS, and the largest.
+too. ATE and rotations are as in poses.py; where centres are nearly on a line or in a clump, the similarity leaves the
+rotations loose, and "rel. deg", the median error of the rotation between two photos, says more. The lens error is how
+far pixels move when the true lens is replaced by the one found, over a grid of the photo, after the rotation that makes
+them agree best: RMS, and the largest.
 """
 
 import csv
@@ -33,7 +35,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -94,6 +96,7 @@ class Row:
     ate: float = NAN
     rotation_median_deg: float = NAN
     rotation_worst_deg: float = NAN
+    relative_rotation_deg: float = NAN
     focal_percent: float = NAN
     principal_point_px: float = NAN
     lens_rms_px: float = NAN
@@ -195,6 +198,17 @@ def lens_error(true: Camera, found: Camera) -> tuple[float, float]:
     return float(np.sqrt(np.mean(distances**2))), float(distances.max())
 
 
+def relative_rotation_deg(truth: Sequence[np.ndarray], found: Sequence[np.ndarray]) -> float:
+    """The median over all pairs of photos of the error of the rotation between them."""
+    one, other = np.triu_indices(len(truth), 1)
+
+    def between(poses: Sequence[np.ndarray]) -> Rotation:
+        rotations = np.array(poses)[:, :3, :3]
+        return Rotation.from_matrix(np.swapaxes(rotations[one], 1, 2) @ rotations[other])
+
+    return float(np.degrees(np.median((between(truth).inv() * between(found)).magnitude())))
+
+
 def run(capture: Capture, folder: Path, *, limit_s: float) -> tuple[int, float, float]:
     """Call `nerfcli poses` into folder/NAME: exit code (-1: stopped), seconds, CPU seconds."""
     command = [sys.executable, "-m", "nerfcli", "poses", str(capture.photos), "-o", str(folder / capture.name)]
@@ -247,7 +261,10 @@ def judge(capture: Capture, folder: Path, *, exit_code: int, seconds: float, cpu
     )
     if capture.truth is None or not (target / scenes.SCENE_FILE).exists():
         return row
-    truth = read_truth(capture.truth, sizes)
+    try:
+        truth = read_truth(capture.truth, sizes)
+    except UserError as error:
+        return replace(row, verdict=f"{row.verdict} (no truth: {error})")
     found = {frame.name: frame for frame in scenes.load(target).frames}
     both = [name for name in found if name in truth]
     if len(both) < 3:
@@ -259,18 +276,19 @@ def judge(capture: Capture, folder: Path, *, exit_code: int, seconds: float, cpu
     )
     lenses = np.array([_lens_numbers(truth[name].camera, found[name].camera) for name in both])
     focal, centre, rms, worst = (float(value) for value in np.nanmedian(lenses, axis=0))
-    return Row(
-        **{
-            **asdict(row),
-            "compared": len(both),
-            "ate": accuracy.ate,
-            "rotation_median_deg": accuracy.rotation_median_deg,
-            "rotation_worst_deg": accuracy.rotation_worst_deg,
-            "focal_percent": focal,
-            "principal_point_px": centre,
-            "lens_rms_px": rms,
-            "lens_worst_px": worst,
-        }
+    return replace(
+        row,
+        compared=len(both),
+        ate=accuracy.ate,
+        rotation_median_deg=accuracy.rotation_median_deg,
+        rotation_worst_deg=accuracy.rotation_worst_deg,
+        relative_rotation_deg=relative_rotation_deg(
+            [truth[name].world_from_cam for name in both], [found[name].world_from_cam for name in both]
+        ),
+        focal_percent=focal,
+        principal_point_px=centre,
+        lens_rms_px=rms,
+        lens_worst_px=worst,
     )
 
 
@@ -308,7 +326,21 @@ def _error_text(log: Path) -> str:
 def print_table(rows: Iterable[Row]) -> None:
     """A line per capture."""
     table = Table(title="nerfcli poses, capture by capture")
-    names = ("capture", "photos", "size", "exit", "s", "CPU s", "placed", "px", "ATE", "deg", "focal %", "lens px")
+    names = (
+        "capture",
+        "photos",
+        "size",
+        "exit",
+        "s",
+        "CPU s",
+        "placed",
+        "px",
+        "ATE",
+        "deg",
+        "rel. deg",
+        "focal %",
+        "lens px",
+    )
     for name in names:
         table.add_column(name, justify="left" if name == "capture" else "right")
     table.add_column("verdict", overflow="fold")
@@ -317,6 +349,7 @@ def print_table(rows: Iterable[Row]) -> None:
             *(row.capture, str(row.photos), row.size, str(row.exit_code)),
             *(f"{row.seconds:.0f}", f"{row.cpu_seconds:.0f}", str(row.registered)),
             *(_text(row.reprojection_px, ".2f"), _text(row.ate, ".4f"), _text(row.rotation_median_deg, ".3f")),
+            _text(row.relative_rotation_deg, ".3f"),
             *(_text(row.focal_percent, "+.2f"), _text(row.lens_rms_px, ".2f"), row.verdict),
         )
     Console(width=200).print(table)
