@@ -211,7 +211,7 @@ def relative_rotation_deg(truth: Sequence[np.ndarray], found: Sequence[np.ndarra
 
 def run(capture: Capture, folder: Path, *, limit_s: float) -> tuple[int, float, float]:
     """Call `nerfcli poses` into folder/NAME: exit code (-1: stopped), seconds, CPU seconds."""
-    command = [sys.executable, "-m", "nerfcli", "poses", str(capture.photos), "-o", str(folder / capture.name)]
+    command = [sys.executable, "-P", "-m", "nerfcli", "poses", str(capture.photos), "-o", str(folder / capture.name)]
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     with (folder / f"{capture.name}.log").open("w", encoding="utf-8") as log:
         child = subprocess.Popen(
