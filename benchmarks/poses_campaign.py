@@ -72,9 +72,9 @@ class Capture:
 
 @dataclass(frozen=True)
 class View:
-    """What is known of a photo: its lens and its pose, (4, 4) world_from_cam."""
+    """What is known of a photo: its pose, (4, 4) world_from_cam, and its lens, if that is of the photo as it is."""
 
-    camera: Camera
+    camera: Camera | None
     world_from_cam: np.ndarray
 
 
@@ -129,11 +129,15 @@ def read_truth(path: Path, photos: Mapping[str, tuple[int, int]]) -> dict[str, V
     else:
         _, _, capture = load(path, Given(), Doubt())
         views = {Path(frame.name).name: View(frame.camera, frame.world_from_cam) for frame in capture.frames}
-    return {
-        name: View(views[name].camera.resized(*size), views[name].world_from_cam)
-        for name, size in photos.items()
-        if name in views
-    }
+    return {name: _resized(views[name], size) for name, size in photos.items() if name in views}
+
+
+def _resized(view: View, size: tuple[int, int]) -> View:
+    try:
+        camera = None if view.camera is None else view.camera.resized(*size)
+    except UserError:  # the photos were cropped or undistorted after their poses were found
+        camera = None
+    return View(camera, view.world_from_cam)
 
 
 def _strecha(folder: Path) -> dict[str, View]:
@@ -275,7 +279,8 @@ def judge(capture: Capture, folder: Path, *, exit_code: int, seconds: float, cpu
         missing=len(truth) - len(both),
     )
     lenses = np.array([_lens_numbers(truth[name].camera, found[name].camera) for name in both])
-    focal, centre, rms, worst = (float(value) for value in np.nanmedian(lenses, axis=0))
+    known = lenses[~np.isnan(lenses).all(axis=1)]
+    focal, centre, rms, worst = np.nanmedian(known, axis=0).tolist() if len(known) else [NAN] * 4
     return replace(
         row,
         compared=len(both),
@@ -292,7 +297,9 @@ def judge(capture: Capture, folder: Path, *, exit_code: int, seconds: float, cpu
     )
 
 
-def _lens_numbers(true: Camera, found: Camera) -> tuple[float, float, float, float]:
+def _lens_numbers(true: Camera | None, found: Camera) -> tuple[float, float, float, float]:
+    if true is None:
+        return NAN, NAN, NAN, NAN
     centre = float(np.hypot(*np.subtract(found.principal_point, true.principal_point)))
     return 100 * (found.focal_px / true.focal_px - 1), centre, *lens_error(true, found)
 

@@ -227,3 +227,22 @@ def test_the_outlook_measures_and_stretches_what_is_to_come():
     outlook.update("map", 10, 10)
     assert outlook.update("map", 10, 10) == (1.0, 0.0)
     assert outlook.update("check", 1, 4) == (1.0, 0.0)
+
+
+def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_from_the_share():
+    """Half of the photos are searched again, at three times the cost: 10 s of searching become 25 s."""
+    now = 0.0
+    outlook = Outlook(
+        Plan(10, 1600, 4096, "exhaustive", 45, {"extract": 10.0, "match": 8.0, "map": 2.0}), clock=lambda: now
+    )
+    outlook.update("extract", 0, 10)
+    now = 10.0
+    assert outlook.update("extract", 10, 10) == (pytest.approx(0.5), pytest.approx(10.0))
+    assert outlook.update("enlarge", 0, 5) == (pytest.approx(0.5), pytest.approx(15.0 + 10.0))
+    now = 22.0
+    share, left = outlook.update("enlarge", 4, 5)
+    assert (share, left) == (pytest.approx(22.0 / 35.0), pytest.approx(3.0 + 10.0))
+    # Later stages are stretched by how the machine did, not by how many photos were searched twice.
+    now = 25.0
+    outlook.update("enlarge", 5, 5)
+    assert outlook.update("match", 0, 45)[1] == pytest.approx(10.0)

@@ -34,6 +34,7 @@ NAMES_SHOWN = 8
 _STAGES = {
     "read": "photos read",
     "extract": "photos searched for features",
+    "enlarge": "photos searched for finer features",
     "pair": "photos looked up",
     "match": "pairs compared",
     "map": "photos placed",

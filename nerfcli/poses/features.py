@@ -46,7 +46,7 @@ def extract(job: Job, report: Report) -> None:
     passes = _stage_file(job, "enlarged")
     enlarged = {i: key for i, key in (read_stage(passes, _FEATURES_VERSION) or {}).items() if keys.get(i) == key}
     first = [number for number, image_id in enumerate(job.image_ids) if str(image_id) not in enlarged]
-    _extract_octaves(job, first, first_octave=0, report=report)
+    _extract_octaves(job, first, watched=range(len(job.image_ids)), first_octave=0, report=report)
     counts = feature_counts(job)
     poor = [number for number in first if counts[number] < _RICH_SHARE * job.max_features]
     # First they go and then it is written that they are due: one that has features and is due has had its second pass.
@@ -54,7 +54,8 @@ def extract(job: Job, report: Report) -> None:
     enlarged |= {str(job.image_ids[number]): keys[str(job.image_ids[number])] for number in poor}
     write_stage(passes, _FEATURES_VERSION, enlarged)
     due = [number for number, image_id in enumerate(job.image_ids) if str(image_id) in enlarged]
-    _extract_octaves(job, due, first_octave=-1, report=report)
+    if due:
+        _extract_octaves(job, due, watched=due, first_octave=-1, report=report)
 
 
 def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
@@ -110,7 +111,10 @@ def feature_counts(job: Job) -> list[int]:
         return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
 
 
-def _extract_octaves(job: Job, numbers: Iterable[int], *, first_octave: int, report: Report) -> None:
+def _extract_octaves(
+    job: Job, numbers: Iterable[int], *, watched: Sequence[int], first_octave: int, report: Report
+) -> None:
+    """Seek features in photos that have none; of the photos `watched` it is reported how many have some."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = job.max_image_size
     options.num_threads = job.threads
@@ -119,14 +123,13 @@ def _extract_octaves(job: Job, numbers: Iterable[int], *, first_octave: int, rep
     reader = pycolmap.ImageReaderOptions()
     reader.mask_path = str(job.mask_folder) if job.masks else ""
     with closing(pycolmap.Database.open(str(job.database))) as database:
-        ids = dict(zip(job.image_ids, job.files, strict=True))
-        pending = set(ids)
+        pending = {job.image_ids[number] for number in watched}
 
         def done() -> int:
             pending.difference_update([image_id for image_id in pending if database.exists_descriptors(image_id)])
-            return len(ids) - len(pending)
+            return len(watched) - len(pending)
 
-        with _watched("extract", done, len(ids), report):
+        with _watched("extract" if first_octave == 0 else "enlarge", done, len(watched), report):
             for limit, members in _by_limit(job, numbers).items():
                 options.sift.max_num_features = limit
                 pycolmap.extract_features(

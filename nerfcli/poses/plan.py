@@ -9,6 +9,8 @@ from nerfcli.poses.pairs import Pairing
 from nerfcli.poses.photos import Photos
 from nerfcli.poses.settings import PoseSettings
 
+# How many times as long a photo takes whose features are sought in the enlarged picture too, see `features.extract`.
+_ENLARGED_FACTOR = 3.0
 # CPU seconds, measured on one core of a 2-core server; within a factor of two on others.
 _SECONDS_PER_MEGAPIXEL = 0.4
 _SECONDS_PER_PAIR = 0.045
@@ -72,7 +74,8 @@ class Outlook:
     """How much is left, told as the work goes on: measured for the stage at hand, for later ones from the plan.
 
     The plan's seconds are stretched by what the stages so far took longer, so that after a few photos it fits the
-    machine and what else it does.
+    machine and what else it does. Which photos are enlarged to find more features in them is known only after the first
+    search; where that adds work, the share that is done stands still until it is true again.
 
     Args:
         plan: for the stages that have not begun.
@@ -86,13 +89,17 @@ class Outlook:
         self._stage = ""
         self._began = (0.0, 0)
         self._stretch = 1.0
+        self._seconds = dict(plan.seconds)
+        self._share = 0.0
 
     def update(self, stage: str, done: int, total: int) -> tuple[float, float]:
         """(share of all work that is done, seconds that are left)."""
         now = self._clock()
+        if stage == "enlarge":
+            self._plan_enlarging(total)
         if stage != self._stage or done < self._began[1]:
             self._stage, self._began = stage, (now, done)
-        planned = self._plan.seconds.get(stage, 0.0)
+        planned = self._seconds.get(stage, 0.0)
         began, done_before = self._began
         if done > done_before:
             left = (now - began) * (total - done) / (done - done_before)
@@ -101,12 +108,20 @@ class Outlook:
                 self._stretch = whole / planned
         else:
             left = self._stretch * planned * (total - done) / max(total, 1)
-        stages = list(self._plan.seconds)
+        stages = list(self._seconds)
         # What is not planned comes last, and is short.
         later = stages[stages.index(stage) + 1 :] if stage in stages else []
-        left += self._stretch * sum(self._plan.seconds[name] for name in later)
+        left += self._stretch * sum(self._seconds[name] for name in later)
         spent = now - self._start
-        return (spent / (spent + left) if left > 0 else 1.0), left
+        self._share = max(self._share, spent / (spent + left) if left > 0 else 1.0)
+        return self._share, left
+
+    def _plan_enlarging(self, photos: int) -> None:
+        """Put the second search for features after the first."""
+        extract = self._plan.seconds.get("extract", 0.0)
+        enlarge = _ENLARGED_FACTOR * extract * photos / max(self._plan.photos, 1)
+        later = {stage: seconds for stage, seconds in self._plan.seconds.items() if stage != "extract"}
+        self._seconds = {"extract": extract, "enlarge": enlarge, **later}
 
 
 def duration(seconds: float) -> str:

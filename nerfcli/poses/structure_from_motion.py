@@ -57,8 +57,8 @@ def estimate_poses(
         scene_dir: the folder to write.
         settings: see `PoseSettings`.
         notify: told what the user should know, one sentence at a time.
-        progress: told (stage, done, total); the stages are "read", "extract", "pair" where look-alikes are sought,
-            "match", "map" and "check", in this order.
+        progress: told (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few features,
+            "pair" where look-alikes are sought, "match", "map" and "check", in this order.
         limits: see `Limits`.
         planned: told the plan before the long work starts.
         given: intrinsics that are known beforehand.

@@ -19,6 +19,7 @@ from nerfcli.poses.settings import Limits
 
 _STAGES = {
     "extract": "finding features",
+    "enlarge": "finding finer features",
     "pair": "choosing pairs",
     "match": "matching photos",
     "map": "placing photos",
