@@ -4,6 +4,7 @@ Features and matches are drawn for known cameras (benchmarks/synthetic_captures.
 everything is real.
 """
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +16,9 @@ import synthetic_captures as synthetic
 from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
 from nerfcli.poses import merging
+from nerfcli.poses import second_chance as chances
 from nerfcli.poses.acceptance import judge
+from nerfcli.poses.checks import Checks
 from nerfcli.poses.contradictions import leave_out_contradicting
 from nerfcli.poses.database import register_photos
 from nerfcli.poses.examine import Examined, examine
@@ -25,8 +28,9 @@ from nerfcli.poses.ladder import climb
 from nerfcli.poses.lens_family import as_fisheye
 from nerfcli.poses.mapped import Mapped
 from nerfcli.poses.parallax import best_turn
+from nerfcli.poses.second_chance import is_contradicted, second_chance
 from nerfcli.poses.two_views import read_verified_pairs, rotation_errors
-from nerfcli.poses.view_graph import Bottlenecks, parts
+from nerfcli.poses.view_graph import Bottlenecks, consistent_groups, parts
 
 pytestmark = pytest.mark.usefixtures("_quiet")
 
@@ -142,6 +146,67 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     verdict = judge(wrong, pairs, turn=None, names={"00005.jpg": "kitchen 5.jpg"}, seed=0, threads=1)
     assert verdict.failures[0].kind == "the poses contradict the strongest matches"
     assert "verified matches of" in verdict.failures[0].evidence
+
+
+def wrongly_mapped(solved: Solved, folder: Path) -> Mapped:
+    """The whole capture with photos 8, 9 and 10 in a wrong place, as a mapper leaves it that was misled."""
+    shutil.copytree(solved.job.database.parent, folder)
+    job = replace(solved.job, folder=str(folder / "work"))
+    return Mapped([bent(solved.model, 8)], job, [{"what": "default thresholds", "models": [10]}], seconds=1000.0)
+
+
+def test_a_contradicted_model_is_mapped_again_from_its_sound_part(solved: Solved, tmp_path: Path):
+    """Synthetic truth: the three photos that were off by 40 degrees come out within 0.4 degrees."""
+    wrong = wrongly_mapped(solved, tmp_path / "again")
+    first = examine(wrong.models, wrong.job, lambda *told: None)
+    assert is_contradicted(first.verdict)
+    told: list[str] = []
+    chance = second_chance(wrong, first, lambda *progress: None, told.append, checks=Checks)
+    assert chance.examined.verdict.accepted
+    assert chance.examined.model is not None
+    assert [attempt["models"] for attempt in chance.mapped.attempts] == [[10], [10]]
+    assert told[0].endswith("the photos are mapped again, for 25 min at most")
+    assert told[-1] == "the largest part that agrees with itself, and the rest anew: 10 of 10 photos placed, accepted"
+    truth = synthetic.true_model(solved.views)
+    for image_id in range(2, 11):
+        relative = [
+            model.image(image_id).cam_from_world() * model.image(1).cam_from_world().inverse()
+            for model in (chance.examined.model, truth)
+        ]
+        assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.4
+
+
+@pytest.mark.parametrize(("failing", "attempts"), [(1, [[10], [10]]), (2, [[10], [10]]), (3, [[10], [7]])])
+def test_each_hypothesis_stands_in_for_the_one_before(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int, attempts: list[list[int]]
+):
+    """The first, the first two, or all that map again give nothing; the last one keeps what agrees with itself."""
+    wrong = wrongly_mapped(solved, tmp_path / "again")
+    first = examine(wrong.models, wrong.job, lambda *told: None)
+    for name in ("_regrown", "_without_suspects", "_all_at_once")[:failing]:
+        monkeypatch.setattr(chances, name, lambda *arguments: None)
+    chance = second_chance(wrong, first, lambda *progress: None, lambda note: None, checks=Checks)
+    assert chance.examined.verdict.accepted
+    assert [attempt["models"] for attempt in chance.mapped.attempts] == attempts
+
+
+def test_a_second_chance_is_bounded_in_time(solved: Solved, tmp_path: Path):
+    """Nothing is mapped again where the first mapping took no time; the sound part alone costs only its checks."""
+    wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=0.0)
+    first = examine(wrong.models, wrong.job, lambda *told: None)
+    told: list[str] = []
+    chance = second_chance(wrong, first, lambda *progress: None, told.append, checks=Checks)
+    assert sum(note.startswith("not tried, for it takes too long") for note in told) == 3
+    assert chance.examined.model is not None
+    assert chance.examined.model.num_reg_images() == 7
+
+
+def test_groups_hold_together_against_what_speaks_against_them():
+    """By hand: two strong pairs, held apart although one join between them is positive."""
+    joins = [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 5.0), (1, 4, -6.0), (5, 1, -1.0)]
+    assert consistent_groups([1, 2, 3, 4, 5], joins) == [[1, 2], [3, 4], [5]]
+    assert consistent_groups([4, 3, 2, 1], [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 7.0), (1, 4, -6.0)]) == [[4, 3, 2, 1]]
+    assert consistent_groups([], []) == []
 
 
 def test_one_photo_that_contradicts_is_left_out(solved: Solved):

@@ -13,7 +13,7 @@ from typing import Any
 import pycolmap
 
 from nerfcli.poses.database import evidence, register_photos
-from nerfcli.poses.features import extract, match, start_matching
+from nerfcli.poses.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.intrinsics import field_of_view_deg
 from nerfcli.poses.job import Job, Report, Tell
 from nerfcli.poses.lens_family import as_fisheye
@@ -67,8 +67,9 @@ class _Ladder:
     def tell_results(self) -> None:
         """Tell what each rung gave that has not been told yet."""
         for rung in self.rungs[self._told :]:
-            sizes = " + ".join(str(size) for size in rung["models"]) or "none"
-            self._tell(f"{rung['what']}: {sizes} of {self._photos} photos placed")
+            largest, *others = rung["models"] or ["none"]
+            also = f" (and {len(others)} smaller models)" if len(others) > 1 else f" + {others[0]}" if others else ""
+            self._tell(f"{rung['what']}: {largest}{also} of {self._photos} photos placed")
         self._told = len(self.rungs)
 
     def attempt(self, what: str, job: Job, start: Start) -> None:
@@ -253,8 +254,10 @@ def _strong_pairs(job: Job) -> list[tuple[int, int, int]]:
 
 
 def _can_have_more_features(job: Job) -> bool:
-    richer = job.max_image_size < FULL_SIZE or job.max_features < _MORE_FEATURES
-    return richer and len(job.files) <= _MOST_FULL_SIZE
+    """Whether larger pictures or a higher limit would give any photo more features than it has."""
+    larger = any(max(group.width, group.height) > job.max_image_size for group in job.groups)
+    limited = job.max_features < _MORE_FEATURES and max(feature_counts(job), default=0) >= job.max_features
+    return (larger or limited) and len(job.files) <= _MOST_FULL_SIZE
 
 
 def _placed(models: list[pycolmap.Reconstruction]) -> int:

@@ -29,18 +29,20 @@ class Mapped:
 
     attempts: what was tried, in order: {"what", "models": sizes, largest first}; the one that looks for single photos
     has "photos" too: what was found for each. localised: ids of images that are placed by the model's points, without
-    a pair that holds them.
+    a pair that holds them. seconds: that mapping took.
     """
 
     models: list[pycolmap.Reconstruction]
     job: Job
     attempts: list[dict[str, Any]]
     localised: tuple[int, ...] = ()
+    seconds: float = 0.0
 
 
 def write_mapped(mapped: Mapped, key: str, *, name: str = FIRST) -> None:
     """Write models and stage into the work folder, in place of earlier ones of this name."""
     content = {"job": asdict(mapped.job), "attempts": mapped.attempts, "localised": list(mapped.localised)}
+    content["seconds"] = mapped.seconds
     write_models(Path(mapped.job.folder) / name, mapped.models, key, also=content)
 
 
@@ -67,7 +69,7 @@ def read_mapped(job: Job, key: str, *, name: str = FIRST) -> Mapped | None:
     )
     if not there.database.exists():
         return None
-    return Mapped(models, there, content["attempts"], tuple(content["localised"]))
+    return Mapped(models, there, content["attempts"], tuple(content["localised"]), content["seconds"])
 
 
 def write_models(

@@ -110,6 +110,23 @@ def map_photos(
     return found[0]
 
 
+def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
+    """Run the global mapper once: all rotations, then all positions; its models, largest first, errors filled in.
+
+    It needs intrinsics that are about right in the database.
+    """
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = job.threads
+    options.random_seed = options.mapper.random_seed = job.seed
+    options.mapper.global_positioning.use_gpu = False
+    options.mapper.bundle_adjustment.ceres.use_gpu = False
+    with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
+        models = pycolmap.global_mapping(str(job.database), str(job.photos), output, options)
+    for model in models.values():
+        model.update_point_3d_errors()
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+
 def _options(job: Job, *, attempt: int, start: Start) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = job.threads

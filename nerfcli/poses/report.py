@@ -122,11 +122,12 @@ def make_report(
 def closing_notes(report: PosesReport) -> list[str]:
     """Return what the user should know of a result that is kept, a sentence each."""
     notes = []
-    if len(report.parts) > 1:
+    placed = {image.name for image in report.images if image.registered}
+    if len(report.parts) > 1 and report.registered < report.total:
         sizes = " + ".join(str(size) for size in report.parts)
-        notes.append(f"the photos fall into parts that share no matches: {sizes} photos")
+        notes.append(f"the photos fall into parts that share few verified matches: {sizes} photos")
     for number, component in enumerate(report.components, start=1):
-        if number == report.settings.component:
+        if number == report.settings.component or placed.issuperset(component["photos"]):
             continue
         names = component["photos"]
         some = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
@@ -161,7 +162,7 @@ def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
     placed = f"only {report.registered} of {report.total} photos could be placed ({photos_dir})"
     if sum(report.parts[1:]) > _MUCH_APART * report.total:
         sizes = " + ".join(str(size) for size in report.parts)
-        text = f"{placed}: they fall into parts of {sizes} photos that share no matches (disconnected)"
+        text = f"{placed}: they fall into parts of {sizes} photos that share few matches (disconnected)"
         return UserError(text, "take photos that join the parts, or give each part by itself", TOO_FEW_PHOTOS)
     reasons = [image.reason for image in report.images if image.reason]
     kind, advice = dominant(reasons)

@@ -4,6 +4,7 @@ A chain of joins is as strong as its weakest; the bottleneck of two photos is th
 """
 
 from collections.abc import Iterable, Sequence
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,3 +48,49 @@ def parts(photos: Sequence[int], joins: Iterable[tuple[int, int]]) -> list[list[
     order = {photo: index for index, photo in enumerate(photos)}
     unique = {id(group): sorted(group, key=order.__getitem__) for group in groups.values()}
     return sorted(unique.values(), key=lambda group: (-len(group), order[group[0]]))
+
+
+def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list[int]]:
+    """Divide photos into groups that hold together against what speaks for keeping them apart.
+
+    Joins with a strength above 0 speak for one group, those below 0 against it. The strongest join is contracted, its
+    parallel joins are added up, and so on until none above 0 is left.
+
+    Args:
+        photos: any numbers.
+        joins: (photo, photo, strength), of these photos.
+
+    Returns:
+        The groups, the largest first, each in the order of `photos`.
+
+    Example:
+        >>> consistent_groups([1, 2, 3, 4], [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 5.0), (1, 4, -6.0)])
+        [[1, 2], [3, 4]]
+
+    Source: greedy additive edge contraction, Keuper et al. 2015, Efficient Decomposition of Image and Mesh Graphs by
+    Lifted Multicuts, arXiv:1505.06973, algorithm 1.
+    """
+    members = {photo: [photo] for photo in photos}
+    strengths: dict[int, dict[int, float]] = {photo: {} for photo in photos}
+    for one, other, strength in joins:
+        for a, b in ((one, other), (other, one)):
+            strengths[a][b] = strengths[a].get(b, 0.0) + strength
+    heap = [(-s, a, b) for a, row in strengths.items() for b, s in row.items() if a < b and s > 0]
+    heapify(heap)
+    while heap:
+        strength, one, other = heappop(heap)
+        if strengths.get(one, {}).get(other) != -strength:
+            continue  # of a join that was contracted or added to since
+        members[one].extend(members.pop(other))
+        del strengths[one][other]
+        for third, more in strengths.pop(other).items():
+            if third == one:
+                continue
+            del strengths[third][other]
+            together = strengths[one].get(third, 0.0) + more
+            strengths[one][third] = strengths[third][one] = together
+            if together > 0:
+                heappush(heap, (-together, min(one, third), max(one, third)))
+    order = {photo: index for index, photo in enumerate(photos)}
+    groups = [sorted(group, key=order.__getitem__) for group in members.values()]
+    return sorted(groups, key=lambda group: (-len(group), order[group[0]]))

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from nerfcli.poses.ladder import climb
 from nerfcli.poses.mapped import Mapped, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
 from nerfcli.poses.retrieval import with_neighbours
+from nerfcli.poses.second_chance import is_contradicted, second_chance
 from nerfcli.poses.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.strict import place_held_out, training_part
 
@@ -89,6 +91,16 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     with _timed(seconds, "check"):
         wanted, others = _split(mapped.models, job.component)
         examined = examine(wanted, mapped.job, report, localised=mapped.localised, checks=checks)
+        if job.component == 1 and is_contradicted(examined.verdict):
+            chance = second_chance(
+                mapped,
+                examined,
+                report,
+                tell,
+                checks=lambda: Checks(Path(job.folder), skip=dict(job.skipped_checks)),
+            )
+            mapped, examined = chance.mapped, chance.examined
+            others = mapped.models[1:]
     model = examined.model
     placed = [] if model is None else photo_numbers(model, job)
     result: dict[str, Any] = {
@@ -129,7 +141,9 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
         start_matching(matched, matched.pairs)
         match(matched, matched.pairs, report)
     with _timed(seconds, "map"):
-        write_mapped(climb(matched, report, tell), key)
+        start = time.perf_counter()
+        climbed = climb(matched, report, tell)
+        write_mapped(replace(climbed, seconds=time.perf_counter() - start), key)
     mapped = read_mapped(job, key)
     if mapped is None:
         raise OSError(f"the models in {job.folder} cannot be read back")

@@ -1,0 +1,194 @@
+"""Try again where the checks refuse a model because verified pairs of photos contradict it.
+
+Wrong matches between parts that look alike put whole groups of photos into wrong places. Each hypothesis below leaves
+out other evidence and maps again; what it finds passes the same checks, against all pairs, before it is believed.
+"""
+
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+
+import pycolmap
+
+from nerfcli.poses.acceptance import MIN_MATCHES, Verdict
+from nerfcli.poses.checks import Checks
+from nerfcli.poses.database import keep_geometries
+from nerfcli.poses.examine import Examined, examine
+from nerfcli.poses.intrinsics import settle
+from nerfcli.poses.job import Job, Report, Tell
+from nerfcli.poses.mapped import Mapped, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.mapping import Start, map_globally, map_photos
+from nerfcli.poses.pairs import capture_order
+from nerfcli.poses.plan import duration
+from nerfcli.poses.stages import stage_key
+from nerfcli.poses.two_views import Agreement, agreements, read_verified_pairs
+from nerfcli.poses.view_graph import consistent_groups
+
+# Numbers of the mapper's runs that follow those of the ladder; they are part of the seed.
+_FIRST_ATTEMPT = 100
+# Of the photos that were placed, the share that must agree with itself to be built upon.
+_LEAST_CORE = 0.3
+# In an ordered capture, photos so near in the order are taken to be neighbours in space.
+_NEAR_IN_ORDER = 10
+# A hypothesis is not started when those before it took this many times as long as the first mapping.
+_MOST_TIME = 1.5
+
+
+@dataclass(frozen=True)
+class Chance:
+    """What a hypothesis led to."""
+
+    mapped: Mapped
+    examined: Examined
+
+
+def second_chance(
+    mapped: Mapped, first: Examined, report: Report, tell: Tell, *, checks: Callable[[], Checks]
+) -> Chance:
+    """Map again under one hypothesis after the other until the checks accept a model.
+
+    Args:
+        mapped: the models that the checks refused.
+        first: what they said.
+        report: called with (stage, done, total).
+        tell: called with what the user should know.
+        checks: makes the runner of the checks of one more model.
+
+    Returns:
+        The first accepted model; else the largest part of a model that is accepted by itself; else what was given.
+    """
+    start = time.perf_counter()
+    pairs = first.verdict.measures["pairs"]
+    against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
+    tell(f"{against}: the photos are mapped again, for {duration(_MOST_TIME * mapped.seconds)} at most")
+    attempts = list(mapped.attempts)
+    core = _core(mapped)
+    hypotheses: list[tuple[str, Callable[[], Mapped | None]]] = [
+        ("the largest part that agrees with itself, and the rest anew", lambda: _regrown(mapped, core, report)),
+        ("without pairs that contradict that part", lambda: _without_suspects(mapped, core, report)),
+        ("all photos at once (global mapper)", lambda: _all_at_once(mapped, core)),
+        ("that part alone", lambda: replace(mapped, models=[core.model, *mapped.models[1:]])),
+    ]
+    for number, (what, make) in enumerate(hypotheses):
+        last = number == len(hypotheses) - 1
+        if not last and time.perf_counter() - start > _MOST_TIME * mapped.seconds:
+            tell(f"not tried, for it takes too long: {what}")
+            continue
+        tell(f"next: {what}")
+        runner = checks()
+        found = runner.run(what, partial(_kept, mapped.job, f"second-chance-{number}", make), otherwise=None)
+        if found is None or not found.models:
+            tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
+            continue
+        examined = examine(found.models[:1], found.job, report, checks=runner)
+        size = 0 if examined.model is None else examined.model.num_reg_images()
+        attempts.append({"what": what, "models": [size, *(m.num_reg_images() for m in found.models[1:])]})
+        verdict = "accepted" if examined.verdict.accepted else examined.verdict.failures[0].kind
+        tell(f"{what}: {size} of {len(mapped.job.files)} photos placed, {verdict}")
+        if examined.verdict.accepted:
+            return Chance(replace(found, attempts=attempts), examined)
+    return Chance(replace(mapped, attempts=attempts), first)
+
+
+def is_contradicted(verdict: Verdict) -> bool:
+    """Whether pairs of photos speak against the model, rather than the capture as a whole."""
+    kinds = [failure.kind for failure in verdict.failures]
+    return any("contradict" in kind or "look alike" in kind for kind in kinds)
+
+
+@dataclass(frozen=True)
+class _Core:
+    """The largest group of photos that no pair contradicts strongly: image ids, model, all agreements of the model."""
+
+    photos: frozenset[int]
+    model: pycolmap.Reconstruction
+    found: list[Agreement]
+
+
+def _core(mapped: Mapped) -> _Core:
+    model = mapped.models[0]
+    with closing(pycolmap.Database.open(str(mapped.job.database))) as database:
+        pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
+    found = agreements(model, pairs)
+    joins = [(a.one, a.other, a.matches * (2 * a.share - 1)) for a in found]
+    largest = frozenset(consistent_groups(sorted(model.reg_image_ids()), joins)[0])
+    rest = pycolmap.Reconstruction(model)
+    for photo in sorted(set(model.reg_image_ids()) - largest):
+        rest.deregister_frame(rest.image(photo).frame_id)
+    rest.tear_down()
+    return _Core(largest, rest, found)
+
+
+def _regrown(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
+    """Adjust the core, and place the other photos from there."""
+    job = mapped.job
+    if len(core.photos) < _LEAST_CORE * mapped.models[0].num_reg_images():
+        return None
+    base = pycolmap.Reconstruction(core.model)
+    settle(base, threads=job.threads, fixed=job.fixed_cameras)
+    models = map_photos(job, report, attempt=_FIRST_ATTEMPT, start=Start(), base=base)
+    return Mapped(models, job, mapped.attempts)
+
+
+def _without_suspects(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
+    """Map from the beginning without the pairs that may be mistaken.
+
+    These are the ones that contradict the core from within, and those that hold other photos to it where the model is
+    refused. In an ordered capture, neighbours in the order are above suspicion.
+    """
+    suspects = {
+        (a.one, a.other)
+        for a in core.found
+        if (a.contradicts and {a.one, a.other} <= core.photos)
+        or (not a.contradicts and len({a.one, a.other} & core.photos) == 1)
+    }
+    if not suspects:
+        return None
+    numbers = {image_id: number for number, image_id in enumerate(mapped.job.image_ids)}
+    order = capture_order(mapped.job.names)
+    place = {} if order is None else {number: index for index, number in enumerate(order)}
+    dropped = {
+        (numbers[one], numbers[other])
+        for one, other in suspects
+        if not place or abs(place[numbers[one]] - place[numbers[other]]) > _NEAR_IN_ORDER
+    }
+    job = _with_own_database(mapped.job, without=dropped)
+    models = map_photos(job, report, attempt=_FIRST_ATTEMPT + 1, start=Start())
+    job.database.unlink()
+    return Mapped(models, mapped.job, mapped.attempts)
+
+
+def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
+    """Rotations, then positions, of all photos together; with the intrinsics of the core."""
+    job = _with_own_database(mapped.job, without=set())
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        for camera in core.model.cameras.values():
+            camera.has_prior_focal_length = True
+            database.update_camera(camera)
+    models = map_globally(job)
+    job.database.unlink()
+    return Mapped(models, mapped.job, mapped.attempts)
+
+
+def _with_own_database(job: Job, *, without: set[tuple[int, int]]) -> Job:
+    """Copy the job's database, without some pairs of photo numbers, and return the job of the copy."""
+    copy = replace(job, rung="second-chance")
+    shutil.copyfile(job.database, copy.database)
+    left_out = {(min(pair), max(pair)) for pair in without}
+    keep_geometries(copy, [pair for pair in job.pairs if (min(pair), max(pair)) not in left_out])
+    return copy
+
+
+def _kept(job: Job, name: str, make: Callable[[], Mapped | None]) -> Mapped | None:
+    """Return what an earlier call has written under this name, or make it and write it."""
+    key = stage_key(mapping_key(job), name)
+    if (there := read_mapped(job, key, name=name)) is not None:
+        return there
+    made = make()
+    if made is None:
+        return None
+    write_mapped(made, key, name=name)
+    return read_mapped(job, key, name=name)
