@@ -29,13 +29,14 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels, scene
+from nerfcli.cameras.formats.run_cameras import read_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, inverse, rotation_from_vector, vector_from_rotation
 from nerfcli.evaluate.protocol import Extras, HeldOut, evaluate_model
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
 from nerfcli.runs.components import Components
-from nerfcli.runs.folder import FIELD, read_cameras
+from nerfcli.runs.files import FIELD
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.loop import Progress, train
@@ -159,10 +160,10 @@ def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downs
         model, cameras = load_model(run / FIELD, "cpu"), read_cameras(run)
         held_out = [  # while the run is there: it says where the photos are from where it is
             HeldOut(photo.frame, photo.pixels, photo.used)
-            for photo in load_photos(cameras["test"], factor=downscale, threads=1)
+            for photo in load_photos(cameras.test, factor=downscale, threads=1)
         ]
     pictures = Pictures(truth.train_frames)
-    found = np.array([frame.world_from_cam for frame in cameras["train"]])
+    found = np.array([frame.world_from_cam for frame in cameras.train])
     alignment = pictures.alignment(found)
     there = [  # a held-out camera, as it stands to the refined ones
         replace(h, frame=replace(h.frame, world_from_cam=alignment.inverse().apply_pose(h.frame.world_from_cam)))
@@ -171,9 +172,7 @@ def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downs
     mean = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras(align_poses=True))["mean"]
     mapped = evaluate_model(model, there, on_image=lambda done, total: None, extras=Extras())["mean"]
     turns = vector_from_rotation(np.swapaxes(pictures.truth[:, :3, :3], 1, 2) @ found[:, :3, :3])
-    focal = [
-        a.camera.focal_px / b.camera.focal_px - 1 for a, b in zip(cameras["train"], truth.train_frames, strict=True)
-    ]
+    focal = [a.camera.focal_px / b.camera.focal_px - 1 for a, b in zip(cameras.train, truth.train_frames, strict=True)]
     return Trained(
         given.root.name,
         choice,

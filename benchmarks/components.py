@@ -27,7 +27,7 @@ from nerfcli.photos.held_out_exposure import log_gains_of
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
 from nerfcli.runs.components import Components, choose
-from nerfcli.runs.folder import FIELD
+from nerfcli.runs.files import FIELD
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import Progress, train
 

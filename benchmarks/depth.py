@@ -27,12 +27,13 @@ from rich.table import Table
 
 from nerfcli import kernels
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.run_cameras import read_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.depth import CONVENTIONS, DepthRequest, requested
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import render_rays
-from nerfcli.runs.folder import FIELD, read_cameras
+from nerfcli.runs.files import FIELD
 
 DEPTHS = (*CONVENTIONS, "quantile:0.05", "quantile:0.95")
 SHARES = (0.5, 0.05, 0.95)
@@ -204,7 +205,7 @@ def main(
     output.mkdir(parents=True, exist_ok=True)
     kernels.prepare(print)
     model = load_model(run / FIELD, "cpu")
-    test = read_cameras(run)["test"]
+    test = read_cameras(run).test
     chosen = [test[index] for index in np.unique(np.linspace(0, len(test) - 1, views).round().astype(int))]
     whole = [desk_truth(frame) if folder is None else kitchen_truth(frame, folder) for frame in chosen]
     truths = [truth[::STRIDE, ::STRIDE] for truth in whole]

@@ -1,7 +1,44 @@
-"""nerfcli: from a folder of photos to a radiance field, its renders, depth maps and videos."""
+"""nerfcli: from a folder of photos to a radiance field, its renders, depth maps and videos.
+
+What the commands do, for Python programs: `estimate_poses`, `train_scene`, `evaluate_run`, `render_run`; and
+`load_scene`, `load_run` for what these write. They are imported when they are first used: `import nerfcli` is quick.
+"""
 
 # Before any module of this package can import pycolmap: its wheel exports zlib's functions, and where Python's zlib is
 # loaded after it, the first compression (a PNG, a TIFF, an npz) aborts the process.
 import zlib  # noqa: F401
 
 __version__ = "0.1.0"
+__all__ = ["estimate_poses", "evaluate_run", "load_run", "load_scene", "render_run", "train_scene"]
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from nerfcli.runs.run import load_run
+    from nerfcli.scene import load as load_scene
+    from nerfcli.workflows.evaluate import evaluate_run
+    from nerfcli.workflows.poses import estimate_poses
+    from nerfcli.workflows.render import render_run
+    from nerfcli.workflows.train import train_scene
+
+_MODULES = {
+    "estimate_poses": "nerfcli.workflows.poses",
+    "evaluate_run": "nerfcli.workflows.evaluate",
+    "load_run": "nerfcli.runs.run",
+    "load_scene": "nerfcli.scene",
+    "render_run": "nerfcli.workflows.render",
+    "train_scene": "nerfcli.workflows.train",
+}
+# Where the name in the module is another one.
+_NAMES = {"load_scene": "load"}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'nerfcli' has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(_MODULES[name]), _NAMES.get(name, name))
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -91,8 +91,13 @@ def model_folder(path: Path) -> Path | None:
     return next((path / name for name in _MODEL_FOLDERS if is_model(path / name)), None)
 
 
-def load(path: Path, *, holdout: str | None = None) -> Scene:
-    """The scene in a folder, whatever its format; a scene.json or transforms.json itself may be named too.
+def load(path: str | Path, *, holdout: str | None = None) -> Scene:
+    """Load the scene in a folder, whatever its format; a scene.json or transforms.json itself may be named too.
+
+    Example:
+        >>> import nerfcli
+        >>> scene = nerfcli.load_scene("photos-scene")
+        >>> [frame.name for frame in scene.test_frames]
 
     Args:
         path: the folder, or the file.

@@ -17,8 +17,11 @@ from hypothesis import settings
 
 from nerfcli import scene
 from nerfcli.atomic import write_json
+from nerfcli.cameras.formats.run_cameras import write_cameras
 from nerfcli.render.model import Model, save_model
-from nerfcli.runs.folder import CONFIG, FIELD, append_log, describe_run, write_cameras
+from nerfcli.runs.config import RunConfig
+from nerfcli.runs.files import CONFIG, FIELD
+from nerfcli.runs.log import LogEntry, append_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import train
 from nerfcli.train.normalisation import object_frame
@@ -98,16 +101,18 @@ def write_run(run: Path, captured: scene.Scene, model: Model, *, factor: int) ->
     """The folder that a training of seven steps at 1 / factor of the resolution leaves, with any model."""
     settings = TrainSettings(budget_seconds=None, steps=7)
     run.mkdir()
-    write_json(run / CONFIG, describe_run(captured, settings, factor=factor, contraction="none"))
+    write_json(run / CONFIG, RunConfig.describing(captured, settings, factor=factor, contraction="none").to_json())
     write_cameras(run, captured.train_frames, captured.test_frames)
     save_model(run / FIELD, model)
-    entry = {
+    entry: LogEntry = {
         "step": 7,
         "seconds": 2.0,
         "samples": 100,
         "rays": 10,
         "loss": 0.1,
         "samples_per_second": 50,
+        "rays_per_second": 5,
+        "rollbacks": 0,
         "peak_memory_bytes": 9,
     }
     append_log(run, entry)

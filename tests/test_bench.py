@@ -22,7 +22,7 @@ from typer.testing import CliRunner, Result
 
 from nerfcli import cli
 from nerfcli.bench import measure, rendering
-from nerfcli.bench.heldout import FINER, distance_to_float64, held_out_photos, quadrature, smaller
+from nerfcli.bench.heldout import FINER, distance_to_float64, quadrature, smaller
 from nerfcli.bench.machine import is_busy, processor_name
 from nerfcli.bench.pareto import SAME_TIME, Measured, Spread, at_most, dominators, least_difference, near_best
 from nerfcli.bench.records import MEASURED, opened
@@ -43,10 +43,11 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, UserError
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.pages.page import asset
 from nerfcli.render.model import Model, load_model
-from nerfcli.runs.folder import FIELD
+from nerfcli.runs.files import FIELD
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.normalisation import object_frame
@@ -263,7 +264,7 @@ def test_smaller_photos_keep_what_they_show():
 def test_a_model_measures_as_it_evaluates(spheres: Scene, foggy: Path, tmp_path: Path):
     """Where all pixels are sampled, the PSNR is that of the evaluation."""
     model = load_model(foggy / FIELD, "cpu")
-    photos = held_out_photos(spheres.test_frames, model, settings=TrainSettings(downscale=4))
+    photos = held_out_photos(spheres.test_frames, model, downscale=4, masks="ignore", threads=1)
     shown = photos[1].frame.name
     found = measure_model(model, photos, seed=0, folder=tmp_path, prefix="a", shown=shown)
     evaluated = evaluate_model(model, photos, on_image=lambda done, total: None)

@@ -24,14 +24,14 @@ from typer.exceptions import TyperException
 
 from nerfcli import cli, scene
 from nerfcli.atomic import write_json
-from nerfcli.cli import poses as poses_command
 from nerfcli.cli.options import seconds_from_text, thread_count
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, INTERRUPTED, OUT_OF_MEMORY, TERMINATED, TOO_FEW_PHOTOS
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
-from nerfcli.runs.folder import read_log
+from nerfcli.runs.log import read_log
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress
+from nerfcli.workflows import poses as poses_workflow
 
 COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench")
 WITHOUT_INPUT = ("selftest",)
@@ -146,7 +146,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train x --stepz 3", "--stepz"),
         ("train x --steps 0", "--steps"),
         ("train x --downscale 3", "'3'; choose auto, 1, 2, 4 or 8"),
-        ("train x --field gaussians", "'gaussians'; choose hash, voxels, mlp"),
+        ("train x --field gaussians", "'gaussians'; choose hash, voxels or mlp"),
         ("train x --budget soon", "'soon' is not a time"),
         ("train x --device tpu", "'tpu'"),
         ("poses x --camera-model PERSPECTIVE", "'PERSPECTIVE'; choose auto"),
@@ -154,8 +154,8 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --depth-axis y", "'y'; choose ray or z"),
         ("render x --outputs rgb,normals", "'normals'; choose some of rgb,depth,opacity"),
         ("render x --min-opacity 1.5", "--min-opacity"),
-        ("render x --colour-map jet", "'jet'; choose one of turbo, viridis, grey"),
-        ("render x --video-format avi", "'avi'; choose one of mp4, h265, webm, gif"),
+        ("render x --colour-map jet", "'jet'; choose turbo, viridis or grey"),
+        ("render x --video-format avi", "'avi'; choose mp4, h265, webm or gif"),
         ("render x --video --crf 52", "52; mp4 ends at 51"),
         ("render x --video-format gif --crf 5", "a gif has no scale of quality"),
         ("render x --video-format gif --fps 60", "60; players show a gif at 50 at most"),
@@ -270,7 +270,7 @@ def test_memory_that_runs_out_is_exit_code_6(monkeypatch, capture, finished):
     def exhausted(*args: object, **kwargs: object) -> None:
         raise RuntimeError("[enforce fail at alloc_cpu.cpp:114] DefaultCPUAllocator: not enough memory: you tried")
 
-    monkeypatch.setattr("nerfcli.render.model.load_model", exhausted)
+    monkeypatch.setattr("nerfcli.runs.run.load_model", exhausted)
     result = nerfcli("evaluate", finished)
     assert result.exit_code == OUT_OF_MEMORY
     assert error_of(result)[0] == "Error: out of memory"
@@ -283,7 +283,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch, finished):
     def broken(*args: object, **kwargs: object) -> None:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("nerfcli.render.model.load_model", broken)
+    monkeypatch.setattr("nerfcli.runs.run.load_model", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         nerfcli("evaluate", finished)
 
@@ -638,11 +638,11 @@ def test_options_of_views_that_do_not_fit_are_wrong_usage(options, finished):
 
 def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch, capture, tmp_path):
     # Structure from motion has its own tests; here it finds the poses that the capture has.
-    def known_poses(folder: Path, target: Path, **settings: object) -> None:
+    def known_poses(folder: Path, target: Path, settings: object, **more: object) -> None:
         if not target.exists():
             shutil.copytree(folder, target)
 
-    monkeypatch.setattr(poses_command, "estimate_scene", known_poses)
+    monkeypatch.setattr(poses_workflow, "estimate_poses", known_poses)
     arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--count", "2", "--max-size", "16"]
 
     def interrupted(*args: Any, on_progress: Callable[[Progress], None], **settings: Any) -> None:
@@ -666,14 +666,20 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
         *(tmp_path / "all" / "scene", run, run / "metrics.json"),
         *(run / "renders" / "test-conditional-z" / name for name in ("rgb", "depth", "opacity")),
         *(run / "renders" / "orbit-conditional-z" / f"{name}.mp4" for name in ("rgb", "depth")),
+        run / "report.html",
     ]
     assert first.exit_code == 0, first.stderr
+    assert f"everything about it, to look at: {run / 'report.html'}" in first.stderr
     assert first.stdout.splitlines() == [str(path) for path in expected]
     assert all(path.exists() for path in expected)
     before = listing(run)
     again = nerfcli(*arguments)
     assert (again.exit_code, again.stdout) == (0, first.stdout)
     assert listing(run) == before
+    assert "report.html is kept" in again.stderr
+    (run / "metrics.json").unlink()  # then the page tells of numbers that are there no more
+    nerfcli("evaluate", run)
+    assert "report.html is kept" not in nerfcli(*arguments).stderr
 
 
 # Processes of their own

@@ -8,9 +8,9 @@ from clips import encode, ffmpeg, pan
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
-from nerfcli.cli import poses as poses_command
-from nerfcli.cli import train as train_command
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
+from nerfcli.workflows import poses as poses_workflow
+from nerfcli.workflows import train as train_workflow
 
 
 def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:
@@ -22,11 +22,11 @@ def estimated(monkeypatch) -> list[tuple[str, str, int]]:
     """What structure from motion was asked for: folder, scene, photos in it. It makes an empty scene."""
     asked = []
 
-    def estimate(folder: Path, scene: Path, **settings: Any) -> None:
+    def estimate(folder: Path, scene: Path, settings: Any, **more: Any) -> None:
         asked.append((str(folder), str(scene), len(list(folder.glob("*.jpg")))))
         scene.mkdir(parents=True, exist_ok=True)
 
-    monkeypatch.setattr(poses_command, "estimate_scene", estimate)
+    monkeypatch.setattr(poses_workflow, "estimate_poses", estimate)
     return asked
 
 
@@ -59,7 +59,7 @@ def test_run_takes_a_video_too(clip, estimated, monkeypatch):
     def stop(*args: Any, **settings: Any) -> None:
         raise UserError("far enough", "")
 
-    monkeypatch.setattr(train_command, "train_scene", stop)
+    monkeypatch.setattr(train_workflow, "train_scene", stop)
     assert "far enough" in nerfcli("run", clip, "--frames", "6", "-o", "all").stderr
     assert "far enough" in nerfcli("run", clip, "--frames", "6").stderr
     assert estimated == [("all/frames", "all/scene", 6), ("my clip-frames", "my clip-scene", 6)]
@@ -117,7 +117,9 @@ def test_frames_and_scene_are_kept(clip, estimated):
 
 def test_masks_go_to_the_settings(tmp_path, monkeypatch):
     asked: list[Any] = []
-    monkeypatch.setattr(poses_command, "estimate_scene", lambda *args, settings, **more: asked.append(settings))
+    monkeypatch.setattr(
+        poses_workflow, "estimate_poses", lambda photos, scene, settings, **more: asked.append(settings)
+    )
     monkeypatch.chdir(tmp_path)
     Path("photos").mkdir()
     assert nerfcli("poses", "photos", "--masks", "masks").exit_code == 0

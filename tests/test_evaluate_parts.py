@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from nerfcli.evaluate.spread import spread
 from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import RaysSeen
+from nerfcli.runs.config import RunConfig
 
 UP = np.array([0.0, -1.0, 0.0])
 BLACK = (0.0, 0.0, 0.0)
@@ -173,8 +175,8 @@ def test_halves_share_no_pixel_and_leave_none():
 # Ledger
 
 
-def seen(config: dict[str, object]) -> dict[str, bool | None]:
-    return {entry.stage: entry.saw_held_out for entry in leak_ledger(config)}
+def seen(config: dict[str, Any]) -> dict[str, bool | None]:
+    return {entry.stage: entry.saw_held_out for entry in leak_ledger(RunConfig(**config))}
 
 
 def test_the_ledger_says_what_each_way_to_poses_has_seen():
@@ -187,7 +189,7 @@ def test_the_ledger_says_what_each_way_to_poses_has_seen():
     foreign = seen({"history": {"from": "blender"}})
     assert (foreign["poses"], foreign["training"]) == (None, False)
     assert seen({})["poses"] is None
-    assert told(leak_ledger({"history": {"from": "llff"}})).startswith(
+    assert told(leak_ledger(RunConfig(history={"from": "llff"}))).startswith(
         "held-out photos were seen by normalisation; perhaps seen by poses, intrinsics, points; not seen by "
     )
 
@@ -213,9 +215,9 @@ def test_what_is_no_requirement_is_refused(text):
 
 def test_registered_is_the_share_of_photos_with_a_pose():
     metrics = {"mean": {"psnr": 20.0}, "training": {"seconds": 5.0}, "render": {"seconds_per_image": 1.0}}
-    config = {"history": {"registered": 9, "total": 12}}
+    config = RunConfig(history={"registered": 9, "total": 12})
     assert known_numbers(metrics, config)["registered"] == 0.75
-    assert known_numbers(metrics, {"history": {"from": "llff"}})["registered"] is None
+    assert known_numbers(metrics, RunConfig(history={"from": "llff"}))["registered"] is None
 
 
 # Spread

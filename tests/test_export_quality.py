@@ -11,7 +11,7 @@ from PIL import Image
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.cli.rendering import tolerance_of
+from nerfcli.cli.render_options import tolerance_of
 from nerfcli.export.frames import export_frames
 from nerfcli.export.order import Order
 from nerfcli.export.settings import ExportSettings

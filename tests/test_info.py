@@ -15,7 +15,7 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
-from nerfcli.cli.words import lines_of
+from nerfcli.cli.info_text import lines_of
 from nerfcli.media.depth import KEY
 from nerfcli.media.descriptions import description_of
 from nerfcli.media.exr import write_exr

@@ -20,7 +20,7 @@ from nerfcli import atomic, kernels, scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
 from nerfcli.exclusive import exclusive
 from nerfcli.interrupts import hear_signals
-from nerfcli.runs.folder import LOCK
+from nerfcli.runs.files import LOCK
 
 ONE_STEP = ("--steps", "1", "--downscale", "8", "--threads", "2")
 FEW = ("--cameras", "test", "--max-size", "16", "--threads", "2")

@@ -1,16 +1,22 @@
-"""What an installed nerfcli is besides its commands: its licence, completion in the shell, the order of imports."""
+"""What an installed nerfcli is besides its commands: a package for Python programs, its licence, completion."""
 
 import ast
 import hashlib
+import inspect
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 import nerfcli
+from nerfcli.poses import structure_from_motion
 
 ROOT = Path(nerfcli.__file__).parent
 PROJECT = ROOT.parent
@@ -89,3 +95,51 @@ def test_completion_is_shown_and_installed_for_the_shell_that_asks(option, tmp_p
         assert "nerfcli.sh" in (tmp_path / ".bashrc").read_text()
     assert "_NERFCLI_COMPLETE=complete_bash" in script
     assert script.rstrip().splitlines()[-1].endswith(" nerfcli")  # complete ... nerfcli
+
+
+# The front door
+
+
+def test_the_package_is_imported_without_its_parts():
+    result = in_python("import sys; before = set(sys.modules); import nerfcli; print(*(set(sys.modules) - before))")
+    assert set(result.stdout.split()) <= {"nerfcli", "zlib"}
+
+
+@pytest.mark.parametrize("name", nerfcli.__all__)
+def test_a_public_function_says_how_it_is_called(name):
+    function = getattr(nerfcli, name)
+    text = inspect.getdoc(function) or ""
+    example = "\n".join(line.strip()[4:] for line in text.splitlines() if line.strip().startswith(">>> "))
+    calls = [node for node in ast.walk(ast.parse(example)) if isinstance(node, ast.Call)]
+    (call,) = [call for call in calls if ast.unparse(call.func) == f"nerfcli.{name}"]
+    keywords = {keyword.arg: None for keyword in call.keywords if keyword.arg}
+    inspect.signature(function).bind(*call.args, **keywords)
+    parameters = inspect.signature(function).parameters
+    assert all(re.search(rf"^    .*\b{parameter}\b.*: ", text, re.M) for parameter in parameters)
+    assert "Raises:" in text
+
+
+def test_the_package_has_nothing_else():
+    assert set(nerfcli.__all__) <= set(dir(nerfcli))
+    with pytest.raises(AttributeError, match="has no attribute 'train_scenes'"):
+        _ = nerfcli.train_scenes  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_example_of_the_readme_runs(capture, tmp_path, monkeypatch, capsys):
+    """As it stands, but for the budget. Structure from motion has its own tests: here it finds the known poses."""
+
+    def known_poses(folder: Path, scene: Path, **settings: Any) -> SimpleNamespace:
+        shutil.copytree(capture, scene)
+        return SimpleNamespace(images=[], registered=5, total=5, seconds={"total": 1.0}, mean_reprojection_error_px=0.5)
+
+    monkeypatch.setattr(structure_from_motion, "estimate_poses", known_poses)
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"^```python\n(.*?)^```", (PROJECT / "README.md").read_text("utf-8"), re.M | re.S)
+    quick = code.replace("budget_seconds=120", "budget_seconds=None, steps=2, downscale=8")
+    assert quick != code
+    exec(compile(quick, "README.md", "exec"), {})
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "photos-scene: 5 of 5 photos registered in 1 s, mean reprojection error 0.50 px"
+    assert re.fullmatch(r"2 steps, \d+\.\d\d dB on photos that training never saw", said[1])
+    assert "photos-scene-run/renders/test-conditional-z/depth" in said[2]
+    assert (tmp_path / "photos-scene-run" / "renders" / "test-conditional-z" / "depth").is_dir()

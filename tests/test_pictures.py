@@ -9,6 +9,7 @@ import torch
 from fog import SIDE, STEP, fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.run_cameras import read_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.field.hash_field import HashField
@@ -18,7 +19,7 @@ from nerfcli.render.depth import CONVENTIONS, DepthRequest
 from nerfcli.render.model import Model, load_model
 from nerfcli.render.pictures import Picture, Quality, render_picture, straight_rgba
 from nerfcli.render.rays import places_in_pixel
-from nerfcli.runs.folder import FIELD, read_cameras
+from nerfcli.runs.files import FIELD
 
 BLACK = (0.0, 0.0, 0.0)
 MAPS = ("rgb", "opacity", "depth", "spread", "disagreement", "truncation_error", "valid")
@@ -27,7 +28,7 @@ MAPS = ("rgb", "opacity", "depth", "spread", "disagreement", "truncation_error",
 @pytest.fixture(scope="module")
 def trained(spheres_run: Path) -> tuple[Model, Frame]:
     """A trained field of the real size, so that the compiled kernels run, and a small view of it."""
-    frame = read_cameras(spheres_run)["test"][0]
+    frame = read_cameras(spheres_run).test[0]
     return load_model(spheres_run / FIELD, "cpu"), replace(frame, camera=frame.camera.resized(16, 12))
 
 

@@ -16,6 +16,7 @@ from nerfcli.poses.report import PosesReport
 from nerfcli.poses.settings import PoseSettings
 from nerfcli.poses.strict import fingerprint, held_out_last, training_part
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
+from nerfcli.runs.config import RunConfig
 
 HELD_OUT = 2  # in the middle, and stored upright
 
@@ -64,7 +65,7 @@ def test_the_scene_knows_what_was_held_out_and_how(solved):
     loaded = scene.load(scene_dir)
     assert loaded.test_names == {NAMES[HELD_OUT]}
     assert (loaded.history["registered"], loaded.history["total"]) == (7, 9)
-    ledger = {entry.stage: entry.saw_held_out for entry in leak_ledger({"history": loaded.history})}
+    ledger = {entry.stage: entry.saw_held_out for entry in leak_ledger(RunConfig(history=loaded.history))}
     assert (ledger["poses"], ledger["intrinsics"], ledger["points"]) == (False, False, False)
     assert is_same_scene(scene_dir, photos, settings)
     assert not is_same_scene(scene_dir, photos, replace(settings, strict=False))

@@ -8,12 +8,12 @@ import typer
 from commands import error_of, nerfcli
 from test_cli import USAGE, write_photos
 
-from nerfcli.cli import poses as poses_command
 from nerfcli.cli.options import bytes_from_text
-from nerfcli.cli.poses import _STAGES
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses import supervise
 from nerfcli.poses.settings import QUALITIES, PoseSettings
+from nerfcli.workflows import poses as poses_workflow
+from nerfcli.workflows.poses import _STAGES
 
 
 @pytest.mark.parametrize(
@@ -33,8 +33,8 @@ def test_what_is_no_amount_of_memory(text: str):
 @pytest.mark.parametrize(
     ("line", "named"),
     [
-        ("--quality superb", "'superb'; choose fast, default, best"),
-        ("--pairing random", "'random'; choose auto, exhaustive, sequential, retrieval, spatial"),
+        ("--quality superb", "'superb'; choose fast, default or best"),
+        ("--pairing random", "'random'; choose auto, exhaustive, sequential, retrieval or spatial"),
         ("--pairing spatial --pairs p.txt", "the pairs come from --pairs"),
         ("--memory lots", "'lots' is not an amount of memory"),
         ("--time-limit soon", "'soon' is not a time"),
@@ -78,11 +78,11 @@ def test_the_plan_can_be_read(tmp_path: Path):
 def test_the_quality_goes_to_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str):
     asked: list[tuple[int, int]] = []
 
-    def estimate(folder: Path, scene: Path, *, settings: PoseSettings, **more: object) -> None:
+    def estimate(folder: Path, scene: Path, settings: PoseSettings, **more: object) -> None:
         asked.append((settings.max_image_size, settings.max_features))
         raise UserError("enough", "that was all")
 
-    monkeypatch.setattr(poses_command, "estimate_scene", estimate)
+    monkeypatch.setattr(poses_workflow, "estimate_poses", estimate)
     photos = write_photos(tmp_path / "photos", 5)
     for quality in ("fast", "best"):
         assert nerfcli(command, photos, "--quality", quality).exit_code == BAD_INPUT

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lenses import HEIGHT, MODELS, WIDTH, random_camera
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.run_cameras import find_run, parse_run
+from nerfcli.cameras.formats.run_cameras import find_run, parse_run, read_cameras, read_given_cameras
 from nerfcli.cameras.rigid import (
     Similarity,
     apply,
@@ -27,7 +27,7 @@ from nerfcli.field.checkpoint import load_tensors
 from nerfcli.photos.loading import load_photos
 from nerfcli.runs.camera_moves import camera_moves
 from nerfcli.runs.components import Components
-from nerfcli.runs.folder import STATE, read_cameras, read_given_cameras
+from nerfcli.runs.files import STATE
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.extent import Extent
@@ -541,7 +541,7 @@ def test_resuming_goes_on_with_the_cameras_bit_for_bit(small, tmp_path):
     for name, tensor in ours.items():
         assert torch.equal(tensor, theirs[name]), name
     assert (ours["parts.cameras.poses.motions"] != torch.eye(4)).any()
-    frames = [read_cameras(tmp_path / name)["train"] for name in ("straight", "parts")]
+    frames = [read_cameras(tmp_path / name).train for name in ("straight", "parts")]
     for one, other in zip(*frames, strict=True):
         assert one.camera == other.camera
         assert np.array_equal(one.world_from_cam, other.world_from_cam)
@@ -551,19 +551,19 @@ def test_a_run_has_the_cameras_of_its_field_and_those_of_the_scene(small, tmp_pa
     run = tmp_path / "run"
     fit(small, run, replace(FEW, components=Components(cameras="all")))
     refined, before = read_cameras(run), read_given_cameras(run)
-    for frame, old in zip(before["train"], small.train_frames, strict=True):
+    for frame, old in zip(before.train, small.train_frames, strict=True):
         assert frame.camera == old.camera
         assert np.array_equal(frame.world_from_cam, old.world_from_cam)
-    moves = camera_moves(before["train"], refined["train"], radius=1.0)
+    moves = camera_moves(before.train, refined.train, radius=1.0)
     assert all(moves[name]["max"] > 0 for name in ("rotation_deg", "translation_percent", "focal_percent"))
     # A held-out photo has the lens that training photos have told, and the pose that it had.
-    (held_out,) = refined["test"]
-    assert held_out.camera == refined["train"][0].camera != small.test_frames[0].camera
+    (held_out,) = refined.test
+    assert held_out.camera == refined.train[0].camera != small.test_frames[0].camera
     assert np.array_equal(held_out.world_from_cam, small.test_frames[0].world_from_cam)
     # And `convert` reads them.
     found = find_run(run)
     assert found is not None
     capture = parse_run(found)
     assert [frame.split for frame in capture.frames] == ["train"] * 3 + ["test"]
-    assert capture.frames[0].camera == refined["train"][0].camera
-    assert np.array_equal(capture.frames[0].world_from_cam, refined["train"][0].world_from_cam)
+    assert capture.frames[0].camera == refined.train[0].camera
+    assert np.array_equal(capture.frames[0].world_from_cam, refined.train[0].world_from_cam)

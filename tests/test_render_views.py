@@ -9,9 +9,9 @@ import pytest
 from commands import error_of, nerfcli
 from PIL import Image
 
-from nerfcli.cli.views import file_fps
 from nerfcli.errors import BAD_INPUT
 from nerfcli.media.float_tiff import read_tiff
+from nerfcli.workflows.views import file_fps
 
 USAGE = 2
 ONE = ("--cameras", "orbit", "--count", "2", "--threads", "1")

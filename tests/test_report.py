@@ -12,6 +12,7 @@ import pytest
 from fog import fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.run_cameras import RunCameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.evaluate.protocol import HeldOut
@@ -23,6 +24,11 @@ from nerfcli.report.facts import RunFacts, labels_of, mismatches_of, warnings_of
 from nerfcli.report.page import page_html
 from nerfcli.report.views import ERROR_RANGE, Seen, common_names, depth_range, error_map, spread_evenly
 from nerfcli.report.views import look_at as look_through
+from nerfcli.runs.components import Components
+from nerfcli.runs.config import RunConfig
+from nerfcli.runs.decisions import Decision, Selection
+from nerfcli.runs.log import LogEntry
+from nerfcli.runs.settings import TrainSettings
 
 EVIL = "</script><script>alert(1)</script><b>\"'"
 DEPTH = DepthRequest("conditional", "z", min_opacity=0.1)
@@ -33,15 +39,27 @@ def camera_at(name: str, place: tuple[float, float, float]) -> Frame:
     return Frame(name, Camera.pinhole(10, 8, 8.0), pose)
 
 
+def logged(step: int, loss: float, *, rollbacks: int = 0) -> LogEntry:
+    """A line of a log with ten steps a second."""
+    return {
+        "step": step,
+        "seconds": step / 10,
+        "loss": loss,
+        "samples": 100_000 * step,
+        "rays": 1_000 * step,
+        "peak_memory_bytes": 10_000_000 * step,
+        "samples_per_second": 1e6,
+        "rays_per_second": 1e4,
+        "rollbacks": rollbacks,
+    }
+
+
 def facts(label: str = "a run", **changes: Any) -> RunFacts:
     run = RunFacts(
         path=Path(label.replace("/", "_")),
         label=label,
-        config={"scene": "kitchen-scene", "split_sha256": "1", "settings": {"seed": 0, "width": 32}},
-        log=[
-            {"step": 10, "seconds": 1.0, "loss": 0.1, "samples_per_second": 1e6, "peak_memory_bytes": 2e8},
-            {"step": 20, "seconds": 2.0, "loss": 0.01, "heldout_psnr": 21.5, "peak_memory_bytes": 3e8},
-        ],
+        config=RunConfig(scene=Path("kitchen-scene"), split_sha256="1"),
+        log=[logged(10, 0.1), {**logged(20, 0.01), "heldout_psnr": 21.5}],
         metrics={
             "protocol": "nerfcli-1",
             "mean": {"psnr": 23.456, "ssim": 0.75},
@@ -50,7 +68,7 @@ def facts(label: str = "a run", **changes: Any) -> RunFacts:
             "render": {"seconds_per_image": 0.25},
         },
         poses=None,
-        frames={"train": (camera_at("b.png", (0, 0, -2)),), "test": (camera_at("a.png", (0, 0, -2)),)},
+        frames=RunCameras((camera_at("b.png", (0, 0, -2)),), (camera_at("a.png", (0, 0, -2)),)),
         field_bytes=8_000_000,
     )
     return replace(run, **changes)
@@ -109,7 +127,7 @@ def test_photos_are_chosen_from_the_worst_to_the_best():
 
 def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
     def holding(*names: str) -> RunFacts:
-        return facts(frames={"train": (), "test": tuple(camera_at(name, (0, 0, -2)) for name in names)})
+        return facts(frames=RunCameras((), tuple(camera_at(name, (0, 0, -2)) for name in names)))
 
     assert common_names([holding("a.png", "b.png", "c.png"), holding("c.png", "a.png", "d.png")], 8) == [
         "a.png",
@@ -127,7 +145,7 @@ def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
         "1.50 M",
         "0.25 s",
         "8.0 MB",
-        "300 MB",
+        "200 MB",
         "conditional depth along the optical",
         ">20<",
     ):
@@ -142,7 +160,7 @@ def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
 
 def test_what_comes_from_outside_stays_text(seen):
     look, _ = seen
-    run = facts(EVIL, config={"scene": EVIL, "settings": {EVIL: EVIL}, "missing_photos": [EVIL], "unit": EVIL})
+    run = facts(EVIL, config=RunConfig(scene=Path(EVIL), versions={EVIL: EVIL}, missing_photos=(EVIL,), unit=EVIL))
     text = page_html([run], [look], depth=_meta())
     assert "<script>alert" not in text
     assert "<b>\"'" not in text
@@ -151,7 +169,7 @@ def test_what_comes_from_outside_stays_text(seen):
 
 def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     look, _ = seen
-    other = facts("another", config={**facts().config, "settings": {"seed": 0, "width": 64}})
+    other = facts("another", config=replace(facts().config, settings=TrainSettings(width=64)))
     text = page_html([facts(), other], [look, look], depth=_meta())
     assert "differs: settings.width" in text
     assert text.index("differs: settings.width") < text.index(">settings.seed<")
@@ -161,7 +179,7 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert f"&gt;= {highest:.3g}" in page_html(
         [facts(), other], [look, farther], depth=_meta()
     )  # one range for a scene
-    foreign = replace(other, config={"scene_fingerprint": "x"})
+    foreign = replace(other, config=RunConfig(scene_fingerprint="x"))
     assert f"&gt;= {high:.3g}" in page_html([facts(), foreign], [look, farther], depth=_meta())
     assert low < high < highest
 
@@ -177,16 +195,10 @@ def test_the_page_tells_what_saw_the_photos_what_was_chosen_and_how_new_the_view
         "ledger": [{"stage": "poses", "saw_held_out": True, "how": "all photos were matched"}],
         "kinds": {"extrapolation": {"images": 3, "psnr": 19.5}},
     }
-    decision = {
-        "component": "view",
-        "value": 0,
-        "gain_db": 0.5,
-        "error_db": 0.1,
-        "cost": -0.02,
-        "kept": True,
-        "why": "so",
-    }
-    chosen = replace(run, metrics=metrics, config={**run.config, "selection": {"decisions": [decision]}})
+    decision = Decision("view", 0, 0.5, 0.1, None, -0.02, None, True, "so")
+    chosen = replace(
+        run, metrics=metrics, config=replace(run.config, selection=Selection(Components(), (decision,), 1.0))
+    )
     text = page_html([chosen], [look], depth=_meta())
     for told in (
         "0.123",
@@ -206,7 +218,9 @@ def test_numbers_that_must_not_be_compared_are_named():
     one = facts()
     assert list(mismatches_of([one, facts("b")])) == []
     assert one.metrics is not None
-    foreign = replace(one, config={"split_sha256": "2"}, metrics={**one.metrics, "protocol": "x", "device": "cuda"})
+    foreign = replace(
+        one, config=RunConfig(split_sha256="2"), metrics={**one.metrics, "protocol": "x", "device": "cuda"}
+    )
     told = list(mismatches_of([one, foreign]))
     assert len(told) == 3
     assert "hold out different photos" in told[0]
@@ -219,8 +233,10 @@ def test_everything_that_was_warned_about_is_listed():
         "attempts": [{"what": "default thresholds"}, {"what": "full size"}],
         "pose_blur_px": {"largest": 3.21, "photo": "d.png"},
     }
-    run = facts(poses=poses, metrics=None, config={"missing_photos": ["e.png"], "warnings": ["intrinsics were halved"]})
-    run.log.append({"step": 30, "seconds": 3.0, "rollbacks": 2})
+    run = facts(
+        poses=poses, metrics=None, config=RunConfig(missing_photos=("e.png",), warnings=("intrinsics were halved",))
+    )
+    run.log.append(logged(30, 0.01, rollbacks=2))
     told = [f"{stage}: {text}" for stage, text in warnings_of(run)]
     for part in (
         *("c.png (too few matches)", "9 times the width", "2 attempts", "d.png is uncertain by 3.2 px"),

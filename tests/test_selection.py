@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.runs.components import Components
-from nerfcli.runs.decisions import Decision, decisions_in_words
+from nerfcli.runs.decisions import Decision, Selection
 from nerfcli.train.camera_check import CameraCheck
 from nerfcli.train.judgement import (
     CLEAR_ERRORS,
@@ -242,7 +242,7 @@ def test_what_gains_is_in_the_model_what_does_not_is_not_and_seeds_are_paired():
     }
     assert {seed for _, seed, _ in scripted.asked} == {0, 1}
     assert {steps for _, _, steps in scripted.asked} == {125}  # half of the longest start
-    assert decisions_in_words({"selection": chosen.to_json()}) == [d.in_words() for d in chosen.decisions]
+    assert Selection.from_json(chosen.to_json(), wanted=Components()).decisions == chosen.decisions
 
 
 POINTED = replace(FITTED, points=7)

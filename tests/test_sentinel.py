@@ -13,7 +13,7 @@ from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.render.model import load_model, save_model
 from nerfcli.render.pictures import render_picture
-from nerfcli.runs.folder import read_log
+from nerfcli.runs.log import read_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import sentinel

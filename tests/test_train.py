@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +21,10 @@ from nerfcli import kernels
 from nerfcli import scene as scenes
 from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.formats.run_cameras import read_cameras, write_cameras
+from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
+from nerfcli.convert.formats import Given, recognise
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
 from nerfcli.field.checkpoint import load_tensors
@@ -31,16 +34,9 @@ from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
 from nerfcli.runs.components import Components
-from nerfcli.runs.folder import (
-    append_log,
-    is_complete,
-    is_same_run,
-    read_cameras,
-    read_config,
-    read_log,
-    saved_progress,
-    write_cameras,
-)
+from nerfcli.runs.config import read_config
+from nerfcli.runs.log import LogEntry, append_log, read_log
+from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
 from nerfcli.train import loop
@@ -96,7 +92,7 @@ def test_held_out_views_are_far_better_than_one_colour(spheres, spheres_run):
     assert metrics["mean"]["psnr"] > one_colour + 8
     assert metrics["mean"]["ssim"] > 0.7
     # What the log said during training is the same quantity, pooled over some pixels.
-    assert read_log(spheres_run)[-1]["heldout_psnr"] == pytest.approx(metrics["mean"]["psnr"], abs=1.0)
+    assert read_log(spheres_run)[-1].get("heldout_psnr", 0.0) == pytest.approx(metrics["mean"]["psnr"], abs=1.0)
 
 
 @pytest.mark.slow
@@ -126,7 +122,7 @@ def test_photos_of_a_desk_are_learned_too(with_points, tmp_path):
     photos = load_photos(scene.test_frames, factor=8, threads=1)
     mean = np.mean([p.pixels for p in load_photos(scene.train_frames, factor=8, threads=1)], (0, 1, 2))
     one_colour = np.mean([-10 * math.log10(np.square((photo.pixels - mean) / 255).mean()) for photo in photos])
-    assert read_log(tmp_path / "run")[-1]["heldout_psnr"] > one_colour + 3
+    assert read_log(tmp_path / "run")[-1].get("heldout_psnr", 0.0) > one_colour + 3
 
 
 @pytest.mark.parametrize(("axis", "truth"), [("z", "z"), ("ray", "distance")])
@@ -187,12 +183,12 @@ def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, tmp_path):
         fit(views, tmp_path / "parts", ADAPTIVE, on_progress=stop)
     halfway = load_model(tmp_path / "parts" / "field.safetensors", "cpu")  # what Ctrl-C left can be looked at
     assert all(torch.isfinite(tensor).all() for tensor in halfway.field.state_dict().values())
-    assert not is_complete(tmp_path / "parts", ADAPTIVE)
+    assert not Run(tmp_path / "parts").is_complete(ADAPTIVE)
     second = fit(views, tmp_path / "parts", ADAPTIVE, resume=True)
     assert [progress.step for progress in second] == list(range(12, 25))
     assert [progress.loss for progress in second] == [progress.loss for progress in straight[11:]]
     assert weights(tmp_path / "parts") == weights(tmp_path / "straight")
-    assert is_complete(tmp_path / "parts", ADAPTIVE)
+    assert Run(tmp_path / "parts").is_complete(ADAPTIVE)
     log = read_log(tmp_path / "parts")
     assert [entry["step"] for entry in log] == sorted(entry["step"] for entry in log)
     assert log[-1]["samples"] == read_log(tmp_path / "straight")[-1]["samples"]
@@ -238,7 +234,7 @@ def test_resume_goes_on_to_a_larger_total(views, tmp_path):
     second = fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True)
     assert [progress.step for progress in second] == [4, 5]
     assert second[0].seconds > read_log(tmp_path / "run")[0]["seconds"]  # the clock goes on too
-    assert read_config(tmp_path / "run")["settings"]["steps"] == 5
+    assert read_config(tmp_path / "run").settings.steps == 5
     assert fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True) == []
 
 
@@ -280,7 +276,7 @@ def test_a_kill_between_field_and_state_is_no_harm(last, views, tmp_path):
         shutil.copy(straight / "field.safetensors", tmp_path / "run")  # a field that is ahead of the state
     with (tmp_path / "run" / "log.jsonl").open("a") as log:
         log.write('{"step": 24, "seconds": 1e3, "loss": 1}\n{"step": 25, "seco')
-    assert not is_complete(tmp_path / "run", ADAPTIVE)
+    assert not Run(tmp_path / "run").is_complete(ADAPTIVE)
     fit(views, tmp_path / "run", ADAPTIVE, resume=True)
     assert weights(tmp_path / "run") == weights(straight)
     steps = [entry["step"] for entry in read_log(tmp_path / "run")]
@@ -304,7 +300,7 @@ def test_ctrl_c_waits_for_the_end_of_the_step(views, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "run", ADAPTIVE)
     assert signal.getsignal(signal.SIGINT) is before
-    assert saved_progress(tmp_path / "run")[0] == 5
+    assert Run(tmp_path / "run").saved_progress()[0] == 5
     fit(views, tmp_path / "run", ADAPTIVE, resume=True)
     fit(views, tmp_path / "straight", ADAPTIVE)
     assert weights(tmp_path / "run") == weights(tmp_path / "straight")
@@ -407,14 +403,14 @@ def test_cameras_of_a_run_come_back_exactly_and_move_with_it(tmp_path, spheres):
     os.rename(tmp_path / "here", tmp_path / "there")
     moved = tmp_path / "there" / "runs" / "one"
     read = read_cameras(moved)
-    for name, expected in (("train", frames[1:]), ("test", (masked,))):
-        for ours, theirs in zip(read[name], expected, strict=True):
+    for found, expected in ((read.train, frames[1:]), (read.test, (masked,))):
+        for ours, theirs in zip(found, expected, strict=True):
             assert (ours.name, ours.camera) == (theirs.name, theirs.camera)
             np.testing.assert_array_equal(ours.world_from_cam, theirs.world_from_cam)
             assert ours.image is not None
             assert ours.image.is_file()
-    assert read["test"][0].mask is not None
-    assert read["train"][0].mask is None
+    assert read.test[0].mask is not None
+    assert read.train[0].mask is None
 
 
 def test_a_folder_that_is_no_run_is_told(tmp_path):
@@ -432,17 +428,28 @@ def test_a_folder_that_is_no_run_is_told(tmp_path):
 
 def test_a_log_line_that_a_kill_cut_short_is_left_out(tmp_path):
     assert read_log(tmp_path) == []
-    entry = {"step": 1, "seconds": 0.5, "loss": 0.1, "samples": 7, "rays": 3, "peak_memory_bytes": 9}
+    totals: Any = {"step": 1, "seconds": 0.5, "loss": 0.1, "samples": 7, "rays": 3, "peak_memory_bytes": 9}
+    entry: LogEntry = totals
     for broken in ('{"step": 3, "sec', "[]", "\x00", json.dumps({**entry, "samples": "7"}), json.dumps(entry)[:-2]):
         append_log(tmp_path, entry)
-        append_log(tmp_path, {**entry, "step": 2})
+        append_log(tmp_path, totals | {"step": 2})
         with (tmp_path / "log.jsonl").open("a") as file:
             file.write(broken)
         assert read_log(tmp_path) == [entry, {**entry, "step": 2}]
         (tmp_path / "log.jsonl").unlink()
 
 
-@pytest.mark.parametrize(("file", "read"), [("config.json", read_config), ("cameras.json", read_cameras)])
+def as_convert_reads(run: Path) -> Capture:
+    """The cameras of a run as `nerfcli convert` reads them."""
+    form, found = recognise(run)
+    assert form.parse is not None
+    return form.parse(found, Given())
+
+
+@pytest.mark.parametrize(
+    ("file", "read"),
+    [("config.json", read_config), ("cameras.json", read_cameras), ("cameras.json", as_convert_reads)],
+)
 def test_a_digit_that_changes_in_the_description_of_a_run_is_noticed(file, read, views, tmp_path):
     fit(views, tmp_path / "run", replace(FEW, steps=1))
     path = tmp_path / "run" / file
@@ -461,23 +468,23 @@ def test_what_counts_as_the_same_run(views, tmp_path):
     settings = replace(FEW, steps=1, downscale=4)
     fit(views, tmp_path / "run", settings)
     same = [settings, replace(settings, threads=1), replace(settings, device="cuda"), replace(settings, downscale=None)]
-    assert all(is_same_run(tmp_path / "run", views, other) for other in same)
+    assert all(Run(tmp_path / "run").is_trained_from(views, other) for other in same)
     other_settings = [replace(settings, seed=1), replace(settings, downscale=2), replace(settings, steps=2)]
-    assert not any(is_same_run(tmp_path / "run", views, other) for other in other_settings)
+    assert not any(Run(tmp_path / "run").is_trained_from(views, other) for other in other_settings)
     turned = Similarity(1.0, rotation_from_quaternion(np.array([1.0, 0.01, 0.0, 0.0])), np.zeros(3))
     frames = tuple(replace(f, world_from_cam=turned.apply_pose(f.world_from_cam)) for f in views.frames)
-    assert not is_same_run(tmp_path / "run", replace(views, frames=frames), settings)
+    assert not Run(tmp_path / "run").is_trained_from(replace(views, frames=frames), settings)
     config = read_config(tmp_path / "run")
-    assert config["settings"]["downscale"] == 4
-    assert config["scene_fingerprint"] == scenes.fingerprint(views)
-    assert set(config["versions"]) >= {"nerfcli", "python", "torch", "numpy"}
+    assert config.settings.downscale == 4
+    assert config.scene_fingerprint == scenes.fingerprint(views)
+    assert set(config.versions) >= {"nerfcli", "python", "torch", "numpy"}
 
 
 def test_settings_that_an_earlier_version_did_not_write_down_were_the_defaults(views, tmp_path):
     settings = replace(FEW, steps=1, downscale=4)
     fit(views, tmp_path / "run", settings)
-    config = read_config(tmp_path / "run")
+    config = read_config(tmp_path / "run").to_json()
     del config["settings"]["log2_rows"]
     write_json(tmp_path / "run" / "config.json", config)
-    assert is_same_run(tmp_path / "run", views, settings)
-    assert not is_same_run(tmp_path / "run", views, replace(settings, log2_rows=15))
+    assert Run(tmp_path / "run").is_trained_from(views, settings)
+    assert not Run(tmp_path / "run").is_trained_from(views, replace(settings, log2_rows=15))

@@ -1,22 +1,18 @@
-"""Held-out photos as a training sees them, and how far the rendering of their pixels is from a converged one."""
+"""Smaller held-out photos, and how far the rendering of their pixels is from a converged one."""
 
-from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.protocol import HeldOut
 from nerfcli.evaluate.sampled import SampledPixels, render_sampled
 from nerfcli.media.images import downscale
-from nerfcli.photos.held_out_exposure import log_gains_of
-from nerfcli.photos.loading import downscaled_camera, load_photos
+from nerfcli.photos.loading import downscaled_camera
 from nerfcli.render.accuracy import TIGHT, refined
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import TOLERANCE, uniform_cuts
-from nerfcli.runs.settings import TrainSettings
 
 # Every so many of the sampled pixels are rendered again with fine steps.
 QUADRATURE_EVERY = 16
@@ -52,27 +48,6 @@ def distance_to_float64(model: Model, photo: HeldOut, *, seed: int, count: int) 
         _in_float64(model), photo, pixels, cuts=refined(cuts, 2), tolerance=TIGHT**2, at_a_time=16
     )
     return float(np.sqrt(np.square(rgb - exact)[valid].mean()))
-
-
-def held_out_photos(frames: Sequence[Frame], model: Model, *, settings: TrainSettings) -> list[HeldOut]:
-    """The photos as they would be trained on, each as bright as EXIF says beside those of the model.
-
-    Args:
-        frames: with their images and masks.
-        model: that they are compared with.
-        settings: of a training, with its downscale.
-
-    Raises:
-        UserError: a photo cannot be read.
-    """
-    assert settings.downscale is not None
-    masks = settings.components.masks
-    photos = load_photos(frames, factor=settings.downscale, threads=settings.threads, masks=masks)
-    gains = log_gains_of(frames, model).tolist()
-    return [
-        HeldOut(photo.frame, photo.pixels, photo.used, log_gains=tuple(gain))
-        for photo, gain in zip(photos, gains, strict=True)
-    ]
 
 
 def smaller(photo: HeldOut, factor: float) -> HeldOut:

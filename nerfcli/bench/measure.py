@@ -20,7 +20,7 @@ from nerfcli.bench.training import KEPT_FIELD, Trainings, measure_trainings
 from nerfcli.bench.worker import measure_model
 from nerfcli.errors import UserError
 from nerfcli.render.model import Model, load_model
-from nerfcli.runs.folder import FIELD
+from nerfcli.runs.files import FIELD
 
 SWEEPS = ("both", "render", "train")
 # Of the budget where both are measured: renderings are short, trainings are not.

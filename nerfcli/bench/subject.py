@@ -1,17 +1,17 @@
 """What is measured: a trained run, or a scene that is trained first."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from nerfcli import scene as scenes
-from nerfcli.bench.heldout import held_out_photos
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import HeldOut
+from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.render.model import Model
-from nerfcli.runs.folder import CONFIG, FIELD, read_cameras, read_config, read_log
+from nerfcli.runs.files import CONFIG
+from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
 
@@ -51,7 +51,9 @@ class Subject:
         Raises:
             UserError: a photo cannot be read.
         """
-        return held_out_photos(self.test_frames, model, settings=self.base)
+        assert self.base.downscale is not None
+        masks, threads = self.base.components.masks, self.base.threads
+        return held_out_photos(self.test_frames, model, downscale=self.base.downscale, masks=masks, threads=threads)
 
 
 def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Subject:
@@ -71,43 +73,36 @@ def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Subject
     return subject
 
 
-def _run_at(run: Path, *, device: str, threads: int, seed: int) -> Subject:
-    config, log = read_config(run), read_log(run)
-    if not (run / FIELD).exists():
-        raise UserError(f"{run} is not trained yet", "train it first (nerfcli train SCENE), or give a scene")
-    trained = TrainSettings.from_json(config["settings"])
+def _run_at(path: Path, *, device: str, threads: int, seed: int) -> Subject:
+    run = Run(path)
+    trained, named = run.config.settings, run.config.scene
+    if not run.is_trained:
+        raise UserError(f"{path} is not trained yet", "train it first (nerfcli train SCENE), or give a scene")
     base = TrainSettings(
         seed=seed, device=device, threads=threads, downscale=trained.downscale, components=trained.components
     )
-    named = Path(config.get("scene", ""))
     # As the training named it, which is relative to where the user then was; or beside the run, where both moved.
-    places = (named, run.resolve().parent / named.name)
+    places = (named, path.resolve().parent / named.name)
     scene = next((place for place in places if named.name and scenes.is_scene(place)), None)
     why = "" if scene is not None else f"its scene {named} is not there"
-    if scene is not None and scenes.fingerprint(scenes.load(scene)) != config.get("scene_fingerprint"):
+    if scene is not None and scenes.fingerprint(scenes.load(scene)) != run.config.scene_fingerprint:
         scene, why = None, f"{scene} has changed since"
     return Subject(
-        path=run,
-        run=run,
+        path=path,
+        run=path,
         scene=scene,
-        test_frames=read_cameras(run)["test"],
+        test_frames=run.cameras.test,
         base=base,
-        identity=hashlib.sha256((run / FIELD).read_bytes()).hexdigest(),
-        trained=_told_by(log),
+        identity=run.checkpoint_sha256(),
+        trained=_trained(run),
         why_no_scene=why,
     )
 
 
-def _told_by(log: list[dict[str, Any]]) -> dict[str, Any]:
-    """What a run's log says of its training; nothing where an earlier version wrote it, or nobody."""
-    if not log:
-        return {}
-    return {
-        "seconds": log[-1]["seconds"],
-        "steps": log[-1]["step"],
-        "samples_per_second": log[-1]["samples"] / log[-1]["seconds"],
-        "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
-    }
+def _trained(run: Run) -> dict[str, Any]:
+    """What the log says of the training, as records have it; nothing without a log."""
+    summary = {} if run.summary is None else run.summary.to_json()
+    return {name: value for name, value in summary.items() if name != "rays_per_second"}
 
 
 def _scene_at(path: Path, *, device: str, threads: int, seed: int) -> Subject:

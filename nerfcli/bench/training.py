@@ -14,12 +14,12 @@ import nerfcli
 from nerfcli.bench.pictures import FOLDER, slug
 from nerfcli.bench.session import Session
 from nerfcli.bench.sweep import TrainSetting, affordable
-from nerfcli.runs.folder import FIELD
+from nerfcli.runs.files import FIELD
 from nerfcli.runs.settings import TrainSettings
 
 # Of a process besides its training, until one has been measured: libraries, photos, kernels, held-out pixels.
 _FIRST_OVERHEAD_SECONDS = 12.0
-KEPT_FIELD = "field.safetensors"
+KEPT_FIELD = FIELD
 
 
 @dataclass(frozen=True)

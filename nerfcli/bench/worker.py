@@ -16,16 +16,17 @@ from typing import Any, TextIO
 
 from nerfcli import kernels
 from nerfcli import scene as scenes
-from nerfcli.bench.heldout import held_out_photos, quadrature, smaller
+from nerfcli.bench.heldout import quadrature, smaller
 from nerfcli.bench.pictures import MOST_ERROR, write_difference, write_picture
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, to_8_bit
 from nerfcli.evaluate.protocol import HeldOut, as_exposed, over_white
+from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels, background_of
 from nerfcli.field.cost import field_bytes
-from nerfcli.render.model import Model, load_model
+from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.runs.folder import FIELD, read_log
+from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import Progress, train
 
@@ -99,15 +100,22 @@ def _train_and_measure(job: dict[str, Any], channel: TextIO) -> dict[str, Any]:
             _tell(channel, share=progress.share, detail=f"step {progress.step}")
 
     train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=on_progress)
-    log = read_log(run)
-    model = load_model(run / FIELD, settings.device)
+    trained = Run(run)
+    summary, model = trained.summary, trained.model(settings.device)
+    assert summary is not None
     _tell(channel, share=1.0, detail="comparing with held-out photos")
-    held_out = held_out_photos(scene.test_frames, model, settings=settings)
+    held_out = held_out_photos(
+        scene.test_frames,
+        model,
+        downscale=trained.config.downscale,
+        masks=trained.components.masks,
+        threads=settings.threads,
+    )
     return {
-        "seconds": log[-1]["seconds"],
-        "steps": log[-1]["step"],
-        "samples_per_second": log[-1]["samples"] / log[-1]["seconds"],
-        "peak_memory_bytes": max(entry["peak_memory_bytes"] for entry in log),
+        "seconds": summary.seconds,
+        "steps": summary.steps,
+        "samples_per_second": summary.samples_per_second,
+        "peak_memory_bytes": summary.peak_memory_bytes,
         "compiled": settings.device == "cpu" and _has_compiled(settings),
         **measure_model(
             model,

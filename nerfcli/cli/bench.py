@@ -16,6 +16,7 @@ from nerfcli.cli.options import (
     Seed,
     Threads,
     device_name,
+    one_of,
     seconds_from_text,
     thread_count,
 )
@@ -63,8 +64,7 @@ def bench(
       nerfcli bench photos-scene --budget 30m -o bench/
       nerfcli bench photos-scene-run --json | jq -r .recommendations[].point
     """
-    if sweep not in _SWEEPS:
-        raise typer.BadParameter(f"{sweep!r}; choose {', '.join(_SWEEPS)}", param_hint="--sweep")
+    one_of(sweep, _SWEEPS, "--sweep")
     seconds = seconds_from_text(budget)
     if seconds < _SHORTEST_SECONDS:
         raise typer.BadParameter(f"{budget!r} is too short; at least {_SHORTEST_SECONDS:g}s", param_hint="--budget")

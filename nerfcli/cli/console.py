@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, ParamSpec, TextIO, TypeVar
 
@@ -69,17 +69,21 @@ class Console:
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float, str], None]]:
-        """A bar on a terminal, a plain line now and then elsewhere.
+        """A bar on a terminal, a plain line now and then elsewhere, from the first update on.
 
         Yields:
             update(share in [0, 1], detail): to be called as often as one likes.
         """
-        if self.quiet:
-            yield lambda share, detail: None
-        elif sys.stderr.isatty():
-            yield from _bar(title)
-        else:
-            yield from _plain_lines(title)
+        with ExitStack() as stack:
+            bar: Callable[[float, str], None] | None = None
+
+            def update(share: float, detail: str) -> None:
+                nonlocal bar
+                if bar is None:
+                    bar = stack.enter_context(_bar(title) if sys.stderr.isatty() else _plain_lines(title))
+                bar(share, detail)
+
+            yield (lambda share, detail: None) if self.quiet else update
 
 
 def _print_table(
@@ -96,6 +100,7 @@ def _print_table(
     RichConsole(file=file, width=width).print(table)
 
 
+@contextmanager
 def _bar(title: str) -> Iterator[Callable[[float, str], None]]:
     from rich.console import Console as RichConsole
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -113,6 +118,7 @@ def _bar(title: str) -> Iterator[Callable[[float, str], None]]:
         yield lambda share, detail: bar.update(task, completed=share, detail=detail)
 
 
+@contextmanager
 def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
     last = time.monotonic()
 

@@ -1,16 +1,15 @@
 """nerfcli convert: from one format of captures to another, proved; and which convention a capture follows."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Overwrite, Quiet
+from nerfcli.cli.options import Json, Overwrite, Quiet, one_of
 
 if TYPE_CHECKING:
-    from nerfcli.cameras.frame import Capture
     from nerfcli.convert.conversion import Conversion
     from nerfcli.convert.detect import Answer, Detection, Question
 
@@ -135,135 +134,68 @@ def convert(
       nerfcli convert strange/ mended.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
+    from nerfcli.convert.conversion import Doubt, Wanted
+    from nerfcli.convert.formats import Given, format_named
+    from nerfcli.convert.intrinsics import read_intrinsics
+    from nerfcli.convert.world_frame import WorldFrame
+    from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record
+
     console = Console(quiet=quiet, json_lines=json)
-    doubt = {
-        "axes": from_axes,
-        "inverted": from_inverted,
-        "pixel_centre": _pixel_centre(from_pixel_center, "--from-pixel-center"),
-        "intrinsics_scale": from_size,
-    }
+    from_centre = _pixel_centre(from_pixel_center, "--from-pixel-center")
+    doubt = Doubt(axes=from_axes, inverted=from_inverted, pixel_centre=from_centre, intrinsics_scale=from_size)
+
+    def given() -> Given:
+        return Given(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
+
     if detect:
         if to is not None or target is not None:
             raise typer.BadParameter("--detect writes nothing; leave OUT and --to out")
 
         def work(path: Path, one_of_many: bool) -> None:
-            detect_one(path, images=images, intrinsics=intrinsics, doubt=doubt, console=console)
+            with console.progress(f"detect {path.name}") as update:
+                form, found = detect_convention(path, given=given(), doubt=doubt, notify=console.note, progress=update)
+            if json:
+                console.result(path, detection_record(found, form.name))
+            else:
+                typer.echo("\n".join([f"{path} ({form.name}), judged by {found.evidence}", *_table(found)]))
     else:
         to = PROGRAMS.get(to or "", to)
         if to is None or to not in FORMATS_WRITTEN:
             raise typer.BadParameter(f"{to!r}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         if target is None:
             raise typer.BadParameter("say where the result goes", param_hint="OUT")
-        lengths = {"scale": scale, "markers": markers, "distances": tuple(distance or ())}
-        world = {"up": world_up, "origin": origin, **lengths}
-        if pixels not in (None, "stored", "upright"):
-            raise typer.BadParameter(f"{pixels!r}; choose stored or upright", param_hint="--pixels")
-        wanted = {
-            "pixels": pixels,
-            "axes": axes,
-            "pixel_centre": _pixel_centre(pixel_center, "--pixel-center"),
-            "allow_loss": allow_loss,
-            "overwrite": overwrite,
-            "verified": verify,
-            "tolerance_px": tolerance,
-        }
+        one_of(pixels, ("stored", "upright"), "--pixels")
+        world = WorldFrame(world_up, origin, scale, markers, tuple(distance or ()))
+        wanted = Wanted(
+            format_named(to),
+            axes=axes,
+            pixel_centre=_pixel_centre(pixel_center, "--pixel-center"),
+            allow_loss=allow_loss,
+            overwrite=overwrite,
+            verified=verify,
+            tolerance_px=tolerance,
+            pixels=pixels,
+        )
 
         def work(path: Path, one_of_many: bool) -> None:
             place = target / _named_for(path).resolve().name if one_of_many else target
-            convert_one(
+            done = convert_capture(
                 path,
                 place,
-                to=to,
-                images=images,
-                intrinsics=intrinsics,
+                wanted,
+                given=given(),
                 doubt=doubt,
                 world=world,
-                wanted=wanted,
-                console=console,
+                notify=console.note,
+                warn=console.warn,
             )
+            _print_verification(done.conversion, console)
+            console.result(done.conversion.path, done.record)
 
     for_each_input(source, work)
 
 
-def convert_one(
-    source: Path,
-    target: Path,
-    *,
-    to: str,
-    images: Path | None,
-    intrinsics: Path | None,
-    doubt: dict[str, Any],
-    world: dict[str, Any],
-    wanted: dict[str, Any],
-    console: Console,
-) -> None:
-    """Convert one capture and tell what came of it."""
-    from nerfcli.cameras.orientation import rescaling_told
-    from nerfcli.convert.conversion import Doubt, Wanted, convert, load
-    from nerfcli.convert.formats import Given, format_named, recording
-    from nerfcli.convert.intrinsics import read_intrinsics
-    from nerfcli.convert.pixels import other_sizes
-    from nerfcli.convert.world_frame import WorldFrame, in_world_frame
-
-    given = Given(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
-    form, found, capture = load(source, given, Doubt(**doubt))
-    console.note(f"{found}: {form.name}, {_contents(capture)}")
-    for text in rescaling_told(other_sizes(capture)):
-        console.note(f"{text.removesuffix(': rescaled')}; {to} gets them as they are")
-    capture, new_from_old, scale = in_world_frame(capture, WorldFrame(**world))
-    if scale is not None:
-        error = "" if scale.standard_error is None else f" +- {scale.standard_error:.2g}"
-        unit = "%" if scale.residual_unit == "percent" else "m"
-        console.note(
-            f"a unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; "
-            f"residual {scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
-        )
-    frame = {"new_from_old": new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
-    wanted_form = recording(format_named(to), {"source": str(found), **frame})
-    done = convert(capture, target, source_format=form.name, wanted=Wanted(wanted_form, **wanted))
-    for text in done.notes:
-        console.note(text)
-    for loss in done.losses:
-        console.warn(f"{to} cannot hold {loss}")
-    if done.loss_px > wanted["tolerance_px"]:
-        console.warn(f"without the lost terms of lenses, pixels are off by up to {done.loss_px:.3g} px")
-    _tell_verification(done, console)
-    console.result(done.path, _record(done, to) | frame)
-
-
-def detect_one(
-    source: Path,
-    *,
-    images: Path | None,
-    intrinsics: Path | None,
-    doubt: dict[str, Any],
-    console: Console,
-) -> None:
-    """Tell which convention a capture follows: a table, or with --json one line."""
-    from nerfcli.convert.conversion import Doubt, load
-    from nerfcli.convert.detect import detect
-    from nerfcli.convert.formats import Given
-    from nerfcli.convert.intrinsics import read_intrinsics
-    from nerfcli.convert.pixels import STORED, in_pixels
-
-    given = Given(images=images, camera=None if intrinsics is None else read_intrinsics(intrinsics))
-    form, found, capture = load(source, given, Doubt(**doubt))
-    console.note(f"{found}: {form.name}, {_contents(capture)}")
-    capture = in_pixels(capture, STORED).capture
-    with console.progress(f"detect {source.name}") as update:
-        found_out = detect(capture, axes=form.axes, progress=update)
-    if console.json_lines:
-        console.result(source, _detection_record(found_out, form.name))
-    else:
-        typer.echo("\n".join([f"{source} ({form.name}), judged by {found_out.evidence}", *_table(found_out)]))
-
-
-def _contents(capture: "Capture") -> str:
-    cameras = len({frame.camera for frame in capture.frames})
-    return f"{len(capture.frames)} images, {cameras} camera{'s' * (cameras != 1)}, {len(capture.points)} points"
-
-
-def _tell_verification(done: "Conversion", console: Console) -> None:
+def _print_verification(done: "Conversion", console: Console) -> None:
     checked = done.verification
     if checked is None:
         console.warn(f"{done.path} was not verified")
@@ -281,33 +213,10 @@ def _tell_verification(done: "Conversion", console: Console) -> None:
     )
 
 
-def _record(done: "Conversion", to: str) -> dict[str, Any]:
-    checked = done.verification
-    return {
-        "from": done.source_format,
-        "to": to,
-        "images": len(done.capture.frames),
-        "cameras": len({frame.camera for frame in done.capture.frames}),
-        "points": len(done.capture.points),
-        "losses": list(done.losses),
-        "loss_px": done.loss_px,
-        "verification": None
-        if checked is None
-        else {
-            "projections": checked.num_projections,
-            "points": checked.num_points,
-            "max_px": checked.max_px,
-            "max_deg": checked.max_deg,
-            "max_centre_shift": checked.max_centre_shift,
-            "max_point_shift": checked.max_point_shift,
-            "tolerance_px": checked.tolerance_px,
-            "same": list(checked.parts),
-        },
-    }
-
-
 def _table(found: "Detection") -> list[str]:
     """Per question the hypotheses that matter: the best ones, and the one that the format prescribes."""
+    from nerfcli.workflows.convert import options_of
+
     lines = [f"  {'hypothesis':<52}{'median error':>14}{'inliers':>9}  verdict"]
     for question in found.questions:
         lines.append(f"  {question.name}")
@@ -321,7 +230,7 @@ def _table(found: "Detection") -> list[str]:
                 lines.append(line.rstrip())
     if found.as_format_says:
         lines.append("  Nothing speaks against the convention of the format.")
-    elif options := _options(found):
+    elif options := options_of(found):
         lines.append(f"  To read it so: nerfcli convert IN OUT --to FORMAT {options}")
     else:
         lines.append("  No hypothesis fits: poses, intrinsics and photos do not belong together in any of these ways.")
@@ -344,50 +253,8 @@ def _verdict(question: "Question") -> str:
     return f"{question.verdict}: {question.reason}"
 
 
-def _options(found: "Detection") -> str:
-    """The options that make `convert` read the capture in the convention that was found."""
-    convention, declared = found.convention, found.declared
-    options = [] if convention.axes == declared.axes else [f"--from-axes {convention.axes}"]
-    options += ["--from-inverted"] if convention.inverted else []
-    options += [f"--from-pixel-center {convention.pixel_centre:g}"] if convention.pixel_centre != 0.5 else []
-    options += [f"--from-size {convention.intrinsics_scale:g}"] if convention.intrinsics_scale != 1 else []
-    return " ".join(options)
-
-
-def _detection_record(found: "Detection", form: str) -> dict[str, Any]:
-    return {
-        "format": form,
-        "evidence": found.evidence,
-        "as_format_says": found.as_format_says,
-        "options": _options(found),
-        "questions": [
-            {
-                "question": question.name,
-                "verdict": question.verdict,
-                "ratio": question.ratio,
-                "reason": question.reason,
-                "hypotheses": [
-                    {
-                        "axes": answer.convention.axes,
-                        "inverted": answer.convention.inverted,
-                        "pixel_centre": answer.convention.pixel_centre,
-                        "intrinsics_scale": answer.convention.intrinsics_scale,
-                        "as_format_says": answer.as_format_says,
-                        "median_px": None if answer.median_px == float("inf") else answer.median_px,
-                        "inlier_share": answer.inlier_share,
-                    }
-                    for answer in question.answers
-                ],
-            }
-            for question in found.questions
-        ],
-    }
-
-
 def _pixel_centre(text: str | None, option: str) -> float | None:
-    if text is not None and text not in PIXEL_CENTRES:
-        raise typer.BadParameter(f"{text!r}; choose 0.5 or 0", param_hint=option)
-    return None if text is None else PIXEL_CENTRES[text]
+    return None if text is None else PIXEL_CENTRES[one_of(text, PIXEL_CENTRES, option)]
 
 
 def _named_for(path: Path) -> Path:

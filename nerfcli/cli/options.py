@@ -1,13 +1,13 @@
 """Options that mean the same in every command, and the readers of their values."""
 
-import os
 import re
+from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
-from nerfcli.errors import UserError
+Word = TypeVar("Word", str, str | None)
 
 Output = Annotated[
     Path | None,
@@ -67,6 +67,31 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No notes and no prog
 _SECONDS_PER_UNIT = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
+def one_of(value: Word, choices: Collection[str], option: str) -> Word:
+    """A word of an option, or None where it is not given.
+
+    Raises:
+        typer.BadParameter: it is none of the choices.
+    """
+    if value is not None and value not in choices:
+        *others, last = choices
+        listed = f"{', '.join(others)} or {last}" if others else last
+        raise typer.BadParameter(f"{value!r}; choose {listed}", param_hint=option)
+    return value
+
+
+def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]:
+    """The words of a list with commas, each once.
+
+    Raises:
+        typer.BadParameter: one of them is none of the choices.
+    """
+    chosen = tuple(dict.fromkeys(text.split(",")))
+    if unknown := [name for name in chosen if name not in choices]:
+        raise typer.BadParameter(f"{unknown[0]!r}; choose some of {','.join(choices)}", param_hint=option)
+    return chosen
+
+
 def seconds_from_text(text: str) -> float:
     """90s, 5m, 1.5h or plain seconds.
 
@@ -81,38 +106,21 @@ def seconds_from_text(text: str) -> float:
 
 
 def downscale_factor(downscale: str) -> int | None:
-    """1, 2, 4 or 8; None for auto.
-
-    Raises:
-        typer.BadParameter: anything else.
-    """
-    if downscale not in ("auto", "1", "2", "4", "8"):
-        raise typer.BadParameter(f"{downscale!r}; choose auto, 1, 2, 4 or 8", param_hint="--downscale")
+    """1, 2, 4 or 8; None for auto."""
+    one_of(downscale, ("auto", "1", "2", "4", "8"), "--downscale")
     return None if downscale == "auto" else int(downscale)
 
 
 def field_kind(kind: str) -> str:
-    """One of the kinds of fields.
-
-    Raises:
-        typer.BadParameter: anything else.
-    """
+    """One of the kinds of fields."""
     from nerfcli.field.kinds import KINDS
 
-    if kind not in KINDS:
-        raise typer.BadParameter(f"{kind!r}; choose {', '.join(KINDS)}", param_hint="--field")
-    return kind
+    return one_of(kind, KINDS, "--field")
 
 
 def model_name(model: str) -> str:
-    """auto or default.
-
-    Raises:
-        typer.BadParameter: anything else.
-    """
-    if model not in ("auto", "default"):
-        raise typer.BadParameter(f"{model!r}; choose auto or default", param_hint="--model")
-    return model
+    """auto or default."""
+    return one_of(model, ("auto", "default"), "--model")
 
 
 def named_components(included: list[str] | None, excluded: list[str] | None) -> tuple[str, ...]:
@@ -121,13 +129,8 @@ def named_components(included: list[str] | None, excluded: list[str] | None) -> 
 
 
 def contraction_name(contraction: str) -> str | None:
-    """none, l2 or linf; None for auto.
-
-    Raises:
-        typer.BadParameter: anything else.
-    """
-    if contraction not in ("auto", "none", "l2", "linf"):
-        raise typer.BadParameter(f"{contraction!r}; choose auto, none, l2 or linf", param_hint="--contraction")
+    """none, l2 or linf; None for auto."""
+    one_of(contraction, ("auto", "none", "l2", "linf"), "--contraction")
     return None if contraction == "auto" else contraction
 
 
@@ -171,26 +174,18 @@ def memory_limit(memory: str | None) -> int | None:
 
 
 def thread_count(threads: int) -> int:
-    """The number of CPU threads to use: as asked, or the processors this process may run on."""
-    if threads:
-        return threads
-    if hasattr(os, "sched_getaffinity"):  # not on macOS
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """The number of CPU threads of --threads; for 0 the processors this process may run on."""
+    from nerfcli.workflows import machine
+
+    return machine.thread_count(threads)
 
 
 def device_name(device: str) -> str:
-    """The torch device for --device.
+    """The torch device of --device.
 
     Raises:
-        UserError: CUDA is asked for and not there, or the name is unknown.
+        UserError: CUDA is wanted and not there, or the name is unknown.
     """
-    import torch
+    from nerfcli.workflows import machine
 
-    if device not in ("auto", "cpu", "cuda"):
-        raise UserError(f"unknown device {device!r}", "choose --device auto, cpu or cuda", exit_code=2)
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UserError("--device cuda: torch sees no CUDA device", "use --device cpu, or install torch with CUDA")
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    return device
+    return machine.device_name(device)

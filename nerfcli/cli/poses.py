@@ -1,12 +1,11 @@
 """nerfcli poses: from photos to a scene."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from nerfcli.cli.batch import for_each_input, result_path
-from nerfcli.cli.clips import Frames, photos_of, without_suffix
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Holdout,
@@ -20,27 +19,16 @@ from nerfcli.cli.options import (
     Threads,
     holdout_rule,
     memory_limit,
+    one_of,
     seconds_from_text,
     thread_count,
 )
-from nerfcli.errors import UserError
 
-if TYPE_CHECKING:
-    from nerfcli.poses.cameras import GivenIntrinsics
-    from nerfcli.poses.plan import Plan
-    from nerfcli.poses.settings import Limits, PoseSettings
-
-NAMES_SHOWN = 8
-_STAGES = {
-    "read": "photos read",
-    "extract": "photos searched for features",
-    "enlarge": "photos searched for finer features",
-    "pair": "photos looked up",
-    "match": "pairs compared",
-    "map": "photos placed",
-    "check": "checks of the poses",
-}
-
+# At least as many as structure from motion needs.
+Frames = Annotated[
+    int | None,
+    typer.Option(help="Of a video, how many frames to use.  [default: 120, or all of a shorter one]", min=4),
+]
 Intrinsics = Annotated[
     Path | None,
     typer.Option(help="A file with the photos' cameras: COLMAP's cameras.txt or .bin, a scene, transforms.json..."),
@@ -123,13 +111,17 @@ def poses(
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.poses.pairs import PAIRINGS
     from nerfcli.poses.settings import CAMERA_MODELS, Limits, PoseSettings
+    from nerfcli.workflows.poses import (
+        estimate_poses,
+        folder_of_photos,
+        folder_with_frames,
+        given_intrinsics,
+        plan_scene,
+        without_suffix,
+    )
 
-    for value, choices, option in (
-        (camera_model, CAMERA_MODELS, "--camera-model"),
-        (pairing, PAIRINGS, "--pairing"),
-    ):
-        if value not in choices:
-            raise typer.BadParameter(f"{value!r}; choose {', '.join(choices)}", param_hint=option)
+    one_of(camera_model, CAMERA_MODELS, "--camera-model")
+    one_of(pairing, PAIRINGS, "--pairing")
     if pairs is not None and pairing != "auto":
         raise typer.BadParameter("the pairs come from --pairs; leave out --pairing", param_hint="--pairing")
     use = use_of(intrinsics, intrinsics_as)
@@ -162,16 +154,33 @@ def poses(
     def work(source: Path, one_of_many: bool) -> None:
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
         if dry_run:
-            folder = frames_there(source, scene)
+            folder = folder_with_frames(source, scene)
             given = given_intrinsics(intrinsics, folder, use=use)
-            plan_scene(source, folder, settings=settings, given=given, console=console)
+            with console.progress(f"poses {folder.name}") as update:
+                plan = plan_scene(folder, settings, intrinsics=given, notify=console.note, progress=update)
+            if json:
+                console.result(source, plan.to_json())
+            else:
+                typer.echo(f"{source}: {plan.describe()}")
             return
-        folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
+        with console.progress(f"frames of {source.name}") as update:
+            folder = folder_of_photos(
+                source, scene, frames=frames, overwrite=overwrite, notify=console.note, progress=update
+            )
         given = given_intrinsics(intrinsics, folder, use=use)
-        estimate_scene(
-            folder, scene, settings=settings, limits=limits, overwrite=overwrite, console=console, given=given
-        )
-        tell_of_database(scene, drop=drop_database, console=console)
+        with console.progress(f"poses {folder.name}") as update:
+            estimate_poses(
+                folder,
+                scene,
+                settings,
+                limits=limits,
+                intrinsics=given,
+                overwrite=overwrite,
+                notify=console.note,
+                warn=console.warn,
+                progress=update,
+            )
+        print_database(scene, drop=drop_database, console=console)
         console.result(scene)
 
     for_each_input(photos, work)
@@ -185,9 +194,7 @@ def sizes_of(quality: str) -> tuple[int, int]:
     """
     from nerfcli.poses.settings import QUALITIES
 
-    if quality not in QUALITIES:
-        raise typer.BadParameter(f"{quality!r}; choose {', '.join(QUALITIES)}", param_hint="--quality")
-    return QUALITIES[quality]
+    return QUALITIES[one_of(quality, QUALITIES, "--quality")]
 
 
 def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
@@ -198,129 +205,13 @@ def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
     """
     from nerfcli.poses.cameras import USES
 
-    if intrinsics_as is not None and intrinsics_as not in USES:
-        raise typer.BadParameter(f"{intrinsics_as!r}; choose {', '.join(USES)}", param_hint="--intrinsics-as")
+    one_of(intrinsics_as, USES, "--intrinsics-as")
     if intrinsics_as is not None and intrinsics is None:
         raise typer.BadParameter("there are no intrinsics to use so; add --intrinsics", param_hint="--intrinsics-as")
     return intrinsics_as or USES[0]
 
 
-def given_intrinsics(file: Path | None, photos: Path, *, use: str) -> "GivenIntrinsics | None":
-    """The intrinsics of a file, for the photos of a folder; None without a file.
-
-    Raises:
-        UserError: see `read_calibration`.
-    """
-    if file is None:
-        return None
-    from nerfcli.convert.intrinsics import read_calibration
-    from nerfcli.poses.cameras import GivenIntrinsics
-
-    return GivenIntrinsics(read_calibration(file, images=photos), use)
-
-
-def frames_there(source: Path, scene: Path) -> Path:
-    """The folder of photos, `source` itself, or the one with the frames of a video that were written before.
-
-    Raises:
-        UserError: a video's frames are not there.
-    """
-    from nerfcli.poses.video_frames import frames_folder
-
-    folder = frames_folder(scene) if source.is_file() else source
-    if source.is_file() and not folder.exists():
-        raise UserError(
-            f"--dry-run: the frames of {source} are not in {folder} yet, and a dry run writes nothing",
-            "call it without --dry-run, or give a folder of photos",
-        )
-    return folder
-
-
-def plan_scene(
-    source: Path, folder: Path, *, settings: "PoseSettings", given: "GivenIntrinsics | None", console: Console
-) -> None:
-    """Print what would be done with a folder of photos, which may hold the frames of the video `source`.
-
-    Raises:
-        UserError: see `plan_poses`.
-    """
-    from nerfcli.poses.structure_from_motion import plan_poses
-
-    with console.progress(f"poses {folder.name}") as update:
-        _, grouped, _, plan = plan_poses(
-            folder,
-            settings=settings,
-            progress=lambda stage, done, total: update(done / max(total, 1), _STAGES[stage]),
-            given=given,
-        )
-    for note in grouped.notes:
-        console.note(note)
-    if console.json_lines:
-        console.result(source, plan.to_json())
-    else:
-        typer.echo(f"{source}: {plan.describe()}")
-
-
-def estimate_scene(
-    folder: Path,
-    scene: Path,
-    *,
-    settings: "PoseSettings",
-    limits: "Limits",
-    overwrite: bool,
-    console: Console,
-    given: "GivenIntrinsics | None" = None,
-) -> None:
-    """Estimate one scene, or keep the one that was made from the same photos with the same settings.
-
-    Raises:
-        UserError: see `estimate_poses`; or something else stands at `scene`.
-    """
-    from nerfcli.poses.plan import Outlook, duration
-    from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
-    from nerfcli.scene import SCENE_FILE
-
-    if (scene / SCENE_FILE).exists() and not overwrite:
-        if is_same_scene(scene, folder, settings, given=given):
-            console.note(f"{scene} is kept: it was made from these photos; --overwrite makes it again")
-            return
-        raise UserError(f"{scene} exists", "add --overwrite to replace it, or choose another place with -o")
-    outlook: Outlook | None = None
-
-    def planned(plan: "Plan") -> None:
-        nonlocal outlook
-        console.note(plan.describe())
-        outlook = Outlook(plan)
-
-    with console.progress(f"poses {folder.name}") as update:
-
-        def progress(stage: str, done: int, total: int) -> None:
-            share, left = (0.0, None) if outlook is None else outlook.update(stage, done, total)
-            about = "" if left is None else f", about {duration(left)} left"
-            update(share, f"({done} of {total} {_STAGES[stage]}{about})")
-
-        report = estimate_poses(
-            folder,
-            scene,
-            settings=settings,
-            notify=console.note,
-            progress=progress,
-            limits=limits,
-            planned=planned,
-            given=given,
-        )
-    left_out = [image for image in report.images if not image.registered]
-    for image in left_out[:NAMES_SHOWN]:
-        console.warn(f"{image.name} was not registered: {image.reason}")
-    if len(left_out) > NAMES_SHOWN:
-        console.warn(f"{len(left_out) - NAMES_SHOWN} more are listed in {scene / 'poses_report.json'}")
-    console.note(
-        f"{scene}: {report.registered} of {report.total} photos registered in {report.seconds['total']:.0f} s, "
-        f"mean reprojection error {report.mean_reprojection_error_px:.2f} px"
-    )
-
-
-def tell_of_database(scene: Path, *, drop: bool, console: Console) -> None:
+def print_database(scene: Path, *, drop: bool, console: Console) -> None:
     """Delete the database of features and matches, or say what it takes and what for."""
     from nerfcli.poses.workspace import database_bytes, drop_database
 

@@ -1,21 +1,40 @@
 """nerfcli render: pictures, depth maps and videos of a run."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.depth_options import DepthFormat, DepthScale, depth_formats, finite, level_scale
-from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, thread_count
-from nerfcli.cli.playing import colour_range_of, frame_range, one_of, video_settings
-from nerfcli.cli.rendering import Rgba, SamplesPerPixel, Step, Tolerance, tolerance_of
-from nerfcli.cli.views import Views, chosen_frames, file_fps, look_of, refuse_z_all_around, write_frames
-from nerfcli.errors import UserError
-
-if TYPE_CHECKING:
-    from nerfcli.export.settings import ExportSettings
+from nerfcli.cli.options import (
+    Device,
+    Json,
+    Output,
+    Overwrite,
+    Quiet,
+    Threads,
+    device_name,
+    one_of,
+    some_of,
+    thread_count,
+)
+from nerfcli.cli.render_options import (
+    DepthFormat,
+    DepthScale,
+    Rgba,
+    SamplesPerPixel,
+    Step,
+    Tolerance,
+    colour_range_of,
+    depth_formats,
+    finite,
+    frame_range,
+    level_scale,
+    look_of,
+    tolerance_of,
+    video_settings,
+)
 
 DEFAULT_FPS = 24.0
 
@@ -142,18 +161,16 @@ def render(
     from nerfcli.export.settings import OUTPUTS, ExportSettings
     from nerfcli.media.colour_maps import COLOUR_MAPS
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
-    from nerfcli.render.model import load_model
     from nerfcli.render.pictures import Quality
-    from nerfcli.runs.folder import FIELD
+    from nerfcli.runs.run import Run
+    from nerfcli.workflows.render import RENDERS, folder_name, render_run
+    from nerfcli.workflows.views import Views, chosen_frames, file_fps, write_frames
 
-    chosen = tuple(dict.fromkeys(outputs.split(",")))
-    if unknown := [name for name in chosen if name not in OUTPUTS]:
-        raise typer.BadParameter(f"{unknown[0]!r}; choose some of {','.join(OUTPUTS)}", param_hint="--outputs")
+    chosen = some_of(outputs, OUTPUTS, "--outputs")
     if not is_convention(depth):
         known = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
         raise typer.BadParameter(f"{depth!r}; choose {known}", param_hint="--depth")
-    if depth_axis not in (None, "ray", "z"):
-        raise typer.BadParameter(f"{depth_axis!r}; choose ray or z", param_hint="--depth-axis")
+    one_of(depth_axis, ("ray", "z"), "--depth-axis")
     formats = depth_formats(depth_format, outputs=chosen, convention=depth)
     scale = level_scale(depth_scale, formats=formats)
     finite(background_distance, "--background-distance")
@@ -194,113 +211,31 @@ def render(
 
     def work(folder: Path, one_of_many: bool) -> None:
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
-        target = folder / "renders" / name
+        target = folder / RENDERS / name
         if output is not None:
             target = output / folder.name if one_of_many else output
         if cameras_only:
-            hint = 1.0 / load_model(folder / FIELD, "cpu").training_from_scene.scale
-            chosen_views = chosen_frames(folder, views, depth_hint=hint)
-            write_frames(chosen_views, target, fps=fps, overwrite=overwrite, console=console)
+            of = Run(folder)
+            chosen_views = chosen_frames(of, views, depth_hint=1.0 / of.model().training_from_scene.scale)
+            write_frames(chosen_views, target, fps=fps, overwrite=overwrite, warn=console.warn)
             console.result(target)
             return
-        written = render_run(
-            folder,
-            target,
-            views=views,
-            settings=settings,
-            device=device_name(device),
-            threads=thread_count(threads),
-            step=step,
-            jobs=jobs,
-            part=part,
-            overwrite=overwrite,
-            console=console,
-        )
+        with console.progress(f"render {views.name}") as update:
+            written = render_run(
+                folder,
+                target,
+                views=views,
+                settings=settings,
+                device=device_name(device),
+                threads=thread_count(threads),
+                step=step,
+                jobs=jobs,
+                part=part,
+                overwrite=overwrite,
+                notify=console.note,
+                progress=update,
+            )
         for path in written:
             console.result(path)
 
     for_each_input(run, work)
-
-
-def folder_name(views: Views, settings: "ExportSettings") -> str:
-    """The folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
-    if not settings.measured:
-        return views.name
-    return f"{views.name}-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}"
-
-
-def render_run(
-    run: Path,
-    target: Path,
-    *,
-    views: Views,
-    settings: "ExportSettings",
-    device: str,
-    threads: int,
-    overwrite: bool,
-    console: Console,
-    step: float = 1.0,
-    jobs: int = 0,
-    part: slice | None = None,
-) -> list[Path]:
-    """Render into `target`, or keep what stands there if it is the same.
-
-    Args:
-        jobs: processes; 0 for `automatic_workers`.
-        step: length of the steps along rays, in those of the training.
-        part: render these views alone, for a later call to find them.
-
-    Returns:
-        The paths to show: videos, or the folders of the outputs; the unfinished folder where only a part is rendered.
-
-    Raises:
-        UserError: no such run, no such cameras, or other files stand at `target`.
-    """
-    from dataclasses import replace
-
-    import torch
-
-    from nerfcli.export.frames import Workers, automatic_workers, export_frames, export_part
-    from nerfcli.export.order import Order, refuse_foreign
-    from nerfcli.render.model import load_model
-    from nerfcli.runs.folder import FIELD
-
-    torch.set_num_threads(threads)
-    model = load_model(run / FIELD, device).stretched(step)
-    if settings.depth.convention == "background" and settings.depth.background_distance is None:
-        farthest = model.marching.far / model.training_from_scene.scale
-        settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
-    # The unit of the training frame is about the distance between the cameras and what they look at.
-    depth_hint = 1.0 / model.training_from_scene.scale
-    frames = chosen_frames(run, views, depth_hint=depth_hint)
-    if "depth" in settings.outputs and settings.depth.axis == "z":
-        refuse_z_all_around(frames, notify=console.note)
-    provenance: dict[str, Any] = {
-        "cameras": views.cameras,
-        "run": run.name,
-        "field_sha256": model.sha256,
-    }
-    if step != 1.0:
-        provenance["step"] = step
-    order = Order(tuple(frames), settings, provenance)
-    chosen = range(len(frames))[part] if part is not None else range(len(frames))
-    if not chosen:
-        raise UserError(f"--frames: there are {len(frames)} views", "count from 0", exit_code=2)
-    refuse_foreign(target)
-    if not overwrite and order.is_held_by(target):
-        console.note(f"{target} is kept: it was rendered with these settings; --overwrite renders again")
-        return order.results(target)
-
-    total = sum(frames[index].camera.width * frames[index].camera.height for index in chosen)
-    done = 0
-    with console.progress(f"render {views.name}") as update:
-
-        def on_rays(rays: int) -> None:
-            nonlocal done
-            done += rays
-            update(done / total, f"{len(chosen)} frames")
-
-        workers = Workers(jobs, threads) if jobs else automatic_workers(total, device=device, threads=threads)
-        if part is not None:
-            return [export_part(model, order, target, chosen, on_rays=on_rays, notify=console.note, workers=workers)]
-        return export_frames(model, order, target, on_rays=on_rays, notify=console.note, workers=workers)

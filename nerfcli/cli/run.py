@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from nerfcli.cli.batch import for_each_input, result_path
-from nerfcli.cli.clips import Frames, photos_of, without_suffix
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Device,
@@ -31,7 +30,7 @@ from nerfcli.cli.options import (
     seconds_from_text,
     thread_count,
 )
-from nerfcli.cli.poses import Intrinsics, IntrinsicsAs, Quality, given_intrinsics, sizes_of, use_of
+from nerfcli.cli.poses import Frames, Intrinsics, IntrinsicsAs, Quality, sizes_of, use_of
 
 
 @command
@@ -61,7 +60,7 @@ def run(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Do everything: poses, train, evaluate, renders, an orbit video.
+    """Do everything: poses, train, evaluate, render, video, report.
 
     Writes PHOTOS-scene/ and PHOTOS-scene-run/ beside the photos, or scene/ and run/ inside --output. Stages that are
     complete are kept, so an interrupted run goes on where it stopped. Components for --with and --without are those of
@@ -76,11 +75,7 @@ def run(
       nerfcli run kitchen.mp4
       nerfcli run photos/kitchen --require "psnr>=25,registered>=0.9"
     """
-    from nerfcli.cli.evaluate import evaluate_run, hold_against, requirements_of
-    from nerfcli.cli.poses import estimate_scene
-    from nerfcli.cli.render import folder_name, render_run
-    from nerfcli.cli.train import train_scene, was_interrupted
-    from nerfcli.cli.views import Views
+    from nerfcli.cli.evaluate import print_numbers, requirements_of
     from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
@@ -88,6 +83,12 @@ def run(
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.runs.components import Components, choose
     from nerfcli.runs.settings import TrainSettings
+    from nerfcli.workflows.evaluate import check_requirements, evaluate_run
+    from nerfcli.workflows.poses import estimate_poses, folder_of_photos, given_intrinsics, without_suffix
+    from nerfcli.workflows.render import render_run
+    from nerfcli.workflows.report import report_runs
+    from nerfcli.workflows.train import train_scene, was_interrupted
+    from nerfcli.workflows.views import Views
 
     console = Console(quiet=quiet, json_lines=json)
     requirements, rule = requirements_of(require), holdout_rule(holdout)
@@ -121,47 +122,56 @@ def run(
         field = result_path(scene, suffix="-run", output=None, one_of_many=False)
         if output is not None:
             scene, field = scene / "scene", scene / "run"
-        folder = photos_of(source, scene, frames=frames, overwrite=overwrite, console=console)
-        estimate_scene(
-            folder,
-            scene,
-            settings=pose_settings,
-            limits=Limits(memory_bytes=memory),
-            overwrite=overwrite,
-            console=console,
-            given=given_intrinsics(intrinsics, folder, use=use),
-        )
-        resume = not overwrite and was_interrupted(scene, field, train_settings)
-        train_scene(
-            scene,
-            field,
-            settings=train_settings,
-            memory_bytes=memory,
-            resume=resume,
-            overwrite=overwrite,
-            console=console,
-        )
-        metrics, numbers = evaluate_run(field, device=torch_device, threads=cores, overwrite=overwrite, console=console)
+        with console.progress(f"frames of {source.name}") as update:
+            folder = folder_of_photos(
+                source, scene, frames=frames, overwrite=overwrite, notify=console.note, progress=update
+            )
+        with console.progress(f"poses {folder.name}") as update:
+            estimate_poses(
+                folder,
+                scene,
+                pose_settings,
+                limits=Limits(memory_bytes=memory),
+                intrinsics=given_intrinsics(intrinsics, folder, use=use),
+                overwrite=overwrite,
+                notify=console.note,
+                warn=console.warn,
+                progress=update,
+            )
+        with console.progress(f"train {scene.name}") as update:
+            trained = train_scene(
+                scene,
+                field,
+                train_settings,
+                memory_bytes=memory,
+                resume=not overwrite and was_interrupted(scene, field, train_settings),
+                overwrite=overwrite,
+                notify=console.note,
+                warn=console.warn,
+                progress=update,
+            )
+        where = {"device": torch_device, "threads": cores, "overwrite": overwrite}
+        with console.progress("evaluate") as update:
+            evaluation = evaluate_run(field, **where, notify=console.note, progress=update)
+        print_numbers(field, evaluation, console)
         console.result(scene)
         console.result(field)
-        console.result(metrics, numbers)
+        console.result(evaluation.path, evaluation.metrics)
         for cameras, video in (("test", False), ("orbit", True)):
             settings = ExportSettings(
                 outputs=OUTPUTS[: 2 if video else 3], depth=depth, video=VideoSettings() if video else None
             )
             views = Views(cameras, count, max_size=max_size if video else None)
-            written = render_run(
-                field,
-                field / "renders" / folder_name(views, settings),
-                views=views,
-                settings=settings,
-                device=torch_device,
-                threads=cores,
-                overwrite=overwrite,
-                console=console,
-            )
+            with console.progress(f"render {views.name}") as update:
+                written = render_run(
+                    field, views=views, settings=settings, **where, notify=console.note, progress=update
+                )
             for path in written:
                 console.result(path)
-        hold_against(field, numbers, requirements)
+        with console.progress("report") as update:
+            page = report_runs([field], keep=True, **where, notify=console.note, progress=update)
+        console.note(f"everything about it, to look at: {page}")
+        console.result(page)
+        check_requirements(trained, evaluation.metrics, requirements)
 
     for_each_input(photos, work)

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from nerfcli.runs.config import RunConfig
+
 _TEXTS = {True: "yes", False: "no", None: "not known"}
 
 
@@ -23,14 +25,14 @@ class Entry:
         return asdict(self)
 
 
-def leak_ledger(config: Mapping[str, Any]) -> list[Entry]:
-    """The ledger of a run, from its config.json.
+def leak_ledger(config: RunConfig) -> list[Entry]:
+    """The ledger of a run.
 
-    "history" of the config is the provenance of the scene: {"command": "poses", ...} where `nerfcli poses` found the
+    `config.history` is the provenance of the scene: {"command": "poses", ...} where `nerfcli poses` found the
     cameras.
     """
     return [
-        *_cameras(config.get("history"), str(config.get("scene_kind"))),
+        *_cameras(config.history, str(config.scene_kind)),
         Entry("normalisation", True, "the poses of all photos, held-out ones included, say where the scene is"),
         _exposure(config),
         Entry("training", False, "no pixel of a held-out photo was trained on"),
@@ -49,9 +51,9 @@ def told(ledger: list[Entry]) -> str:
     return "held-out photos were " + "; ".join(parts)
 
 
-def _exposure(config: Mapping[str, Any]) -> Entry:
+def _exposure(config: RunConfig) -> Entry:
     """No exposure is ever fitted to a held-out photo; what its EXIF says of it may be used."""
-    chosen = (config.get("settings") or {}).get("components", {}).get("exposure", "none")
+    chosen = config.settings.components.exposure
     how = {
         "none": "none is fitted",
         "exif": "by EXIF, that of the held-out photos included",

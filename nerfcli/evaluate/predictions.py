@@ -6,6 +6,7 @@ predictions/mask/NAME.png          255 where pixels count; only where some do no
 predictions/color-float/NAME.npy   the rendered picture before rounding, float32; only if it is asked for
 """
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -38,3 +39,12 @@ def save_unrounded(folder: Path, stem: str, compared: Compared) -> None:
     path = folder / "color-float" / f"{stem}.npy"
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, compared.rendered.astype(np.float32))
+
+
+def predictions_are_there(folder: Path, kind: str, *, checkpoint: str) -> bool:
+    """Whether predictions of this checkpoint have been saved, unrounded ones included where `kind` is "float"."""
+    try:
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return info.get("checkpoint_sha256") == checkpoint and kind in (info.get("kind"), "png")

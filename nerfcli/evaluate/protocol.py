@@ -24,7 +24,6 @@ from nerfcli.field.exposure import exposed
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Picture, render_picture
 
-METRICS = "metrics.json"
 PROTOCOL = "nerfcli-2"
 NO_GAINS = (0.0, 0.0, 0.0)
 WHITE = (1.0, 1.0, 1.0)

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from nerfcli.runs.config import RunConfig
+
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 _ALIGNED = ("", "_colour_aligned", "_pose_aligned")
 # What may be asked for: the means of metrics.json, the share of photos with a pose, and what the run cost.
@@ -48,9 +50,9 @@ def parse_requirements(text: str) -> tuple[Requirement, ...]:
     return tuple(found)
 
 
-def known_numbers(metrics: Mapping[str, Any], config: Mapping[str, Any]) -> dict[str, float | None]:
+def known_numbers(metrics: Mapping[str, Any], config: RunConfig) -> dict[str, float | None]:
     """The numbers of a run that requirements are about, from metrics.json and config.json."""
-    history = config.get("history") or {}
+    history = config.history or {}
     placed, photos = history.get("registered"), history.get("total")
     return {
         **metrics["mean"],

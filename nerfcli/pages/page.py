@@ -34,7 +34,7 @@ class Mark:
         return f'<meta name="nerfcli-{self.kind}" content="{identity}">'
 
 
-def page_html(*, title: str, mark: Mark, style: str, body: str, script: str = "") -> str:
+def page_html(*, title: str, mark: Mark, style: str, body: str, script: str = "", origin: str | None = None) -> str:
     """A whole page that loads nothing; a browser that knows content security policies would refuse to.
 
     Args:
@@ -43,9 +43,10 @@ def page_html(*, title: str, mark: Mark, style: str, body: str, script: str = ""
         style: CSS that follows `page.css`.
         body: HTML, whatever comes from outside escaped.
         script: JavaScript that runs when the body is there; for data see `data_element`.
+        origin: a digest of what the page was made from, for `is_made_from`.
     """
     return _PAGE.substitute(
-        mark=mark.html(),
+        mark=mark.html() + ("" if origin is None else f"\n{_origin_html(origin)}"),
         title=escape(title),
         kind=mark.kind,
         policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -82,6 +83,18 @@ def write_page(text: str, path: Path) -> None:
     """
     with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def is_made_from(path: Path, origin: str) -> bool:
+    """Whether the page at a path says that it was made from what has this digest."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return _origin_html(origin).encode() in file.read(_HEAD_BYTES)
+
+
+def _origin_html(origin: str) -> str:
+    return f'<meta name="nerfcli-made-from" content="{origin}">'
 
 
 def refuse_foreign(path: Path, mark: Mark, *, about: str) -> None:

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nerfcli.cameras.formats.run_cameras import RunCameras
 from nerfcli.errors import UserError
-from nerfcli.evaluate.protocol import METRICS
-from nerfcli.runs.folder import FIELD, read_cameras, read_config, read_log
+from nerfcli.runs.config import RunConfig
+from nerfcli.runs.log import LogEntry
+from nerfcli.runs.run import Run
 
 POSES_REPORT = "poses_report.json"
 # Photos named in a warning; the others are counted.
@@ -28,44 +30,43 @@ class RunFacts:
         log: RUN/log.jsonl.
         metrics: RUN/metrics.json; None before it was evaluated, or where it is of another checkpoint.
         poses: the scene's poses_report.json; None where poses came from elsewhere or the scene has moved.
-        frames: of "train" and "test".
+        frames: trained on, and held out.
         field_bytes: of the checkpoint.
     """
 
     path: Path
     label: str
-    config: dict[str, Any]
-    log: list[dict[str, Any]]
+    config: RunConfig
+    log: list[LogEntry]
     metrics: dict[str, Any] | None
     poses: dict[str, Any] | None
-    frames: dict[str, tuple[Any, ...]]
+    frames: RunCameras
     field_bytes: int
 
 
-def read_facts(run: Path, label: str, *, checkpoint_sha256: str) -> RunFacts:
+def read_facts(run: Run, label: str, *, checkpoint_sha256: str) -> RunFacts:
     """Everything that the folders tell of a run.
 
     Args:
-        run: the folder that train wrote.
+        run: the run.
         label: what it is called on the page.
         checkpoint_sha256: of its field: numbers of another one are left out.
 
     Raises:
         UserError: it is not a run, or one of its files cannot be read.
     """
-    config = read_config(run)
-    metrics = _json(run / METRICS)
+    metrics = _json(run.metrics_path)
     if metrics is not None and metrics.get("checkpoint_sha256") != checkpoint_sha256:
         metrics = None
     return RunFacts(
-        path=run,
+        path=run.path,
         label=label,
-        config=config,
-        log=read_log(run),
+        config=run.config,
+        log=run.log,
         metrics=metrics,
-        poses=_json(Path(config.get("scene", "")) / POSES_REPORT),
-        frames=read_cameras(run),
-        field_bytes=(run / FIELD).stat().st_size,
+        poses=_json(run.config.scene / POSES_REPORT),
+        frames=run.cameras,
+        field_bytes=run.field_path.stat().st_size,
     )
 
 
@@ -82,10 +83,10 @@ def labels_of(runs: Sequence[Path]) -> list[str]:
 def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
     """(stage, text) of everything that was warned about on the way to this run, in the order of the stages."""
     yield from _of_poses(facts.poses or {})
-    missing = facts.config.get("missing_photos", [])
+    missing = facts.config.missing_photos
     if missing:
         yield "scene", f"{len(missing)} photos are not there: {_listed(missing)}"
-    for note in facts.config.get("warnings", []):
+    for note in facts.config.warnings:
         yield "training", note
     rollbacks = max((entry.get("rollbacks", 0) for entry in facts.log), default=0)
     if rollbacks:
@@ -99,7 +100,7 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
 def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
     """Why numbers of these runs must not be compared with each other."""
     measured = [run for run in runs if run.metrics is not None]
-    if len({run.config.get("split_sha256") for run in runs}) > 1:
+    if len({run.config.split_sha256 for run in runs}) > 1:
         yield "the runs hold out different photos"
     if len({(run.metrics or {}).get("protocol") for run in measured}) > 1:
         yield "the runs were evaluated by different protocols"

@@ -1,17 +1,20 @@
 """The page: what was captured, how it was posed and trained, what it shows of photos it has not seen, and how fast."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from string import Template
 
 import numpy as np
 
+from nerfcli import __version__
 from nerfcli.media.colour_maps import levels_of
 from nerfcli.media.depth import DepthMeta
 from nerfcli.media.preview import coloured
 from nerfcli.pages import page
 from nerfcli.pages.pictures import data_uri, jpeg_bytes
+from nerfcli.render.depth import DepthRequest
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.facts import RunFacts, mismatches_of, warnings_of
 from nerfcli.report.tables import (
@@ -23,6 +26,7 @@ from nerfcli.report.tables import (
     settings_html,
 )
 from nerfcli.report.views import ERROR_COLOURS, ERROR_RANGE, Seen, depth_range
+from nerfcli.sealed import digest
 
 # Curves of more runs than these share colours.
 COLOURS = 6
@@ -36,13 +40,28 @@ def mark_of(runs: Sequence[Path]) -> page.Mark:
     return page.Mark("report", Path("|".join(str(run.resolve()) for run in runs)))
 
 
-def page_html(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, depth: DepthMeta) -> str:
+def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, depth: DepthRequest) -> str:
+    """Return a digest of all that a page is made from: fields, numbers, logs, settings, and what is shown of them.
+
+    Args:
+        runs: what the folders say.
+        hashes: of their fields.
+        views, depth: how many held-out photos, and which depth of them.
+    """
+    told = [[run.label, run.config.to_json(), run.log, run.metrics, run.poses] for run in runs]
+    return digest([__version__, list(hashes), told, views, asdict(depth)])
+
+
+def page_html(
+    runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, depth: DepthMeta, origin: str | None = None
+) -> str:
     """The page's text.
 
     Args:
         runs: at least one.
         looks: what each of them shows of photos of the same names.
         depth: the meaning of the depths, in the unit of the first run.
+        origin: see `origin_of`.
     """
     ranges = _depth_ranges(runs, looks)
     title = " against ".join(run.label for run in runs) if len(runs) < 4 else f"{len(runs)} runs"
@@ -63,7 +82,8 @@ def page_html(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, dept
     )
     style = page.asset("compare.css") + _STYLE
     script = page.asset("compare.js")
-    return page.page_html(title=title, mark=mark_of([run.path for run in runs]), style=style, body=body, script=script)
+    mark = mark_of([run.path for run in runs])
+    return page.page_html(title=title, mark=mark, style=style, body=body, script=script, origin=origin)
 
 
 def _warnings_html(runs: Sequence[RunFacts]) -> str:
@@ -81,7 +101,7 @@ def _structure(view: Seen) -> str:
 
 def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> list[tuple[float, float]]:
     """The range of colours of each run's depths: the same for all runs of a scene."""
-    scenes = [run.config.get("scene_fingerprint") for run in runs]
+    scenes = [run.config.scene_fingerprint for run in runs]
     return [
         depth_range([view for other, look in zip(scenes, looks, strict=True) if other == scene for view in look])
         for scene in scenes
@@ -186,8 +206,8 @@ def _cameras_html(runs: Sequence[RunFacts]) -> str:
     """The cameras of every scene, once."""
     drawn: dict[str, str] = {}
     for run in runs:
-        scene = str(run.config.get("scene_fingerprint", run.path))
-        drawn.setdefault(scene, from_above(run.frames["train"], run.frames["test"]))
+        scene = run.config.scene_fingerprint or str(run.path)
+        drawn.setdefault(scene, from_above(run.frames.train, run.frames.test))
     return "".join(f'<section class="chart">{drawing}</section>' for drawing in drawn.values() if drawing)
 
 

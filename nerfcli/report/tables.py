@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any
 
 from nerfcli.pages.tables import table
@@ -74,13 +73,13 @@ def _last(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
 
 
 def _size(run: RunFacts) -> str:
-    cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames["train"], *run.frames["test"])}
+    cameras = {(frame.camera.width, frame.camera.height) for frame in (*run.frames.train, *run.frames.test)}
     return ", ".join(f"{width} x {height}" for width, height in sorted(cameras)[:4])
 
 
 def _unit(run: RunFacts) -> str:
-    source = run.config.get("unit_source")
-    return str(run.config.get("unit", "")) + (f" ({source})" if source else "")
+    source = run.config.unit_source
+    return (run.config.unit or "") + (f" ({source})" if source else "")
 
 
 def _registered(run: RunFacts) -> str:
@@ -144,14 +143,15 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
     rows = [
         (
             run.label,
-            f"{decision['component']}={str(decision['value']).lower()}",
-            "" if decision["gain_db"] is None else f"{decision['gain_db']:+.2f} +- {decision['error_db']:.2f}",
-            "" if decision["cost"] is None else f"{decision['cost']:+.0%}",
-            "yes" if decision["kept"] else "no",
-            decision["why"],
+            f"{decision.component}={str(decision.value).lower()}",
+            "" if decision.gain_db is None else f"{decision.gain_db:+.2f} +- {decision.error_db:.2f}",
+            "" if decision.cost is None else f"{decision.cost:+.0%}",
+            "yes" if decision.kept else "no",
+            decision.why,
         )
         for run in runs
-        for decision in (run.config.get("selection") or {}).get("decisions", [])
+        if run.config.selection is not None
+        for decision in run.config.selection.decisions
     ]
     if not rows:
         return ""
@@ -162,7 +162,7 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
 def settings_html(runs: Sequence[RunFacts]) -> str:
     """Every setting and version; where runs differ, the row is marked and comes first."""
     per_run = [
-        _flat({"settings": run.config.get("settings", {}), "versions": run.config.get("versions", {})}) for run in runs
+        _flat({"settings": run.config.settings.to_json(), "versions": dict(run.config.versions)}) for run in runs
     ]
     keys = list(dict.fromkeys(key for settings in per_run for key in settings))
     rows = [(key, *(settings.get(key, "") for settings in per_run)) for key in keys]
@@ -204,10 +204,10 @@ _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
 
 
 _CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
-    ("scene", lambda run: Path(str(run.config.get("scene", ""))).name),
-    ("format", lambda run: str(run.config.get("scene_kind", ""))),
-    ("photos to train on", lambda run: str(len(run.frames["train"]))),
-    ("photos held out", lambda run: str(len(run.frames["test"]))),
+    ("scene", lambda run: run.config.scene.name),
+    ("format", lambda run: run.config.scene_kind or ""),
+    ("photos to train on", lambda run: str(len(run.frames.train))),
+    ("photos held out", lambda run: str(len(run.frames.test))),
     ("size", _size),
     ("unit of length", _unit),
     ("poses found", _registered),

@@ -47,9 +47,9 @@ class Seen:
 
 def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
     """At most `count` photos that all of the runs hold out, chosen by `spread_evenly` with the first known quality."""
-    names = [frame.name for frame in runs[0].frames["test"]]
+    names = [frame.name for frame in runs[0].frames.test]
     for run in runs[1:]:
-        held_out = {frame.name for frame in run.frames["test"]}
+        held_out = {frame.name for frame in run.frames.test}
         names = [name for name in names if name in held_out]
     measured = next((run.metrics for run in runs if run.metrics is not None), {})
     quality = {image["name"]: image["psnr"] for image in measured.get("images", [])}

@@ -38,6 +38,12 @@ class Decision:
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "Decision":
+        """Read what `to_json` gave; numbers that an earlier version did not have are None."""
+        known: dict[str, Any] = {entry.name: content.get(entry.name) for entry in fields(cls)}
+        return cls(**known)
+
     def in_words(self) -> str:
         """A line for people: "exposure=learned: +1.20 +- 0.08 dB, +3 % time: kept, gains ..."."""
         named = f"{self.component}={str(self.value).lower()}"
@@ -77,9 +83,12 @@ class Selection:
             "seconds": self.seconds,
         }
 
-
-def decisions_in_words(config: Mapping[str, Any]) -> list[str]:
-    """A line per decision of a run that has this RUN/config.json; none where nobody asked the scene."""
-    known = {entry.name for entry in fields(Decision)}
-    decisions = (config.get("selection") or {}).get("decisions", [])
-    return [Decision(**{k: v for k, v in one.items() if k in known}).in_words() for one in decisions]
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any], *, wanted: Components) -> "Selection":
+        """Read what `to_json` gave, which has no exposures; `wanted` are the components where it names none."""
+        chosen = content.get("components")
+        return cls(
+            components=Components(**chosen) if chosen else wanted,
+            decisions=tuple(Decision.from_json(one) for one in content.get("decisions", ())),
+            seconds=content.get("seconds", 0.0),
+        )

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from nerfcli.cameras.formats.run_cameras import write_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
 from nerfcli.field.kinds import settings_from_json
 from nerfcli.photos.held_out_exposure import gains_between
 from nerfcli.render.model import Model, save_model
-from nerfcli.runs.folder import FIELD, STATE, chosen_components, read_config, write_cameras
+from nerfcli.runs.config import read_config
+from nerfcli.runs.files import FIELD, STATE
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.extent import Extent
@@ -130,7 +132,7 @@ def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]
             f"{run} was trained with --contraction {extent.contraction}, not {settings.contraction}",
             "train into a new folder with -o, or again with --overwrite",
         )
-    return Begun(extent, chosen_components(read_config(run)))
+    return Begun(extent, read_config(run).components)
 
 
 def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:

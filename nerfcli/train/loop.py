@@ -4,9 +4,8 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -15,17 +14,9 @@ from nerfcli.atomic import cannot_write
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
 from nerfcli.interrupts import held_back
-from nerfcli.runs.folder import (
-    CONFIG,
-    FIELD,
-    LOG,
-    STATE,
-    append_log,
-    cut_log,
-    describe_run,
-    read_config,
-    write_sealed,
-)
+from nerfcli.runs.config import RunConfig, read_config, write_config
+from nerfcli.runs.files import FIELD, LOG, STATE
+from nerfcli.runs.log import LogEntry, append_log, cut_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
@@ -129,7 +120,7 @@ def _clear(run: Path) -> None:
 
 def _describe(scene: Scene, run: Path, asked: TrainSettings, prepared: Prepared, *, resume: bool) -> None:
     """Write RUN/config.json."""
-    described = describe_run(
+    described = RunConfig.describing(
         scene,
         asked,
         factor=prepared.factor,
@@ -137,8 +128,8 @@ def _describe(scene: Scene, run: Path, asked: TrainSettings, prepared: Prepared,
         selection=prepared.selection,
     )
     if resume:
-        described["selection"] = read_config(run).get("selection")
-    write_sealed(run / CONFIG, described)
+        described = replace(described, selection=read_config(run).selection)
+    write_config(run, described)
 
 
 def _run(
@@ -163,7 +154,7 @@ def _run(
     def log() -> None:
         nonlocal logged_samples, logged_rays, logged_seconds
         samples_per_second, rays_per_second = speeds()
-        entry: dict[str, Any] = {
+        entry: LogEntry = {
             "step": fitting.step,
             "seconds": round(totals.seconds, 3),
             "loss": loss,

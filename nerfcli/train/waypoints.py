@@ -14,7 +14,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.photos.held_out_exposure import log_gains_of
 from nerfcli.render.model import Model, load_model, save_model
-from nerfcli.runs.folder import add_to_log
+from nerfcli.runs.log import add_to_log
 from nerfcli.train.heldout import HeldoutPixels
 from nerfcli.train.photos import load_album
 from nerfcli.train.preparation import Prepared

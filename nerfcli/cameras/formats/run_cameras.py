@@ -1,46 +1,129 @@
-"""The cameras of a run of nerfcli: those that its field was trained with, refined where training refined them."""
+"""RUN/cameras.json: the cameras that a field was trained with, refined where training refined them."""
 
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
+from nerfcli.sealed import SEAL, read_sealed, write_sealed
 
 CAMERAS = "cameras.json"
-_SPLITS = ("train", "test")
+# What to do about a damaged file of a run.
+MEND = f"train again with --overwrite, or restore the file; if you changed it yourself, take out its {SEAL}"
+# In an entry: camera and pose as the scene had them.
+_GIVEN = "given"
+
+
+@dataclass(frozen=True)
+class RunCameras:
+    """The frames that were trained on, and those that were held out."""
+
+    train: tuple[Frame, ...]
+    test: tuple[Frame, ...]
+
+
+def write_cameras(
+    run: Path, train: Sequence[Frame], test: Sequence[Frame], *, given: Mapping[str, Frame] | None = None
+) -> None:
+    """Write the frames of both sets: full-size cameras and poses in the scene's frame.
+
+    Rendering needs nothing else of the scene; evaluation finds the photos through it.
+
+    Args:
+        run: the folder.
+        train, test: frames as the field knows them.
+        given: by name, as the scene has them, where training has refined them.
+    """
+    frames = {"train": train, "test": test}
+    content = {name: [_frame_to_json(frame, run, given or {}) for frame in frames[name]] for name in frames}
+    write_sealed(run / CAMERAS, content)
+
+
+def read_cameras(run: Path) -> RunCameras:
+    """Return the frames of a run.
+
+    Raises:
+        UserError: the folder is not one that `train` wrote, or the file is damaged.
+    """
+    return _read_frames(run / CAMERAS, given=False)
+
+
+def read_given_cameras(run: Path) -> RunCameras:
+    """Return the frames of a run as the scene had them, before training refined them.
+
+    Raises:
+        UserError: see `read_cameras`.
+    """
+    return _read_frames(run / CAMERAS, given=True)
 
 
 def find_run(path: Path) -> Path | None:
-    """RUN/cameras.json of a run, or of a file of that name in one."""
+    """Return RUN/cameras.json of a run, or of a file of that name in one; None if it is neither."""
     file = path if path.is_file() and path.name == CAMERAS else path / CAMERAS
     return file if file.is_file() and (file.parent / "config.json").is_file() else None
 
 
 def parse_run(path: Path) -> Capture:
-    """The frames of RUN/cameras.json, training photos first; without points, which a run has none of.
+    """Return the frames of a RUN/cameras.json, training photos first; without points, which a run has none of.
 
     Raises:
-        UserError: it is damaged.
+        UserError: see `read_cameras`.
     """
-    content = read_json_object(path)
-    try:
-        frames = tuple(
-            Frame(
-                name=str(entry["name"]),
-                camera=Camera.from_json(entry["camera"]),
-                world_from_cam=np.array(entry["world_from_cam"], dtype=np.float64).reshape(4, 4),
-                image=None if entry["image"] is None else path.parent / entry["image"],
-                mask=None if entry["mask"] is None else path.parent / entry["mask"],
-                split=split,
-            )
-            for split in _SPLITS
-            for entry in content[split]
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(
-            f"{path} holds no cameras of a run: {type(error).__name__} {error}", "give the folder of a run"
-        ) from error
+    cameras = _read_frames(path, given=False)
+    splits = (("train", cameras.train), ("test", cameras.test))
+    frames = tuple(replace(frame, split=split) for split, frames in splits for frame in frames)
     return Capture(frames, np.zeros((0, 3)), (), None, "run")
+
+
+def _read_frames(path: Path, *, given: bool) -> RunCameras:
+    run = path.parent
+    try:
+        content = read_sealed(path)
+        train, test = (
+            tuple(
+                _frame_from_json({**entry, **(entry.get(_GIVEN, {}) if given else {})}, run) for entry in content[name]
+            )
+            for name in ("train", "test")
+        )
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{run} is not a run: it has no {CAMERAS}", "give the folder that nerfcli train wrote"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} cannot be read: {error}", MEND) from error
+    return RunCameras(train, test)
+
+
+def _frame_to_json(frame: Frame, run: Path, given: Mapping[str, Frame]) -> dict[str, Any]:
+    before = given.get(frame.name)
+    return {
+        "name": frame.name,
+        **_view_to_json(frame),
+        **({} if before is None else {_GIVEN: _view_to_json(before)}),
+        # Relative, so that scene and run can be moved together.
+        "image": None if frame.image is None else os.path.relpath(frame.image, run),
+        "mask": None if frame.mask is None else os.path.relpath(frame.mask, run),
+    }
+
+
+def _view_to_json(frame: Frame) -> dict[str, Any]:
+    return {"camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
+
+
+def _frame_from_json(entry: dict[str, Any], run: Path) -> Frame:
+    pose = np.array(entry["world_from_cam"], dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"world_from_cam of {entry['name']} is not 4 rows of 4 finite numbers")
+    return Frame(
+        name=entry["name"],
+        camera=Camera.from_json(entry["camera"]),
+        world_from_cam=pose,
+        image=None if entry["image"] is None else run / entry["image"],
+        mask=None if entry["mask"] is None else run / entry["mask"],
+    )

@@ -1,21 +1,27 @@
-"""The views that `nerfcli render --cameras` names: those of the run, a path through or around them, or of a file."""
+"""The views to render of a run: its own, a path through or around them, or those of a file."""
 
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import typer
+import numpy as np
 
+from nerfcli import scene as scenes
 from nerfcli.atomic import cannot_write
-from nerfcli.cli.console import Console
+from nerfcli.cameras import paths
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.camera_path import losses_camera_path, read_normalisation, read_path, write_camera_path
+from nerfcli.cameras.formats.transforms import write_transforms
+from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
+from nerfcli.cameras.names import frames_named
+from nerfcli.convert.finding import find_camera_path
+from nerfcli.convert.formats import Given, recognise
 from nerfcli.errors import UserError
-
-if TYPE_CHECKING:
-    from nerfcli.cameras.camera import Camera
-    from nerfcli.cameras.frame import Frame
+from nerfcli.photos.loading import downscaled_camera
+from nerfcli.runs.run import Run
+from nerfcli.workflows.notices import Notify, warn_python
 
 PATHS = ("orbit", "ellipse", "spiral", "interpolate")
 # From this field of view on, a lens sees behind the camera.
@@ -48,14 +54,12 @@ class Look:
         lens = [] if self.lens is None else [self.lens + ("" if self.fov_deg is None else f"{self.fov_deg:g}")]
         return [*size, *lens, *([] if self.crop is None else ["crop", *map(str, self.crop)])]
 
-    def of(self, camera: "Camera") -> "Camera":
+    def of(self, camera: Camera) -> Camera:
         """The camera that takes such a picture where another one stands.
 
         Raises:
             UserError: a part outside of the picture, or a size or an angle that the lens does not have.
         """
-        from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
-
         if self.lens == "equirectangular" and self.fov_deg is None and (self.width or self.height):
             width = self.width or 2 * (self.height or 0)
             camera = equirectangular(width, self.height or width // 2)
@@ -64,30 +68,6 @@ class Look:
             if self.lens is not None:
                 camera = with_lens(camera, self.lens, self.fov_deg)
         return camera if self.crop is None else cropped(camera, Window(*self.crop))
-
-
-def look_of(
-    width: int | None, height: int | None, *, lens: str | None, fov_deg: float | None, crop: str | None
-) -> Look:
-    """What --width, --height, --lens, --fov and --crop ask for.
-
-    Raises:
-        typer.BadParameter: a lens that does not exist, --fov without --lens, or a part that is none.
-    """
-    from nerfcli.cameras.framing import LENSES
-
-    if lens is not None and lens not in LENSES:
-        raise typer.BadParameter(f"{lens!r}; choose {', '.join(LENSES)}", param_hint="--lens")
-    if fov_deg is not None and lens is None:
-        raise typer.BadParameter("it is the angle of --lens; give both", param_hint="--fov")
-    window = None
-    if crop is not None:
-        match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", crop.replace(" ", ""))
-        if match is None:
-            raise typer.BadParameter(f"{crop!r}; write X,Y,WIDTH,HEIGHT in pixels", param_hint="--crop")
-        x, y, crop_width, crop_height = (int(part) for part in match.groups())
-        window = (x, y, crop_width, crop_height)
-    return Look(width, height, lens, fov_deg, window)
 
 
 @dataclass(frozen=True)
@@ -104,7 +84,7 @@ class Views:
     """
 
     cameras: str
-    count: int
+    count: int = 60
     through: str | None = None
     nerfstudio_frame: Path | None = None
     max_size: int | None = None
@@ -117,36 +97,30 @@ class Views:
         return "-".join([name, *self.look.words])
 
 
-def chosen_frames(run: Path, views: Views, *, depth_hint: float) -> "list[Frame]":
+def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     """The frames of a run that are to be seen.
 
     Args:
-        run: the folder that train wrote.
+        run: the run.
         views: which.
         depth_hint: how far away the scene's middle is, for paths around it where the optical axes do not say.
 
     Raises:
         UserError: no such cameras, or an option that makes no sense with them.
     """
-    from nerfcli.cameras import paths
-    from nerfcli.cameras.names import frames_named
-    from nerfcli.photos.loading import downscaled_camera
-    from nerfcli.runs.folder import read_cameras, read_config
-
     cameras, through = views.cameras, views.through
     if through is not None and cameras not in PATHS:
         raise UserError(f"--through does not fit --cameras {cameras}", f"it is for {', '.join(PATHS)}", exit_code=2)
     if views.nerfstudio_frame is not None and cameras in ("test", "train", *PATHS):
         raise UserError(f"--nerfstudio-frame does not fit --cameras {cameras}", "it is for a file", exit_code=2)
-    sets = read_cameras(run)
-    factor = read_config(run)["settings"]["downscale"]
-    known = sets["train"]
+    sets, factor = run.cameras, run.config.downscale
+    known = sets.train
     if through is not None:
-        known = frames_named([*sets["train"], *sets["test"]], through.split(","))
+        known = frames_named([*sets.train, *sets.test], through.split(","))
     if cameras in ("test", "train"):
-        chosen = sets[cameras]
+        chosen = sets.test if cameras == "test" else sets.train
         if not chosen:
-            raise UserError(f"{run} has no {cameras} cameras", f"choose --cameras train, {', '.join(PATHS)}")
+            raise UserError(f"{run.path} has no {cameras} cameras", f"choose --cameras train, {', '.join(PATHS)}")
     elif cameras == "interpolate":
         chosen = paths.interpolate(known, count=views.count)
     elif cameras in PATHS:
@@ -163,7 +137,7 @@ def chosen_frames(run: Path, views: Views, *, depth_hint: float) -> "list[Frame]
     return [replace(frame, camera=look(frame.camera)) for frame in chosen]
 
 
-def refuse_z_all_around(frames: "Sequence[Frame]", *, notify: Callable[[str], None]) -> None:
+def refuse_z_all_around(frames: Sequence[Frame], *, notify: Notify) -> None:
     """z is the distance along the optical axis, and half of a picture of all directions lies behind the camera.
 
     Raises:
@@ -181,33 +155,26 @@ def refuse_z_all_around(frames: "Sequence[Frame]", *, notify: Callable[[str], No
 
 def file_fps(cameras: str) -> float | None:
     """The frame rate that a nerfstudio camera path gives; None of anything else."""
-    from nerfcli.cameras.formats.camera_path import read_path
-    from nerfcli.convert.finding import find_camera_path
-
     path = Path(cameras)
     found = find_camera_path(path) if path.is_file() else None
     return None if found is None else read_path(found).fps
 
 
-def write_frames(frames: "Sequence[Frame]", target: Path, *, fps: float, overwrite: bool, console: Console) -> None:
+def write_frames(
+    frames: Sequence[Frame], target: Path, *, fps: float, overwrite: bool = False, warn: Notify = warn_python
+) -> None:
     """Write views into a folder: cameras.json, a transforms.json, and camera_path.json for nerfstudio's viewer.
 
     Raises:
         UserError: one of them exists, or cannot be written.
     """
-    import numpy as np
-
-    from nerfcli.cameras.formats.camera_path import losses_camera_path, write_camera_path
-    from nerfcli.cameras.formats.transforms import write_transforms
-    from nerfcli.cameras.frame import Capture
-
     views = tuple(replace(frame, image=None, mask=None, split=None) for frame in frames)
     capture = Capture(views, np.zeros((0, 3)), (), None, "camera-path")
     listed, path = target / "cameras.json", target / "camera_path.json"
     if there := [file for file in (listed, path) if file.exists() and not overwrite]:
         raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another place with -o")
     for loss in losses_camera_path(capture):
-        console.warn(f"{path.name} cannot hold {loss}; {listed.name} does")
+        warn(f"{path.name} cannot hold {loss}; {listed.name} does")
     try:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -216,12 +183,8 @@ def write_frames(frames: "Sequence[Frame]", target: Path, *, fps: float, overwri
     write_camera_path(capture, path, fps=fps)
 
 
-def _frames_of(path: Path, nerfstudio_frame: Path | None) -> "tuple[Frame, ...]":
+def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
     """The cameras of a scene, fitted to its photos, or of any file or folder that `nerfcli convert` reads."""
-    from nerfcli import scene as scenes
-    from nerfcli.cameras.formats.camera_path import read_normalisation
-    from nerfcli.convert.formats import Given, recognise
-
     if not path.exists():
         raise UserError(
             f"no cameras called {path}",
@@ -239,8 +202,6 @@ def _frames_of(path: Path, nerfstudio_frame: Path | None) -> "tuple[Frame, ...]"
     return tuple(replace(f, world_from_cam=world_from_nerfstudio.apply_pose(f.world_from_cam)) for f in frames)
 
 
-def _within(camera: "Camera", max_size: int) -> "Camera":
+def _within(camera: Camera, max_size: int) -> Camera:
     """The camera of the picture made smaller, if need be, until its longer side fits."""
-    from nerfcli.photos.loading import downscaled_camera
-
     return downscaled_camera(camera, max(1.0, max(camera.width, camera.height) / max_size))

@@ -5,6 +5,9 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any
 
+# Of the table of costs.
+HEADINGS = ("field", "weights", "optimiser", "step keeps", "ops/sample", "B/sample", "ops/picture", "B/picture")
+_UNITS = ("", "k", "M", "G", "T", "P")
 # Letters in a line; what is longer goes on in the next one, further in.
 WIDTH = 110
 
@@ -120,3 +123,26 @@ def _plain(value: Any) -> str:
 
 def _number(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def cost_lines(costs: dict[str, dict[str, Any]]) -> list[str]:
+    """A table: a line per kind. Operations are multiplications and additions, forward; bytes are those of rows and of
+    layers' values."""
+    rows: list[tuple[str, ...]] = [HEADINGS]
+    for kind, cost in costs.items():
+        held, sample, picture = cost["bytes"], cost["per_sample"], cost["per_picture"]
+        numbers = (
+            held["weights"], held["optimiser"], held["activations"], sample["operations"], sample["bytes_moved"],
+            picture["operations"], picture["bytes_moved"],
+        )  # fmt: skip
+        rows.append((kind, *map(_short, numbers)))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+
+
+def _short(number: float) -> str:
+    """Three digits and a letter: 8.4 M."""
+    unit = 0
+    while number >= 999.5 and unit < len(_UNITS) - 1:
+        number, unit = number / 1000, unit + 1
+    return f"{number:.3g}{_UNITS[unit]}"

@@ -1,0 +1,205 @@
+"""Options of `nerfcli render`: files of depth, the work that goes into a picture, videos, frames and lenses."""
+
+import math
+import re
+from fractions import Fraction
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nerfcli.cli.options import one_of, some_of
+
+if TYPE_CHECKING:
+    from nerfcli.export.settings import VideoSettings
+    from nerfcli.workflows.views import Look
+
+MOST_SAMPLES = 256
+
+Tolerance = Annotated[
+    str,
+    typer.Option(
+        help="What a channel of a colour may miss because rays stop early, as 1/255 or 0.001; the bound that was "
+        "reached is in the files. It is about the rendering of the field, not about the field."
+    ),
+]
+Step = Annotated[
+    float,
+    typer.Option(
+        help="Length of the steps along rays, in those of the training: 2 is faster, 0.5 nearer to the field.",
+        min=1 / 64,
+        max=64,
+    ),
+]
+SamplesPerPixel = Annotated[
+    int,
+    typer.Option(help="Rays of a pixel, against jagged edges; depth is that of all together.", min=1, max=MOST_SAMPLES),
+]
+Rgba = Annotated[
+    bool,
+    typer.Option("--rgba", help="Colours without background and the opacity as alpha (straight; EXR premultiplied)."),
+]
+DepthFormat = Annotated[
+    str,
+    typer.Option(
+        help="Some of tiff, exr, npy, npz (floats; exr and npz hold all outputs of a view) and png16 (16-bit levels "
+        "beside floats)."
+    ),
+]
+DepthScale = Annotated[
+    str,
+    typer.Option(
+        help="Scene units per level of png16; auto: the finest of 1, 2, 5 times a power of ten that holds twice "
+        "what 99.9 % of all pixels need (what is farther has none there), never finer than a millimetre in metres."
+    ),
+]
+
+
+def depth_formats(text: str, *, outputs: tuple[str, ...], convention: str) -> tuple[str, ...]:
+    """The formats in a comma-separated list.
+
+    Raises:
+        typer.BadParameter: an unknown one, or one that cannot hold what is asked for.
+    """
+    from nerfcli.export.settings import FORMATS
+
+    hint = "--depth-format"
+    chosen = some_of(text, FORMATS, hint)
+    if "png16" in chosen and "depth" not in outputs:
+        raise typer.BadParameter("png16 holds depth, which is not among the --outputs", param_hint=hint)
+    if "png16" in chosen and convention == "moment":
+        raise typer.BadParameter("png16 keeps 0 for no depth; the moment of an empty ray is 0", param_hint=hint)
+    return chosen
+
+
+def level_scale(text: str, *, formats: tuple[str, ...]) -> float | None:
+    """Scene units per level; None for auto.
+
+    Raises:
+        typer.BadParameter: not a positive number, or without 16-bit files.
+    """
+    if text == "auto":
+        return None
+    if "png16" not in formats:
+        raise typer.BadParameter("it is for --depth-format png16", param_hint="--depth-scale")
+    try:
+        scale = float(text)
+    except ValueError:
+        scale = math.nan
+    if not 0 < scale < math.inf:
+        raise typer.BadParameter(f"{text!r}; write auto or a positive number", param_hint="--depth-scale")
+    return scale
+
+
+def finite(value: float | None, option: str) -> None:
+    """Refuse NaN and infinity, which the bounds of an option let through.
+
+    Raises:
+        typer.BadParameter: it is one of them.
+    """
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is no distance or share", param_hint=option)
+
+
+def tolerance_of(text: str) -> float:
+    """A number or a fraction above 0 and at most 1.
+
+    Raises:
+        typer.BadParameter: anything else.
+    """
+    try:
+        value = float(Fraction(text.strip()))
+    except (ValueError, ZeroDivisionError, OverflowError):
+        value = -1.0
+    if not 1e-9 <= value <= 1:
+        raise typer.BadParameter(
+            f"{text!r}; write a fraction like 1/255 or a number, from 1e-9 to 1", param_hint="--tolerance"
+        )
+    return value
+
+
+def video_settings(
+    formats: str, *, layout: str, direction: str, fps: float, crf: int | None, loop: int | None
+) -> "VideoSettings":
+    """The videos that --video-format and its companions ask for.
+
+    Raises:
+        typer.BadParameter: a value that does not exist, or does not fit the formats.
+    """
+    from nerfcli.export.settings import DIRECTIONS, LAYOUTS, VideoSettings
+    from nerfcli.media.video import FORMATS, GIF_FASTEST_FPS
+
+    chosen = tuple(dict.fromkeys(formats.split(",")))
+    for name in chosen:
+        one_of(name, FORMATS, "--video-format")
+    one_of(layout, LAYOUTS, "--video-layout")
+    one_of(direction, DIRECTIONS, "--direction")
+    if "gif" in chosen and fps > GIF_FASTEST_FPS:
+        raise typer.BadParameter(f"{fps:g}; players show a gif at {GIF_FASTEST_FPS:g} at most", param_hint="--fps")
+    if crf is not None:
+        scaled = [name for name in chosen if FORMATS[name].crf is not None]
+        if not scaled:
+            raise typer.BadParameter("a gif has no scale of quality; leave it out", param_hint="--crf")
+        for name in scaled:
+            if crf > FORMATS[name].worst_crf:
+                raise typer.BadParameter(f"{crf}; {name} ends at {FORMATS[name].worst_crf}", param_hint="--crf")
+    if loop == 0 and chosen != ("gif",):
+        raise typer.BadParameter("0; a gif alone can be told to play for ever", param_hint="--loop")
+    return VideoSettings(formats=chosen, layout=layout, direction=direction, fps=fps, crf=crf, plays=loop)
+
+
+def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[float, float] | None:
+    """LOW:HIGH; None where nothing is said.
+
+    Raises:
+        typer.BadParameter: anything else, or no depth is asked for.
+    """
+    if text is None:
+        return None
+    if "depth" not in outputs:
+        raise typer.BadParameter("it is of depth, which is not among the --outputs", param_hint="--colour-range")
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        low = high = math.nan
+    if not -math.inf < low < high < math.inf:
+        message = f"{text!r}; write LOW:HIGH in scene units, for example 0.5:4"
+        raise typer.BadParameter(message, param_hint="--colour-range")
+    return low, high
+
+
+def frame_range(text: str) -> slice:
+    """START:STOP or START:STOP:STEP; START and STOP may be left out.
+
+    Raises:
+        typer.BadParameter: anything else, or nothing between start and stop.
+    """
+    match = re.fullmatch(r"(\d*):(\d*)(?::(\d+))?", text.strip())
+    start, stop, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
+    if match is None or step == 0 or (stop is not None and stop <= (start or 0)):
+        message = f"{text!r}; write START:STOP or START:STOP:STEP, for example 100:200 or 0:120:4"
+        raise typer.BadParameter(message, param_hint="--frames")
+    return slice(start, stop, step)
+
+
+def look_of(
+    width: int | None, height: int | None, *, lens: str | None, fov_deg: float | None, crop: str | None
+) -> "Look":
+    """What --width, --height, --lens, --fov and --crop ask for.
+
+    Raises:
+        typer.BadParameter: a lens that does not exist, --fov without --lens, or a part that is none.
+    """
+    from nerfcli.cameras.framing import LENSES
+    from nerfcli.workflows.views import Look
+
+    one_of(lens, LENSES, "--lens")
+    if fov_deg is not None and lens is None:
+        raise typer.BadParameter("it is the angle of --lens; give both", param_hint="--fov")
+    window = None
+    if crop is not None:
+        match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", crop.replace(" ", ""))
+        if match is None:
+            raise typer.BadParameter(f"{crop!r}; write X,Y,WIDTH,HEIGHT in pixels", param_hint="--crop")
+        x, y, crop_width, crop_height = (int(part) for part in match.groups())
+        window = (x, y, crop_width, crop_height)
+    return Look(width, height, lens, fov_deg, window)

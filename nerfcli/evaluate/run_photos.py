@@ -1,0 +1,58 @@
+"""The photos of a run as it was trained on: those held out, and the training photos on billboards."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+from nerfcli.evaluate.billboards import Billboards, reduction
+from nerfcli.evaluate.protocol import HeldOut, over_white
+from nerfcli.photos.held_out_exposure import log_gains_of
+from nerfcli.photos.loading import downscaled_camera, load_photos
+from nerfcli.render.model import Model
+from nerfcli.runs.config import RunConfig
+from nerfcli.runs.run import Run
+
+
+def held_out_photos(
+    frames: Sequence[Frame], model: Model, *, downscale: int, masks: str, threads: int
+) -> list[HeldOut]:
+    """Load photos as a run was trained on, each as bright as EXIF or its neighbours say beside those of the model.
+
+    Args:
+        frames: with their images and masks.
+        model: that they are compared with.
+        downscale: of the training.
+        masks: what their black means, see `Components`.
+        threads: to read with.
+
+    Raises:
+        UserError: a photo cannot be read.
+    """
+    photos = load_photos(frames, factor=downscale, threads=threads, masks=masks)
+    return [
+        HeldOut(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains))
+        for photo, gains in zip(photos, log_gains_of(frames, model).tolist(), strict=True)
+    ]
+
+
+def held_out_photos_of(config: RunConfig, frames: Sequence[Frame], model: Model, *, threads: int) -> list[HeldOut]:
+    """Load held-out photos of a run; see `held_out_photos`."""
+    masks = config.components.masks
+    return held_out_photos(frames, model, downscale=config.downscale, masks=masks, threads=threads)
+
+
+def training_billboards(run: Run, *, notify: Callable[[str], None]) -> Billboards | None:
+    """Build the model without shape of a run's training photos; None, with a line, where these cannot be read."""
+    factor, masks = run.config.downscale, run.components.masks
+    small, cameras = [], []
+    try:
+        for frame in run.cameras.train:
+            trained = replace(frame, camera=downscaled_camera(frame.camera, factor))
+            (photo,) = load_photos([frame], factor=factor * reduction(trained), threads=1, masks=masks)
+            cameras.append(photo.frame)
+            small.append(over_white(photo.pixels))
+    except UserError as error:
+        notify(f"no comparison with a model without shape: {error}")
+        return None
+    return Billboards(cameras, small)

@@ -1,0 +1,174 @@
+"""RUN/config.json: what was trained, from what, and how the components were chosen."""
+
+import hashlib
+import platform
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from nerfcli import __version__
+from nerfcli.cameras.formats.run_cameras import MEND
+from nerfcli.cameras.orientation import rescaling_told
+from nerfcli.errors import UserError
+from nerfcli.runs.components import Components
+from nerfcli.runs.decisions import Selection
+from nerfcli.runs.files import CONFIG
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene, fingerprint
+from nerfcli.sealed import read_sealed, write_sealed
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What a run was trained from and how; what an earlier version did not write down has its default.
+
+    Args:
+        settings: as they were asked for, with the downscale and contraction that were chosen.
+        scene: the folder of the scene, relative to where the user then was, or absolute.
+        scene_kind: the format of the scene, see `Scene`.
+        unit, unit_source: of length, see `Scene`.
+        scene_fingerprint: see `scene.fingerprint`.
+        split_sha256: see `split_hash`.
+        holdout: the rule that chose the held-out photos; None where the scene says.
+        history: how cameras and points were found, see `Scene`; None if that was not written down.
+        missing_photos: that the scene lists and that were not on disk.
+        warnings: about the scene.
+        selection: how the components were chosen, where the scene decided; without its exposures.
+        versions: of nerfcli, Python, torch and NumPy.
+    """
+
+    settings: TrainSettings = field(default_factory=TrainSettings)
+    scene: Path = Path()
+    scene_kind: str | None = None
+    unit: str | None = None
+    unit_source: str | None = None
+    scene_fingerprint: str | None = None
+    split_sha256: str | None = None
+    holdout: str | None = None
+    history: Mapping[str, Any] | None = None
+    missing_photos: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    selection: Selection | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def describing(
+        cls,
+        scene: Scene,
+        settings: TrainSettings,
+        *,
+        factor: int,
+        contraction: str,
+        selection: Selection | None = None,
+    ) -> "RunConfig":
+        """Describe a training that begins now.
+
+        Args:
+            scene: what is trained on.
+            settings: as they were asked for.
+            factor: by which photos are made smaller.
+            contraction: of the field.
+            selection: how the components were chosen, where the scene decided.
+        """
+        return cls(
+            settings=replace(settings, downscale=factor, contraction=contraction),
+            scene=scene.root,
+            scene_kind=scene.kind,
+            unit=scene.unit,
+            unit_source=scene.unit_source,
+            scene_fingerprint=fingerprint(scene),
+            split_sha256=split_hash(scene.test_names),
+            holdout=scene.holdout,
+            history=dict(scene.history),
+            missing_photos=tuple(scene.missing),
+            warnings=tuple(rescaling_told(scene.rescaled)),
+            selection=selection,
+            versions={
+                "nerfcli": __version__,
+                "python": platform.python_version(),
+                **{name: version(name) for name in ("torch", "numpy")},
+            },
+        )
+
+    @property
+    def components(self) -> Components:
+        """The components of the model: those that the scene decided on, or as asked for."""
+        return self.settings.components if self.selection is None else self.selection.components
+
+    @property
+    def downscale(self) -> int:
+        """The side of the squares that photos were averaged over."""
+        return self.settings.downscale or 1
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of the file; the order of its keys is that of every version before."""
+        return {
+            "scene": str(self.scene),
+            "scene_kind": self.scene_kind,
+            "unit": self.unit,
+            "unit_source": self.unit_source,
+            "scene_fingerprint": self.scene_fingerprint,
+            "split_sha256": self.split_sha256,
+            "holdout": self.holdout,
+            "history": self.history,
+            "missing_photos": list(self.missing_photos),
+            "warnings": list(self.warnings),
+            "settings": self.settings.to_json(),
+            "selection": None if self.selection is None else self.selection.to_json(),
+            "versions": dict(self.versions),
+        }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "RunConfig":
+        """Read what `to_json` gave, or an earlier version.
+
+        Raises:
+            KeyError, TypeError, ValueError, AttributeError: it is something else.
+        """
+        settings, selection = TrainSettings.from_json(content.get("settings", {})), content.get("selection")
+        return cls(
+            settings=settings,
+            scene=Path(content.get("scene", "")),
+            selection=None if selection is None else Selection.from_json(selection, wanted=settings.components),
+            missing_photos=tuple(content.get("missing_photos", ())),
+            warnings=tuple(content.get("warnings", ())),
+            versions=content.get("versions") or {},
+            **{name: content.get(name) for name in _AS_THEY_ARE},
+        )
+
+
+_AS_THEY_ARE = ("scene_kind", "unit", "unit_source", "scene_fingerprint", "split_sha256", "holdout", "history")
+
+
+def write_config(run: Path, config: RunConfig) -> None:
+    """Write RUN/config.json.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    write_sealed(run / CONFIG, config.to_json())
+
+
+def read_config(run: Path) -> RunConfig:
+    """Read RUN/config.json.
+
+    Raises:
+        UserError: it is missing or damaged.
+    """
+    try:
+        return RunConfig.from_json(read_sealed(run / CONFIG))
+    except FileNotFoundError as error:
+        raise UserError(
+            f"{run} is not a run: it has no {CONFIG}", "give the folder that nerfcli train wrote"
+        ) from error
+    except UserError as error:
+        raise UserError(f"{run / CONFIG} cannot be read: {error.message}", MEND) from error
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{run / CONFIG} cannot be read: {error}", MEND) from error
+
+
+def split_hash(test_names: Iterable[str]) -> str:
+    """SHA-256 over the names of the held-out photos, in order: the same split has the same hash."""
+    return hashlib.sha256("\n".join(sorted(test_names)).encode()).hexdigest()

@@ -1,0 +1,187 @@
+"""A run: the folder that training wrote, as everything that comes after training sees it."""
+
+import hashlib
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from nerfcli.atomic import read_json
+from nerfcli.cameras.formats.run_cameras import RunCameras, read_cameras, read_given_cameras
+from nerfcli.errors import UserError
+from nerfcli.field.checkpoint import load_tensors
+from nerfcli.render.model import Model, load_model
+from nerfcli.runs.components import Components
+from nerfcli.runs.config import RunConfig, read_config, split_hash
+from nerfcli.runs.decisions import Decision
+from nerfcli.runs.files import CAMERAS, CONFIG, FIELD, METRICS, STATE
+from nerfcli.runs.log import LogEntry, TrainingSummary, read_log, summary_of
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene, fingerprint
+
+
+class Run:
+    """A run folder, read file by file as it is asked for, each file once.
+
+    Args:
+        path: the folder; nothing is read yet.
+
+    Every property raises a UserError where its file is missing or damaged.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})"
+
+    @cached_property
+    def config(self) -> RunConfig:
+        """RUN/config.json."""
+        return read_config(self.path)
+
+    @cached_property
+    def cameras(self) -> RunCameras:
+        """The frames that were trained on and those held out, with their cameras as the field knows them."""
+        return read_cameras(self.path)
+
+    @cached_property
+    def given_cameras(self) -> RunCameras:
+        """The same frames as the scene had them, before training refined their cameras."""
+        return read_given_cameras(self.path)
+
+    @cached_property
+    def log(self) -> list[LogEntry]:
+        """RUN/log.jsonl, as far as its lines are whole; empty if there is none."""
+        return read_log(self.path)
+
+    @property
+    def summary(self) -> TrainingSummary | None:
+        """What the training took; None without a log."""
+        return summary_of(self.log)
+
+    @property
+    def components(self) -> Components:
+        """The components of the model."""
+        return self.config.components
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """What the scene decided on; none where it was not asked."""
+        return () if self.config.selection is None else self.config.selection.decisions
+
+    @property
+    def field_path(self) -> Path:
+        """RUN/field.safetensors."""
+        return self.path / FIELD
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether there is a field."""
+        return self.field_path.exists()
+
+    @property
+    def metrics_path(self) -> Path:
+        """RUN/metrics.json."""
+        return self.path / METRICS
+
+    def model(self, device: str = "cpu") -> Model:
+        """Load the field with all that rendering needs; a call loads it again.
+
+        Raises:
+            UserError: it is missing or damaged.
+        """
+        return load_model(self.field_path, device)
+
+    def checkpoint_sha256(self) -> str:
+        """Hash of the field's file: metrics, renders and pages name the field by it.
+
+        Raises:
+            UserError: it cannot be read.
+        """
+        try:
+            return hashlib.sha256(self.field_path.read_bytes()).hexdigest()
+        except OSError as error:
+            hint = "train first, or give another run"
+            raise UserError(f"{self.field_path} cannot be read: {error.strerror}", hint) from error
+
+    def metrics(self) -> dict[str, Any] | None:
+        """What `evaluate` measured; None before it has.
+
+        Raises:
+            UserError: the file is damaged.
+        """
+        if not self.metrics_path.exists():
+            return None
+        hint = "measure again: nerfcli evaluate RUN --overwrite"
+        return read_json(self.metrics_path, needed=("mean",), hint=hint)
+
+    def check_split(self) -> None:
+        """Refuse cameras whose held-out photos are not those that were held out of the training.
+
+        Raises:
+            UserError: they are others.
+        """
+        if self.config.split_sha256 != split_hash(frame.name for frame in self.cameras.test):
+            raise UserError(
+                f"the held-out photos in {self.path / CAMERAS} are not those that {CONFIG} was written for "
+                "(split_sha256)",
+                "numbers on photos that may have been trained on mean nothing: train again with --overwrite",
+            )
+
+    def is_trained_from(self, scene: Scene, settings: TrainSettings) -> bool:
+        """Whether it was trained from this scene with these settings; threads and device aside, an automatic downscale
+        and contraction counting as whatever was chosen."""
+        wanted = {key: value for key, value in settings.to_json().items() if key not in ("device", "threads")}
+        for name in ("downscale", "contraction"):
+            if wanted[name] is None:
+                del wanted[name]
+        trained = self.config.settings.to_json()
+        return self.config.scene_fingerprint == fingerprint(scene) and all(
+            trained[key] == value for key, value in wanted.items()
+        )
+
+    def is_complete(self, settings: TrainSettings) -> bool:
+        """Whether training reached the budget, by its last checkpoint: the log of a killed training is ahead of it."""
+        if not self.is_trained:
+            return False
+        if (self.path / STATE).exists():
+            step, seconds = self.saved_progress()
+        elif log := self.log:  # the state was deleted to save space
+            step, seconds = log[-1]["step"], log[-1]["seconds"]
+        else:
+            return False
+        by_time = settings.budget_seconds is not None and seconds >= settings.budget_seconds
+        by_steps = settings.steps is not None and step >= settings.steps
+        return by_time or by_steps
+
+    def saved_progress(self) -> tuple[int, float]:
+        """Steps and training seconds of the last checkpoint.
+
+        Raises:
+            UserError: it cannot be read.
+        """
+        _, description = load_tensors(self.path / STATE, "cpu")
+        return description["step"], description["totals"]["seconds"]
+
+
+def load_run(path: str | Path) -> Run:
+    """Open a run folder.
+
+    Example:
+        >>> import nerfcli
+        >>> run = nerfcli.load_run("photos-scene-run")
+        >>> run.config.settings.seed, run.summary.seconds, run.components.background
+        >>> model = run.model()
+
+    Args:
+        path: the folder that `train_scene` or `nerfcli train` wrote.
+
+    Returns:
+        The run; its configuration and cameras have been read, the field is loaded by `Run.model`.
+
+    Raises:
+        UserError: it is no run, or damaged.
+    """
+    run = Run(Path(path))
+    _ = run.config, run.cameras
+    return run

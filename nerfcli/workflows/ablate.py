@@ -1,0 +1,151 @@
+"""From a scene to what each component is worth on it: every variant with every seed, trained and measured."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli import scene as scenes
+from nerfcli.ablate.results import RUNS, Measured, refuse_foreign, rows_of, write_results
+from nerfcli.ablate.variants import AUTO, CHOSEN, Capture, Variant, variants
+from nerfcli.cameras.formats.colmap import parse_colmap
+from nerfcli.errors import UserError
+from nerfcli.evaluate.run_photos import held_out_photos_of
+from nerfcli.evaluate.sampled import SampledPixels
+from nerfcli.media.images import read_image
+from nerfcli.photos.exif_exposure import mean_log_exposure, relative_log_exposures
+from nerfcli.runs.files import STATE
+from nerfcli.runs.run import Run
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene, model_folder
+from nerfcli.workflows.evaluate import evaluate_run
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.workflows.train import train_scene, was_interrupted
+
+_SAME = "; the same pixels for all models of a seed, others for each seed"
+
+# Takes a run, its variant's name and its settings, and whether to measure anew.
+Measure = Callable[[Run, str, TrainSettings, bool], Measured]
+
+
+def ablate_scene(
+    path: Path,
+    folder: Path,
+    settings: TrainSettings,
+    *,
+    seeds: int,
+    only: tuple[str, ...] = (),
+    whole: bool = False,
+    holdout: str | None = None,
+    memory_bytes: int | None = None,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    warn: Notify = warn_python,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
+    """Train every variant with every seed, or what is left of it, measure it, and write the table after each.
+
+    Args:
+        path: the scene.
+        folder: takes the table and the runs.
+        settings: of all trainings; `model` "auto" has the scene decide first.
+        seeds: how many, from that of the settings on.
+        only: components to vary; all where there are none.
+        whole: measure whole held-out photos as `evaluate_run` does, not random pixels of them.
+        holdout: see `train_scene`.
+        memory_bytes: that a training may have resident.
+        overwrite: train and measure again what is there.
+        notify, warn: take lines for the user.
+        progress: takes the share of the trainings that is done.
+
+    Returns:
+        The content of ablation.json.
+
+    Raises:
+        UserError: see `nerfcli.train.loop.train`; nothing is held out, or something else stands at the folder.
+    """
+    scene = scenes.load(path, holdout=holdout)
+    if not scene.test_frames:
+        raise UserError(f"{path} has no held-out photo to measure on", "hold some out: --holdout every:8")
+    refuse_foreign(folder)
+    measure = _measured_whole if whole else _measured_pixels
+
+    def trained(name: str, settings: TrainSettings) -> Run:
+        """A run with these settings, trained now or by an earlier call."""
+        target = folder / RUNS / f"{name}-{settings.seed}"
+        resume = not overwrite and was_interrupted(path, target, settings, holdout=holdout)
+        run = train_scene(
+            path,
+            target,
+            settings,
+            memory_bytes=memory_bytes,
+            resume=resume,
+            overwrite=overwrite,
+            holdout=holdout,
+            warn=warn,
+        )
+        # Three times as large as the field, and nobody resumes from here.
+        (target / STATE).unlink(missing_ok=True)
+        return run
+
+    about = {"scene": str(path), "settings": settings.to_json(), "complete": False}
+    measured: list[Measured] = []
+    compared: list[Variant] = []
+    rows = rows_of(measured, compared)
+    write_results(folder, rows, measured, about)
+    if settings.model == "auto":
+        progress(0.0, "asking the scene which components it needs")
+        run = trained(AUTO, settings)
+        compared.append(Variant(AUTO, settings.components))
+        measured.append(measure(run, AUTO, settings, overwrite))
+        settings = replace(settings, model="default", components=run.components, fixed=())
+        about["chosen"] = settings.components.to_json()
+        notify(_line(measured[-1]))
+    models = [Variant(CHOSEN, settings.components)]
+    models += variants(settings.components, _capture(scene), only=only)
+    compared[:0] = models
+    todo = [(seed, one) for seed in range(settings.seed, settings.seed + seeds) for one in models]
+    for number, (seed, variant) in enumerate(todo):
+        progress(number / len(todo), f"{variant.name}, seed {seed} ({number + 1} of {len(todo)})")
+        wanted = replace(settings, components=variant.components, seed=seed)
+        measured.append(measure(trained(variant.name, wanted), variant.name, wanted, overwrite))
+        notify(_line(measured[-1]))
+        about["complete"] = number + 1 == len(todo)
+        rows = rows_of(measured, compared)
+        write_results(folder, rows, measured, about)
+    return {"rows": [vars(row) for row in rows], **about}
+
+
+def _capture(scene: Scene) -> Capture:
+    """What the scene offers to components."""
+    first, sparse = scene.train_frames[0].image, model_folder(scene.root)
+    seen = parse_colmap(sparse).observations if sparse is not None else None
+    exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
+    return Capture(
+        has_alpha=first is not None and read_image(first).shape[-1] == 4,
+        has_points=seen is not None and len(seen.pixels) > 0,
+        has_exif=bool(np.ptp(exif) > 0.0),
+    )
+
+
+def _measured_whole(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> Measured:
+    """Whole photos, by the protocol of `evaluate_run`: now, or by an earlier call."""
+    metrics = evaluate_run(run.path, device=settings.device, threads=settings.threads, overwrite=overwrite).metrics
+    mean, training, protocol = metrics["mean"], metrics["training"], metrics["protocol"]
+    return Measured(name, settings.seed, mean["psnr"], mean["ssim"], training["seconds"], training["steps"], protocol)
+
+
+def _measured_pixels(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> Measured:
+    """Random pixels of the held-out photos: the same for all models of a seed."""
+    model, last = run.model(settings.device), run.log[-1]
+    photos = held_out_photos_of(run.config, run.cameras.test, model, threads=settings.threads)
+    sample = SampledPixels.drawn(photos, seed=settings.seed)
+    return Measured(
+        name, settings.seed, sample.psnr(model), None, last["seconds"], last["step"], f"{sample.protocol()}{_SAME}"
+    )
+
+
+def _line(entry: Measured) -> str:
+    return f"{entry.variant}, seed {entry.seed}: {entry.psnr:.2f} dB after {entry.seconds:.0f} s, {entry.steps} steps"

@@ -1,0 +1,162 @@
+"""From a capture in one format to another, proved; or to the convention that it follows."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from nerfcli.cameras.frame import Capture
+from nerfcli.cameras.orientation import rescaling_told
+from nerfcli.convert import detect
+from nerfcli.convert.conversion import Conversion, Doubt, Wanted, convert, load
+from nerfcli.convert.formats import Format, Given, recording
+from nerfcli.convert.pixels import STORED, in_pixels, other_sizes
+from nerfcli.convert.world_frame import WorldFrame, in_world_frame
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A conversion: what was done, and its record as plain values."""
+
+    conversion: Conversion
+    record: dict[str, Any]
+
+
+def convert_capture(
+    source: Path,
+    target: Path,
+    wanted: Wanted,
+    *,
+    given: Given = Given(),
+    doubt: Doubt = Doubt(),
+    world: WorldFrame = WorldFrame(),
+    notify: Notify = silent,
+    warn: Notify = warn_python,
+) -> Converted:
+    """Convert one capture.
+
+    Args:
+        source: a file or folder in a known format.
+        target: the file or folder to write.
+        wanted: format and conventions of the target.
+        given: photos and cameras that the source does not name.
+        doubt: conventions of the source, where they are not those of its format.
+        world: the world frame of the target.
+        notify, warn: take lines for the user.
+
+    Raises:
+        UserError: it cannot be read or written, the format cannot hold it, or what was written is not the same.
+    """
+    to = wanted.form.name
+    form, found, capture = load(source, given, doubt)
+    notify(f"{found}: {form.name}, {contents(capture)}")
+    for text in rescaling_told(other_sizes(capture)):
+        notify(f"{text.removesuffix(': rescaled')}; {to} gets them as they are")
+    capture, new_from_old, scale = in_world_frame(capture, world)
+    if scale is not None:
+        error = "" if scale.standard_error is None else f" +- {scale.standard_error:.2g}"
+        unit = "%" if scale.residual_unit == "percent" else "m"
+        notify(
+            f"a unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; "
+            f"residual {scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
+        )
+    frame = {"new_from_old": new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
+    wanted = replace(wanted, form=recording(wanted.form, {"source": str(found), **frame}))
+    done = convert(capture, target, source_format=form.name, wanted=wanted)
+    for text in done.notes:
+        notify(text)
+    for loss in done.losses:
+        warn(f"{to} cannot hold {loss}")
+    if done.loss_px > wanted.tolerance_px:
+        warn(f"without the lost terms of lenses, pixels are off by up to {done.loss_px:.3g} px")
+    return Converted(done, _record(done, to) | frame)
+
+
+def detect_convention(
+    source: Path,
+    *,
+    given: Given = Given(),
+    doubt: Doubt = Doubt(),
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> tuple[Format, detect.Detection]:
+    """Return the format of a capture, and which convention its numbers follow.
+
+    Raises:
+        UserError: it cannot be read, or there is too little to judge by.
+    """
+    form, found, capture = load(source, given, doubt)
+    notify(f"{found}: {form.name}, {contents(capture)}")
+    return form, detect.detect(in_pixels(capture, STORED).capture, axes=form.axes, progress=progress)
+
+
+def options_of(found: detect.Detection) -> str:
+    """Return the options that make `nerfcli convert` read the capture in the convention that was found."""
+    convention, declared = found.convention, found.declared
+    options = [] if convention.axes == declared.axes else [f"--from-axes {convention.axes}"]
+    options += ["--from-inverted"] if convention.inverted else []
+    options += [f"--from-pixel-center {convention.pixel_centre:g}"] if convention.pixel_centre != 0.5 else []
+    options += [f"--from-size {convention.intrinsics_scale:g}"] if convention.intrinsics_scale != 1 else []
+    return " ".join(options)
+
+
+def detection_record(found: detect.Detection, form: str) -> dict[str, Any]:
+    """Return what was found as plain values."""
+    return {
+        "format": form,
+        "evidence": found.evidence,
+        "as_format_says": found.as_format_says,
+        "options": options_of(found),
+        "questions": [
+            {
+                "question": question.name,
+                "verdict": question.verdict,
+                "ratio": question.ratio,
+                "reason": question.reason,
+                "hypotheses": [
+                    {
+                        "axes": answer.convention.axes,
+                        "inverted": answer.convention.inverted,
+                        "pixel_centre": answer.convention.pixel_centre,
+                        "intrinsics_scale": answer.convention.intrinsics_scale,
+                        "as_format_says": answer.as_format_says,
+                        "median_px": None if answer.median_px == float("inf") else answer.median_px,
+                        "inlier_share": answer.inlier_share,
+                    }
+                    for answer in question.answers
+                ],
+            }
+            for question in found.questions
+        ],
+    }
+
+
+def contents(capture: Capture) -> str:
+    """Return what a capture holds, in a few words."""
+    cameras = len({frame.camera for frame in capture.frames})
+    return f"{len(capture.frames)} images, {cameras} camera{'s' * (cameras != 1)}, {len(capture.points)} points"
+
+
+def _record(done: Conversion, to: str) -> dict[str, Any]:
+    checked = done.verification
+    return {
+        "from": done.source_format,
+        "to": to,
+        "images": len(done.capture.frames),
+        "cameras": len({frame.camera for frame in done.capture.frames}),
+        "points": len(done.capture.points),
+        "losses": list(done.losses),
+        "loss_px": done.loss_px,
+        "verification": None
+        if checked is None
+        else {
+            "projections": checked.num_projections,
+            "points": checked.num_points,
+            "max_px": checked.max_px,
+            "max_deg": checked.max_deg,
+            "max_centre_shift": checked.max_centre_shift,
+            "max_point_shift": checked.max_point_shift,
+            "tolerance_px": checked.tolerance_px,
+            "same": list(checked.parts),
+        },
+    }

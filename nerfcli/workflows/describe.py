@@ -1,0 +1,57 @@
+"""What a folder or a file is, as plain values: scenes, runs, renders, depth, pictures, videos, states of a training.
+
+Imports stand where they are needed: what a depth file holds is told without torch.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from nerfcli.media.facts import RENDERS, file_facts, renders_facts
+
+
+def describe(path: str | Path) -> dict[str, Any]:
+    """Return the facts of a file of depth, pictures or video, of renders, or of a run; else of a scene.
+
+    Raises:
+        UserError: it is none of these, or damaged.
+    """
+    folder = Path(path)
+    if folder.name == RENDERS:
+        folder = folder.parent
+    if folder.is_file() and folder.suffix == ".safetensors":
+        from nerfcli.workflows.describe_run import describe_tensors
+
+        return describe_tensors(folder)
+    if folder.is_file() and folder.suffix.lower() != ".json":
+        return file_facts(folder)
+    if (folder / RENDERS).exists():
+        return renders_facts(folder)
+    from nerfcli.runs.files import CONFIG
+
+    if not (folder / CONFIG).exists():
+        return _describe_scene(folder)
+    from nerfcli.runs.run import Run
+    from nerfcli.workflows.describe_run import describe_run
+
+    return describe_run(Run(folder))
+
+
+def _describe_scene(folder: Path) -> dict[str, Any]:
+    from nerfcli import scene as scenes
+    from nerfcli.cameras.orientation import rescaling_told
+
+    scene = scenes.load(folder)
+    cameras = {frame.camera for frame in scene.frames}
+    return {
+        "kind": scene.kind,
+        "photos": len(scene.frames),
+        "held_out": len(scene.test_frames),
+        "missing": len(scene.missing),
+        "cameras": [f"{c.model} {c.width}x{c.height} focal {c.focal_px:.1f} px" for c in list(cameras)[:5]],
+        "camera_count": len(cameras),
+        "rescaled": rescaling_told(scene.rescaled),
+        "points": len(scene.points),
+        "unit": scene.unit,
+        "unit_source": scene.unit_source,
+        "fingerprint": scenes.fingerprint(scene),
+    }

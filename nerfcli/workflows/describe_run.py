@@ -1,0 +1,94 @@
+"""What a run or a file of tensors is, as plain values: settings, decisions, numbers, costs."""
+
+from pathlib import Path
+from typing import Any
+
+from nerfcli.field.checkpoint import load_tensors
+from nerfcli.field.comparison import described_cost, others_of_equal_storage
+from nerfcli.field.cost import field_bytes
+from nerfcli.render.model import Model
+from nerfcli.runs.camera_moves import camera_moves
+from nerfcli.runs.run import Run
+from nerfcli.train.footprint import pixel_footprint
+from nerfcli.train.sentinel import FAILURE_FORMAT, replay
+
+
+def describe_run(run: Run) -> dict[str, Any]:
+    """Return the facts of a run."""
+    config, cameras = run.config, run.cameras
+    settings = config.settings.to_json()
+    content: dict[str, Any] = {
+        "kind": "run",
+        "scene": str(config.scene),
+        "photos": len(cameras.train),
+        "held_out": len(cameras.test),
+        "unit": config.unit,
+        "unit_source": config.unit_source,
+        "settings": {name: value for name, value in settings.items() if name != "components"},
+        "components": run.components.to_json(),
+        "decisions": [decision.in_words() for decision in run.decisions],
+        "versions": config.versions,
+    }
+    if run.log:
+        content |= {key: run.log[-1].get(key) for key in ("step", "seconds", "loss", "samples_per_second")}
+    if run.is_trained:
+        model = run.model()
+        content |= {
+            "field": model.field.settings.to_json(),
+            "field_bytes": field_bytes(model.field),
+            "occupied_share": round(model.occupied.float().mean().item(), 4),
+            "contraction": model.contraction,
+            "cost": costs_of_run(run, model),
+        }
+        if run.components.cameras != "fixed":
+            radius = 1.0 / model.training_from_scene.scale
+            content["cameras_moved"] = camera_moves(run.given_cameras.train, cameras.train, radius=radius)
+    if (metrics := run.metrics()) is not None:
+        content["metrics"] = metrics["mean"]
+    return content
+
+
+def costs_of_run(run: Run, model: Model) -> dict[str, dict[str, Any]]:
+    """Return what the field costs, beside fields of the other kinds of equal storage; see `comparison.described_cost`.
+
+    Args:
+        run: its settings, cameras and how many samples a ray had at last.
+        model: of the run.
+
+    Returns:
+        By kind, the run's own first: size, bytes, operations and memory traffic.
+    """
+    factor, log = run.config.downscale, run.log
+    camera = run.cameras.train[0].camera
+    rays = log[-1]["rays"] if log else 0
+    samples_per_ray = log[-1]["samples"] / rays if rays else 1.0
+    own = model.field.settings
+    footprint = pixel_footprint(run.cameras.train, model.training_from_scene) * factor
+    return {
+        size.kind: {
+            "settings": size.to_json(),
+            **described_cost(
+                size,
+                occupancy_side=len(model.occupied),
+                batch=run.config.settings.samples_per_step,
+                samples_per_ray=samples_per_ray,
+                picture_px=(camera.width // factor) * (camera.height // factor),
+            ),
+        }
+        for size in (own, *others_of_equal_storage(own, footprint).values())
+    }
+
+
+def describe_tensors(path: Path) -> dict[str, Any]:
+    """A field, the state of a training, or the state before a failure, whose step is taken again."""
+    tensors, description = load_tensors(path, "cpu")
+    facts: dict[str, Any] = {
+        "kind": description.get("format"),
+        "bytes": path.stat().st_size,
+        "tensors": {name: f"{str(tensor.dtype)[6:]} {list(tensor.shape)}" for name, tensor in tensors.items()},
+    }
+    if description.get("format") != FAILURE_FORMAT:
+        return facts
+    _, bad = replay(path)
+    again = None if bad is None else f"{bad.name}: {bad.count} of {bad.total} numbers"
+    return {**facts, "failure": description["told"], "pixels": description["pixels"], "repeated_now": again}

@@ -1,0 +1,179 @@
+"""From a run to its numbers on held-out photos: measure them, or keep those of this very checkpoint."""
+
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerfcli.atomic import atomic_folder, clear_leftovers, read_json, write_json
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import GATE_NOT_MET, UserError
+from nerfcli.evaluate.ledger import leak_ledger
+from nerfcli.evaluate.perceptual import find_perceptual
+from nerfcli.evaluate.predictions import (
+    INFO,
+    PREDICTIONS,
+    predictions_are_there,
+    save_compared,
+    save_unrounded,
+)
+from nerfcli.evaluate.protocol import PROTOCOL, Compared, Extras, evaluate_model
+from nerfcli.evaluate.requirements import Requirement, known_numbers, unmet
+from nerfcli.evaluate.run_photos import held_out_photos_of, training_billboards
+from nerfcli.export.names import file_names
+from nerfcli.runs.files import LOG
+from nerfcli.runs.run import Run
+from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Numbers of a run.
+
+    Args:
+        path: RUN/metrics.json.
+        metrics: its content: protocol, means, values per photo, and what else `nerfcli evaluate --help` lists.
+        is_kept: whether the file was there already.
+    """
+
+    path: Path
+    metrics: dict[str, Any]
+    is_kept: bool
+
+
+def evaluate_run(
+    run: str | Path,
+    *,
+    device: str = "auto",
+    threads: int = 0,
+    overwrite: bool = False,
+    align_poses: bool = False,
+    predictions: str | None = None,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> Evaluation:
+    """Write RUN/metrics.json, or keep the one that this very checkpoint already has.
+
+    Example:
+        >>> import nerfcli
+        >>> evaluation = nerfcli.evaluate_run("photos-scene-run")
+        >>> evaluation.metrics["mean"]["psnr"]
+
+    Args:
+        run: the folder that `train_scene` wrote.
+        device: "auto", "cpu" or "cuda".
+        threads: of the CPU; 0 for all.
+        overwrite: measure again.
+        align_poses: also from a pose refined on the left half of each photo, measured on the right.
+        predictions: "png" saves what was compared in RUN/predictions, "float" unrounded, too; None saves nothing.
+        notify: takes lines for the user.
+        progress: takes the share of the photos that is done, and a few words.
+
+    Raises:
+        UserError: the folder is no run, its split is not the one it was trained with, a photo cannot be read, or
+            metrics of another state or without what is wanted stand there.
+    """
+    trained = Run(Path(run))
+    cores, torch_device = thread_count(threads), device_name(device)
+    torch.set_num_threads(cores)
+    trained.check_split()
+    clear_leftovers(trained.path)
+    model = trained.model(torch_device)
+    checkpoint = model.sha256
+    assert checkpoint is not None
+    if trained.metrics_path.exists() and not overwrite:
+        metrics = _kept(trained.metrics_path, checkpoint, align_poses=align_poses, predictions=predictions)
+        made_by = metrics["protocol"].split(":")[0]
+        older = "" if made_by == PROTOCOL else f" (by {made_by})"
+        notify(f"{trained.metrics_path} is kept{older}; --overwrite measures again")
+        return Evaluation(trained.metrics_path, metrics, is_kept=True)
+
+    summary = trained.summary
+    if summary is None:
+        raise UserError(
+            f"{trained.path} has no {LOG}, which tells the time of the training", "train again with --overwrite"
+        )
+    test = trained.cameras.test
+    held_out = held_out_photos_of(trained.config, test, model, threads=cores)
+    perceptual = find_perceptual(notify)
+    billboards = training_billboards(trained, notify=notify)
+    progress(0.0, "")
+    with saved_predictions(trained.path, test, predictions, checkpoint=checkpoint) as keep:
+        metrics = evaluate_model(
+            model,
+            held_out,
+            on_image=lambda done, total: progress(done / total, f"{done}/{total} rays"),
+            extras=Extras(trained.cameras.train, perceptual, billboards, align_poses, keep),
+        )
+    metrics["training"] = summary.to_json()
+    metrics["ledger"] = [entry.to_json() for entry in leak_ledger(trained.config)]
+    metrics["holdout"] = trained.config.holdout
+    metrics["split_sha256"] = trained.config.split_sha256
+    metrics["device"] = f"{torch_device}, {cores} threads, {platform.machine()}"
+    metrics["checkpoint_sha256"] = checkpoint
+    write_json(trained.metrics_path, metrics)
+    return Evaluation(trained.metrics_path, metrics, is_kept=False)
+
+
+def check_requirements(run: Run, metrics: dict[str, Any], requirements: Sequence[Requirement]) -> None:
+    """Raise if a requirement is not met.
+
+    Raises:
+        UserError: with the exit code of gates.
+    """
+    failures = unmet(requirements, known_numbers(metrics, run.config)) if requirements else []
+    if failures:
+        raise UserError(
+            f"{run.path} does not meet --require {', '.join(failures)}",
+            "train longer (--budget, --resume), or find out with `nerfcli doctor` what the photos lack",
+            GATE_NOT_MET,
+        )
+
+
+@contextmanager
+def saved_predictions(
+    run: Path, frames: Sequence[Frame], kind: str | None, *, checkpoint: str
+) -> Iterator[Callable[[Compared], None]]:
+    """Yield what takes each comparison and writes it below RUN/predictions, which appears when all are there.
+
+    Args:
+        run: the run's folder.
+        frames: the held-out frames.
+        kind: one of `evaluate.predictions.KINDS`; None to save nothing.
+        checkpoint: the hash of the field.
+    """
+    if kind is None:
+        yield lambda compared: None
+        return
+    stems = dict(zip((frame.name for frame in frames), file_names(frames), strict=True))
+    with atomic_folder(run / PREDICTIONS) as folder:
+
+        def keep(compared: Compared) -> None:
+            save_compared(folder, stems[compared.frame.name], compared)
+            if kind == "float":
+                save_unrounded(folder, stems[compared.frame.name], compared)
+
+        yield keep
+        write_json(folder / INFO, {"checkpoint_sha256": checkpoint, "kind": kind, "files": stems})
+
+
+def _kept(path: Path, checkpoint: str, *, align_poses: bool, predictions: str | None) -> dict[str, Any]:
+    """The metrics that are there, if they are of this checkpoint and have all that is wanted."""
+    metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to measure again")
+    if metrics.get("checkpoint_sha256") != checkpoint:
+        raise UserError(f"{path} belongs to an earlier state of this run", "add --overwrite to replace it")
+    lacks = []
+    if align_poses and "psnr_pose_aligned" not in metrics["mean"]:
+        lacks.append("refined poses")
+    if predictions is not None and not predictions_are_there(
+        path.with_name(PREDICTIONS), predictions, checkpoint=checkpoint
+    ):
+        lacks.append("saved predictions")
+    if lacks:
+        raise UserError(f"{path} was made without {' and '.join(lacks)}", "add --overwrite to measure again")
+    return metrics

@@ -1,0 +1,22 @@
+"""How a workflow reports: lines for the user, warnings, progress; silent, but for warnings, where nobody says how."""
+
+import warnings
+from collections.abc import Callable
+
+# Takes a line for the user.
+Notify = Callable[[str], None]
+# Takes how much is done, in [0, 1], and a few words about it, as often as one likes.
+Progress = Callable[[float, str], None]
+
+
+def silent(text: str) -> None:
+    """Drop a line."""
+
+
+def no_progress(share: float, detail: str) -> None:
+    """Show no progress."""
+
+
+def warn_python(text: str) -> None:
+    """Warn as Python programs do, by `warnings.warn`."""
+    warnings.warn(text, stacklevel=3)

@@ -1,0 +1,176 @@
+"""From photos or a video to a scene: estimate poses, keep a scene that is already there, or refuse to touch another."""
+
+from pathlib import Path
+
+from nerfcli.convert.intrinsics import read_calibration
+from nerfcli.errors import UserError
+from nerfcli.poses import structure_from_motion
+from nerfcli.poses.cameras import USES, GivenIntrinsics
+from nerfcli.poses.plan import Outlook, Plan, duration
+from nerfcli.poses.settings import Limits, PoseSettings
+from nerfcli.poses.structure_from_motion import is_same_scene, plan_poses
+from nerfcli.poses.video_frames import extract_frames, frames_folder
+from nerfcli.scene import SCENE_FILE
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+
+NAMES_SHOWN = 8
+_STAGES = {
+    "read": "photos read",
+    "extract": "photos searched for features",
+    "enlarge": "photos searched for finer features",
+    "pair": "photos looked up",
+    "match": "pairs compared",
+    "map": "photos placed",
+    "check": "checks of the poses",
+}
+
+
+def estimate_poses(
+    photos: str | Path,
+    scene: str | Path,
+    settings: PoseSettings = PoseSettings(),
+    *,
+    limits: Limits = Limits(),
+    intrinsics: GivenIntrinsics | None = None,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    warn: Notify = warn_python,
+    progress: Progress = no_progress,
+) -> Path:
+    """Estimate the poses of one scene, or keep the one that was made from the same photos with the same settings.
+
+    Example:
+        >>> import nerfcli
+        >>> folder = nerfcli.estimate_poses("photos", "photos-scene")
+        >>> len(nerfcli.load_scene(folder).train_frames)
+
+    Args:
+        photos: a folder of photos; for a video see `folder_of_photos`.
+        scene: the folder to write.
+        settings: features, pairs, seed, threads; by default those of `nerfcli poses`.
+        limits: of memory and time.
+        intrinsics: of the cameras, where they are known; see `given_intrinsics`.
+        overwrite: replace another scene at `scene`.
+        notify, warn: take lines for the user.
+        progress: takes the share that is done and a few words.
+
+    Returns:
+        The folder of the scene.
+
+    Raises:
+        UserError: see `nerfcli.poses.structure_from_motion.estimate_poses`; or something else stands at `scene`.
+    """
+    folder, target = Path(photos), Path(scene)
+    if (target / SCENE_FILE).exists() and not overwrite:
+        if is_same_scene(target, folder, settings, given=intrinsics):
+            notify(f"{target} is kept: it was made from these photos; --overwrite makes it again")
+            return target
+        raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another place with -o")
+    outlook: Outlook | None = None
+
+    def planned(plan: Plan) -> None:
+        nonlocal outlook
+        notify(plan.describe())
+        outlook = Outlook(plan)
+
+    def on_stage(stage: str, done: int, total: int) -> None:
+        share, left = (0.0, None) if outlook is None else outlook.update(stage, done, total)
+        about = "" if left is None else f", about {duration(left)} left"
+        progress(share, f"({done} of {total} {_STAGES[stage]}{about})")
+
+    report = structure_from_motion.estimate_poses(
+        folder,
+        target,
+        settings=settings,
+        notify=notify,
+        progress=on_stage,
+        limits=limits,
+        planned=planned,
+        given=intrinsics,
+    )
+    left_out = [image for image in report.images if not image.registered]
+    for image in left_out[:NAMES_SHOWN]:
+        warn(f"{image.name} was not registered: {image.reason}")
+    if len(left_out) > NAMES_SHOWN:
+        warn(f"{len(left_out) - NAMES_SHOWN} more are listed in {target / 'poses_report.json'}")
+    notify(
+        f"{target}: {report.registered} of {report.total} photos registered in {report.seconds['total']:.0f} s, "
+        f"mean reprojection error {report.mean_reprojection_error_px:.2f} px"
+    )
+    return target
+
+
+def plan_scene(
+    folder: Path,
+    settings: PoseSettings,
+    *,
+    intrinsics: GivenIntrinsics | None = None,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> Plan:
+    """Return what `estimate_poses` would do with a folder of photos, and how long it takes.
+
+    Raises:
+        UserError: see `plan_poses`.
+    """
+    _, grouped, _, plan = plan_poses(
+        folder,
+        settings=settings,
+        progress=lambda stage, done, total: progress(done / max(total, 1), _STAGES[stage]),
+        given=intrinsics,
+    )
+    for note in grouped.notes:
+        notify(note)
+    return plan
+
+
+def without_suffix(source: Path) -> Path:
+    """Return what results are named after: clip for clip.mp4, the folder itself for a folder."""
+    return source.with_suffix("") if source.is_file() else source
+
+
+def folder_of_photos(
+    source: Path,
+    scene: Path,
+    *,
+    frames: int | None = None,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> Path:
+    """Return the folder of photos: `source` itself, or the one beside `scene` with the frames of the video that it is.
+
+    Raises:
+        UserError: see `extract_frames`.
+    """
+    if not source.is_file():
+        if frames is not None:
+            notify(f"{source} is no video: all of its photos are used, whatever --frames says")
+        return source
+    folder = frames_folder(scene)
+    extract_frames(source, folder, count=frames, overwrite=overwrite, notify=notify, progress=progress)
+    return folder
+
+
+def folder_with_frames(source: Path, scene: Path) -> Path:
+    """Return the folder of photos, `source` itself, or the one with the frames of a video that were written before.
+
+    Raises:
+        UserError: a video's frames are not there.
+    """
+    folder = frames_folder(scene) if source.is_file() else source
+    if source.is_file() and not folder.exists():
+        raise UserError(
+            f"--dry-run: the frames of {source} are not in {folder} yet, and a dry run writes nothing",
+            "call it without --dry-run, or give a folder of photos",
+        )
+    return folder
+
+
+def given_intrinsics(file: Path | None, photos: Path, *, use: str = USES[0]) -> GivenIntrinsics | None:
+    """Return the intrinsics of a file, for the photos of a folder; None without a file.
+
+    Raises:
+        UserError: see `read_calibration`.
+    """
+    return None if file is None else GivenIntrinsics(read_calibration(file, images=photos), use)

@@ -1,0 +1,109 @@
+"""From a run to pictures, depth maps and videos: render them, go on, or keep what is there."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nerfcli.errors import UserError
+from nerfcli.export.frames import Workers, automatic_workers, export_frames, export_part
+from nerfcli.export.order import Order, refuse_foreign
+from nerfcli.export.settings import OUTPUTS, ExportSettings
+from nerfcli.render.depth import DepthRequest
+from nerfcli.runs.run import Run
+from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.views import Views, chosen_frames, refuse_z_all_around
+
+RENDERS = "renders"
+HELD_OUT = Views("test")
+# Colours, depths and opacities, as `nerfcli render` writes them by default.
+USUAL = ExportSettings(outputs=OUTPUTS[:3], depth=DepthRequest(convention="conditional", axis="z"))
+
+
+def folder_name(views: Views, settings: ExportSettings) -> str:
+    """The folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
+    if not settings.measured:
+        return views.name
+    return f"{views.name}-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}"
+
+
+def render_run(
+    run: str | Path,
+    target: str | Path | None = None,
+    *,
+    views: Views = HELD_OUT,
+    settings: ExportSettings = USUAL,
+    device: str = "auto",
+    threads: int = 0,
+    step: float = 1.0,
+    jobs: int = 0,
+    part: slice | None = None,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> list[Path]:
+    """Render views of a run into a folder, or keep what stands there if it is the same.
+
+    Example:
+        >>> import nerfcli
+        >>> from nerfcli.workflows.views import Views
+        >>> nerfcli.render_run("photos-scene-run", views=Views("orbit", count=120))
+
+    Args:
+        run: the folder that `train_scene` wrote.
+        target: the folder to write; in RUN/renders by default, named after views and depth.
+        views: which cameras; the held-out ones by default.
+        settings: outputs, depth, files, videos, and how much work goes into a picture.
+        device: "auto", "cpu" or "cuda".
+        threads: of the CPU; 0 for all.
+        step: length of the steps along rays, in those of the training.
+        jobs: processes; 0 for `automatic_workers`.
+        part: render these views alone, for a later call to find them.
+        overwrite: replace what stands at `target`.
+        notify: takes lines for the user.
+        progress: takes the share of the pixels that is done, and a few words.
+
+    Returns:
+        The paths to show: videos, or the folders of the outputs; the unfinished folder where only a part is rendered.
+
+    Raises:
+        UserError: no such run, no such cameras, or other files stand at `target`.
+    """
+    trained, cores, torch_device = Run(Path(run)), thread_count(threads), device_name(device)
+    folder = trained.path / RENDERS / folder_name(views, settings) if target is None else Path(target)
+    torch.set_num_threads(cores)
+    model = trained.model(torch_device).stretched(step)
+    if settings.depth.convention == "background" and settings.depth.background_distance is None:
+        farthest = model.marching.far / model.training_from_scene.scale
+        settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
+    # The unit of the training frame is about the distance between the cameras and what they look at.
+    frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
+    if "depth" in settings.outputs and settings.depth.axis == "z":
+        refuse_z_all_around(frames, notify=notify)
+    provenance: dict[str, Any] = {"cameras": views.cameras, "run": trained.path.name, "field_sha256": model.sha256}
+    if step != 1.0:
+        provenance["step"] = step
+    order = Order(tuple(frames), settings, provenance)
+    chosen = range(len(frames))[part] if part is not None else range(len(frames))
+    if not chosen:
+        raise UserError(f"--frames: there are {len(frames)} views", "count from 0", exit_code=2)
+    refuse_foreign(folder)
+    if not overwrite and order.is_held_by(folder):
+        notify(f"{folder} is kept: it was rendered with these settings; --overwrite renders again")
+        return order.results(folder)
+
+    total = sum(frames[index].camera.width * frames[index].camera.height for index in chosen)
+    done = 0
+
+    def on_rays(rays: int) -> None:
+        nonlocal done
+        done += rays
+        progress(done / total, f"{len(chosen)} frames")
+
+    progress(0.0, "")
+    workers = Workers(jobs, cores) if jobs else automatic_workers(total, device=torch_device, threads=cores)
+    if part is not None:
+        return [export_part(model, order, folder, chosen, on_rays=on_rays, notify=notify, workers=workers)]
+    return export_frames(model, order, folder, on_rays=on_rays, notify=notify, workers=workers)

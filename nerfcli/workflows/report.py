@@ -1,0 +1,91 @@
+"""From runs to one page about them, for which held-out photos are rendered anew."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from nerfcli.errors import UserError
+from nerfcli.evaluate.run_photos import held_out_photos_of
+from nerfcli.export.settings import depth_meta
+from nerfcli.pages.page import is_made_from, refuse_foreign, write_page
+from nerfcli.render.depth import DepthRequest
+from nerfcli.report.facts import labels_of, read_facts
+from nerfcli.report.page import mark_of, origin_of, page_html
+from nerfcli.report.views import common_names, look_at
+from nerfcli.runs.files import REPORT
+from nerfcli.runs.run import load_run
+from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+
+# Held-out photos on a page, unless somebody says how many.
+VIEWS = 8
+DEPTH = DepthRequest(convention="conditional", axis="z")
+
+
+def report_runs(
+    runs: Sequence[Path],
+    page: Path | None = None,
+    *,
+    views: int = VIEWS,
+    depth: DepthRequest = DEPTH,
+    device: str = "auto",
+    threads: int = 0,
+    overwrite: bool = False,
+    keep: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> Path:
+    """Write a page about one run or several, and return its path.
+
+    Args:
+        runs: folders that training wrote, at least one.
+        page: the file; RUN/report.html by default, beside the first run where there are several.
+        views: held-out photos to show at most, from the worst to the best.
+        depth: the depth that is shown.
+        device, threads: to render with; 0 threads for all.
+        overwrite: replace whatever stands there.
+        keep: keep a page that was made from the same files with the same options.
+        notify: takes lines for the user.
+        progress: takes the share of the rendering that is done.
+
+    Raises:
+        UserError: a folder is not a run, its photos cannot be read, or something else stands at the page's place.
+    """
+    target = page or (runs[0] / REPORT if len(runs) == 1 else runs[0].resolve().parent / REPORT)
+    if target.is_dir():
+        raise UserError(f"{target} is a folder", "give the page's file name with -o")
+    if not overwrite:
+        refuse_foreign(target, mark_of(runs), about="report")
+    torch.set_num_threads(thread_count(threads))
+    opened, facts, hashes = [], [], []
+    for path, label in zip(runs, labels_of(runs), strict=True):
+        run = load_run(path)
+        opened.append(run)
+        hashes.append(run.checkpoint_sha256())
+        facts.append(read_facts(run, label, checkpoint_sha256=hashes[-1]))
+    origin = origin_of(facts, hashes, views=views, depth=depth)
+    if keep and not overwrite and is_made_from(target, origin):
+        notify(f"{target} is kept: it was made from these numbers; --overwrite makes it again")
+        return target
+    names = common_names(facts, views)
+    looks, meanings = [], []
+    progress(0.0, "")
+    for index, (run, told) in enumerate(zip(opened, facts, strict=True)):
+
+        def on_share(share: float, index: int = index, label: str = told.label) -> None:
+            progress((index + share) / len(runs), label)
+
+        model = run.model(device_name(device))
+        if model.sha256 != hashes[index]:
+            raise UserError(
+                f"{run.field_path} was replaced while the report was made",
+                "give the command again when the training is over",
+            )
+        frames = [frame for frame in run.cameras.test if frame.name in names]
+        held_out = held_out_photos_of(run.config, frames, model, threads=thread_count(threads))
+        compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
+        looks.append(look_at(model, compared, depth=depth, on_share=on_share))
+        meanings.append(depth_meta(model, depth))
+    write_page(page_html(facts, looks, depth=meanings[0], origin=origin), target)
+    return target

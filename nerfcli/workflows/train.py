@@ -1,0 +1,205 @@
+"""From a scene to a run: train it, keep a run that is already there, resume one, or refuse to touch another."""
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+
+from nerfcli import scene as scenes
+from nerfcli.atomic import clear_leftovers
+from nerfcli.cameras.orientation import rescaling_told
+from nerfcli.errors import UserError
+from nerfcli.exclusive import exclusive
+from nerfcli.runs.config import split_hash
+from nerfcli.runs.files import CONFIG, LOCK, METRICS, STATE
+from nerfcli.runs.run import Run
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene
+from nerfcli.train import loop
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+
+NAMES_SHOWN = 8
+
+
+def train_scene(
+    scene: str | Path,
+    run: str | Path,
+    settings: TrainSettings = TrainSettings(),
+    *,
+    memory_bytes: int | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    holdout: str | None = None,
+    notify: Notify = silent,
+    warn: Notify = warn_python,
+    progress: Progress = no_progress,
+) -> Run:
+    """Train one scene, keep a run that is already what is wanted, or refuse to touch another one.
+
+    Example:
+        >>> import nerfcli
+        >>> from nerfcli.runs.settings import TrainSettings
+        >>> run = nerfcli.train_scene("photos-scene", "photos-scene-run", TrainSettings(budget_seconds=60, threads=4))
+        >>> run.summary.steps
+
+    Args:
+        scene: a folder that `estimate_poses` wrote, or of another format that `load_scene` reads.
+        run: the folder to write.
+        settings: budget, components, resolution, seed, device, threads.
+        memory_bytes: that may be resident; None for no limit.
+        resume: go on from the last checkpoint of `run`.
+        overwrite: replace another run at `run`.
+        holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None as the scene says.
+        notify, warn: take lines for the user.
+        progress: takes the share of the budget and a few words, after every step.
+
+    Returns:
+        The run, complete.
+
+    Raises:
+        UserError: see `nerfcli.train.loop.train`; or a different run stands at `run`.
+        KeyboardInterrupt: passed on after a checkpoint has been written.
+    """
+    folder, run = Path(scene), Path(run)
+    loaded = scenes.load(folder, holdout=holdout)
+    if loaded.missing:
+        listed = ", ".join(loaded.missing[:NAMES_SHOWN])
+        more = f" and {len(loaded.missing) - NAMES_SHOWN} more" if len(loaded.missing) > NAMES_SHOWN else ""
+        warn(f"{len(loaded.missing)} photos of {folder} are not there and are left out: {listed}{more}")
+    for text in rescaling_told(loaded.rescaled):
+        notify(text)
+
+    def is_kept() -> bool:
+        if not _keeps(run, loaded, settings, resume=resume, overwrite=overwrite):
+            return False
+        notify(f"{run} is kept: it was trained with these settings; --overwrite trains again")
+        return True
+
+    if is_kept():
+        return Run(run)
+    with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
+        if is_kept():  # by one that has just ended
+            return Run(run)
+        clear_leftovers(run)
+        if overwrite:
+            (run / METRICS).unlink(missing_ok=True)  # they belong to the field that goes
+        _fit(loaded, run, settings, memory_bytes=memory_bytes, resume=resume, notify=notify, progress=progress)
+    return Run(run)
+
+
+def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout: str | None = None) -> bool:
+    """Whether a training of this scene with these settings stopped before its end and left a checkpoint."""
+    trained = Run(run)
+    if not trained.is_trained:
+        return False
+    loaded = scenes.load(scene, holdout=holdout)
+    return trained.is_trained_from(loaded, settings) and not trained.is_complete(settings)
+
+
+def train_other_seeds(
+    run: Run,
+    count: int,
+    *,
+    device: str,
+    threads: int,
+    notify: Notify = silent,
+    warn: Notify = warn_python,
+    progress: Progress = no_progress,
+) -> list[Path]:
+    """Train the scene of a run again with other seeds and otherwise the same settings, in RUN/seeds/SEED.
+
+    Runs that are there and complete are kept, interrupted ones are resumed.
+
+    Args:
+        run: a complete run.
+        count: how many others; their seeds follow the run's own.
+        device, threads: as for `TrainSettings`.
+        notify, warn, progress: see `train_scene`.
+
+    Raises:
+        UserError: the scene is no longer where it was, or is another one by now.
+    """
+    config = run.config
+    folder = config.scene
+    first = replace(config.settings, device=device, threads=threads)
+    if not folder.exists():
+        raise UserError(
+            f"the scene of {run.path} should be in {folder}, which is not there",
+            "call it from the folder that the run was trained from, or train again",
+        )
+    loaded = scenes.load(folder, holdout=config.holdout)
+    if scenes.fingerprint(loaded) != config.scene_fingerprint:
+        raise UserError(
+            f"{folder} is not the scene any more that {run.path} was trained on", "train again with --overwrite"
+        )
+    others = []
+    for seed in range(first.seed + 1, first.seed + 1 + count):
+        settings, other = replace(first, seed=seed), run.path / "seeds" / str(seed)
+        resume = was_interrupted(folder, other, settings, holdout=config.holdout)
+        notify(f"{other}: seed {seed}")
+        train_scene(
+            folder,
+            other,
+            settings,
+            resume=resume,
+            holdout=config.holdout,
+            notify=notify,
+            warn=warn,
+            progress=progress,
+        )
+        others.append(other)
+    return others
+
+
+def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
+    """Whether the run at `path` is already what is wanted.
+
+    Raises:
+        UserError: it is something else, which is not ours to replace; or nothing to resume.
+    """
+    run = Run(path)
+    if resume and not run.is_trained and not (path / STATE).exists():
+        raise UserError(f"nothing to resume in {path}", "leave --resume out to start, or give the run with -o")
+    if resume and run.config.split_sha256 != split_hash(scene.test_names):
+        before = run.config.holdout
+        raise UserError(
+            f"{path} was trained with other photos held out ({before or 'as the scene says'})",
+            f"give --holdout {before}" if before else "leave --holdout out, or choose another place with -o",
+        )
+    if resume and run.config.scene_fingerprint != scenes.fingerprint(scene):
+        raise UserError(f"{path} was trained on another scene than {scene.root}", "choose another place with -o")
+    if run.is_trained and not resume and not overwrite:
+        if run.is_trained_from(scene, settings) and run.is_complete(settings):
+            return True
+        raise UserError(
+            f"{path} exists", "add --resume to go on, --overwrite to replace it, or choose another place with -o"
+        )
+    others = path.is_dir() and not (path / CONFIG).exists() and any(entry.name != LOCK for entry in path.iterdir())
+    if path.is_file() or others:
+        raise UserError(f"{path} is not a run, but something else", "choose another place with -o")
+    return False
+
+
+def _fit(
+    scene: Scene,
+    run: Path,
+    settings: TrainSettings,
+    *,
+    memory_bytes: int | None,
+    resume: bool,
+    notify: Notify,
+    progress: Progress,
+) -> None:
+    def on_progress(state: loop.Progress) -> None:
+        speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
+        progress(state.share, f"step {state.step}  loss {state.loss:.4f}  {speed}")
+
+    progress(0.0, "")
+    try:
+        loop.train(
+            scene, run, settings, resume=resume, memory_bytes=memory_bytes, notify=notify, on_progress=on_progress
+        )
+    except KeyboardInterrupt:
+        if (run / STATE).exists():
+            paths = f"{shlex.quote(str(scene.root))} -o {shlex.quote(str(run))}"
+            notify(f"checkpoint saved; go on with: nerfcli train {paths} --resume")
+        raise
