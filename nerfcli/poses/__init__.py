@@ -4,3 +4,7 @@
 `supervise` runs the child process `worker` on a `job`, through `features` and `mapping`; `reasons` says why a photo
 found no place.
 """
+
+# pycolmap brings a zlib of its own. If that is loaded first, Pillow and OpenCV mix it with theirs, and writing a PNG
+# ends the process ("free(): invalid pointer" in deflateEnd). So Python's is loaded before all else.
+import zlib as _zlib  # noqa: F401
