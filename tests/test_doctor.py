@@ -21,13 +21,14 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.doctor import consensus, coverage, graph, inventory, quality, two_views
 from nerfcli.doctor.examination import Diagnosis, compare_all, content, estimated_seconds, examine, judged
 from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding
-from nerfcli.doctor.matching import Pair, mutual_matches
+from nerfcli.doctor.matching import Pair
 from nerfcli.doctor.page import page_html, refuse_foreign
 from nerfcli.doctor.photos import PhotoFacts, Source, read_photo
 from nerfcli.doctor.sharpness import measure
 from nerfcli.doctor.subject import Subject, find_subject
 from nerfcli.errors import UserError
 from nerfcli.media.images import Exif
+from nerfcli.poses.nearest import mutual_matches
 from nerfcli.scene import Scene
 
 ONE = 3  # the number of the photo that is spoilt

@@ -13,11 +13,10 @@ from nerfcli.doctor.moving import Patch, moving_patches
 from nerfcli.doctor.photos import Features, PhotoFacts
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import Exif
+from nerfcli.poses.nearest import mutual_matches
 
 # Of each photo so many features are compared at first; all of them where these link it to nothing.
 QUICK_FEATURES = 1000
-# A match is kept if the second-best feature is this much farther away. Source: Lowe 2004, section 7.1.
-_RATIO = 0.8
 # How far a match may be from what a geometry says, pixels.
 EPIPOLAR_PX = 2.0
 # Fewer matches than these agree on a common geometry by chance.
@@ -107,22 +106,6 @@ def compare(
         views=views,
         patches=patches,
     )
-
-
-def mutual_matches(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of features that are each other's nearest and nearer by `_RATIO` than the second-nearest."""
-    if min(len(one), len(other)) < 2:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    a, b = (descriptors.astype(np.float32) for descriptors in (one, other))
-    distances = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)  # squared; (one, other)
-    back = distances.argmin(axis=0)
-    rows = np.arange(len(a))
-    nearest = distances.argmin(axis=1)
-    best = distances[rows, nearest].copy()
-    distances[rows, nearest] = np.inf
-    clear = best < _RATIO**2 * distances.min(axis=1)
-    kept = clear & (back[nearest] == rows)
-    return rows[kept], nearest[kept]
 
 
 def focal_px(features: Features, exif: Exif) -> float:
