@@ -42,15 +42,13 @@ def lay_out_masks(
 
     def one(index: int) -> LaidOutMask | str:
         path, photo = found[index], photos.photos[index]
-        if path is None:  # pycolmap leaves out a photo whose mask is not there
-            Image.new("1", (photo.width, photo.height), 1).save(folder / f"{files[index]}.png")
-            return LaidOutMask()
+        if path is None:
+            return write_no_mask(folder / f"{files[index]}.png", (photo.width, photo.height))
         try:
             used = read_mask(path, photos.folder / photo.name) > 0
         except UserError as error:
             return error.message
-        Image.fromarray(used).save(folder / f"{files[index]}.png")
-        return LaidOutMask(stage_key(used.shape, np.packbits(used).tobytes().hex()), float(used.mean()))
+        return write_mask(folder / f"{files[index]}.png", used)
 
     with ThreadPoolExecutor(_READERS) as readers:
         laid_out = list(readers.map(one, range(len(found))))
@@ -66,6 +64,18 @@ def lay_out_masks(
     if hidden:
         notify(f"{len(hidden)} masks are black all over, so that nothing of the photo is used: {_some(hidden)}")
     return done
+
+
+def write_mask(path: Path, used: np.ndarray) -> LaidOutMask:
+    """Write a mask for pycolmap: which pixels of the upright photo are used, bool (height, width)."""
+    Image.fromarray(used).save(path)
+    return LaidOutMask(stage_key(used.shape, np.packbits(used).tobytes().hex()), float(used.mean()))
+
+
+def write_no_mask(path: Path, size: tuple[int, int]) -> LaidOutMask:
+    """Write a white mask for a photo of (width, height): pycolmap leaves out a photo whose mask is not there."""
+    Image.new("1", size, 1).save(path)
+    return LaidOutMask()
 
 
 def _check_folder(photos: Photos, masks: Path) -> None:

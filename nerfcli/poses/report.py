@@ -44,6 +44,7 @@ class PosesReport:
     strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components: each model's photos and
     why it is apart from the largest, in the order of sizes, by which `--component` counts. not_computed: checks that
     could not be computed, and why. not_finite: where the report has null for a number that was not finite.
+    moving_foreground: an object that turns before a still background, and its masks, in numbers; see `turntable`.
     """
 
     registered: int
@@ -67,6 +68,7 @@ class PosesReport:
     components: tuple[dict[str, Any], ...] = ()
     not_computed: dict[str, str] = field(default_factory=dict)
     not_finite: dict[str, str] = field(default_factory=dict)
+    moving_foreground: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and dictionaries."""
@@ -116,6 +118,7 @@ def make_report(
         components=tuple(_with_names(component, photos) for component in result["components"]),
         not_computed=result["not_computed"],
         not_finite=result["not_finite"],
+        moving_foreground=result.get("moving_foreground"),
     )
 
 

@@ -32,6 +32,7 @@ from nerfcli.poses.settings import Limits, PoseSettings, check_settings
 from nerfcli.poses.stages import file_key
 from nerfcli.poses.strict import held_out_last
 from nerfcli.poses.supervise import WorkerDiedError, run_worker
+from nerfcli.poses.turntable import MASKS, advised
 from nerfcli.poses.workspace import POINTS_FILE, is_in_the_making, keep_refused, publish, workspace
 
 
@@ -93,7 +94,7 @@ def estimate_poses(
             raise _no_such_component(report, photos_dir)
         if error := refusal(report, photos_dir):
             if not (settings.accept_refused and report.models):
-                raise _refused(error, report, scene_dir)
+                raise _refused(advised(error, report.moving_foreground), report, scene_dir)
             notify(f"accepted all the same, as --accept-refused says: {error.message}")
 
         def describe() -> None:
@@ -106,7 +107,7 @@ def estimate_poses(
                 image_folder=photos_dir,
                 provenance=provenance,
                 unit="arbitrary",
-                masks=Path(settings.masks) if settings.masks else None,
+                masks=_masks_of(report, scene_dir),
                 split=_split(report, settings.holdout),
             )
 
@@ -237,6 +238,14 @@ def _prepare(
         component=settings.component,
     )
     return held_out_last(job)
+
+
+def _masks_of(report: PosesReport, scene_dir: Path) -> Path | None:
+    """Return the folder of the masks that the poses were found with, of the user or of an object that turns."""
+    if report.settings.masks:
+        return Path(report.settings.masks)
+    found = report.moving_foreground
+    return scene_dir / MASKS if found is not None and found["masked"] else None
 
 
 def _split(report: PosesReport, holdout: str) -> dict[str, str | None]:

@@ -38,6 +38,7 @@ from nerfcli.poses.retrieval import with_neighbours
 from nerfcli.poses.second_chance import is_contradicted, second_chance
 from nerfcli.poses.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.strict import place_held_out, training_part
+from nerfcli.poses.turntable import recalled, with_object_masks
 
 # The last stage's file: what the report needs. The model stands beside it, in sparse/0.
 RESULT = "result.json"
@@ -56,12 +57,19 @@ def main(job_path: str) -> None:
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
     """Extract, match, map, check; each goes on from what earlier calls left."""
-    result, key = Path(job.folder) / RESULT, result_key(job)
+    known = recalled(job)
+    result, key = Path(job.folder) / RESULT, result_key(job if known is None else known[0])
     if _is_complete(job, key):
         _name_images(job)
         return
     result.unlink(missing_ok=True)
+    seconds: dict[str, float] = {}
+    job, moving = _looked_at(job, report, tell, seconds=seconds) if known is None else known
+    key = result_key(job)
     found = _solve_strictly(job, report, tell) if job.held_out else _estimate(job, report, tell)
+    for stage, value in seconds.items():
+        found["seconds"][stage] = round(found["seconds"].get(stage, 0.0) + value, 3)
+    found["moving_foreground"] = moving
     found, replaced = finite(found)
     found["not_finite"] = replaced
     write_stage(result, key, found)
@@ -71,6 +79,18 @@ def solve(job: Job, report: Report, tell: Tell) -> None:
 def result_key(job: Job) -> str:
     """Return a hash of all that the result depends on."""
     return stage_key(mapping_key(job), job.component, job.skipped_checks)
+
+
+def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> tuple[Job, dict[str, Any] | None]:
+    """Return the job with masks of an object that turns before a still background, and what to report of it, if any.
+
+    Held-out photos get masks too, but what is looked for are the features of the others.
+    """
+    discard_if_damaged(job.database)
+    with _timed(seconds, "extract"):
+        extract(training_part(job), report)
+    with _timed(seconds, "motions"):
+        return with_object_masks(job, training_part(job), tell)
 
 
 def _solve_strictly(job: Job, report: Report, tell: Tell) -> dict[str, Any]:

@@ -1,0 +1,141 @@
+"""Masks of what turns before a background that stays: from photos that a camera on a tripod took.
+
+What a pixel shows most often is the background, wherever the object leaves it free in some photos: an object that
+turns shows other colours each time. Where no colour comes back as precisely as at the background's features, the
+object is always there. A photo's object is that, and what differs from the background, with its holes filled: an
+object of one colour is taken for the background where it is in all photos, but there it is surrounded by what differs.
+
+All is done in small pictures; the masks are enlarged and a little wider than the object, for a mask that cuts the
+object costs more than one that leaves a rim of the background.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import binary_fill_holes
+
+# The longer side of the pictures that are compared.
+SIDE_PX = 480
+# So many photos at most, evenly chosen, tell what the background looks like; fewer than so many tell nothing.
+_MOST_PHOTOS = 40
+LEAST_PHOTOS = 6
+# The background is the colour that a pixel has, most nearly, in this share of the photos.
+_SHARE = 0.3
+# How many levels of 255 a pixel may differ from the background, apart from noise and edges that are a little displaced.
+_LEVELS = 9.0
+_NOISES = 3.0
+_DISPLACED_PX = 0.5
+# Where colours come back so much less precisely than at the background's features, there is no background.
+_LESS_PRECISE = 2.0
+_LESS_PRECISE_LEVELS = 2.0
+_AT_MOST_WORST = 0.9
+# Parts smaller than this share of the largest one, or of the picture, are no objects.
+_LEAST_OF_LARGEST = 0.02
+_LEAST_OF_PICTURE = 0.0005
+# Gaps of this many pixels are closed, and the mask is this much wider than what differs.
+_CLOSED_PX = 4
+_WIDER_PX = 2
+
+
+@dataclass(frozen=True)
+class Background:
+    """What stays: colours (h, w, 3) float32; how much a pixel of each place may differ, (h, w); and where the object
+    always is, (h, w) bool."""
+
+    colours: np.ndarray
+    tolerance: np.ndarray
+    covered: np.ndarray
+
+
+def small(picture: np.ndarray) -> np.ndarray:
+    """A picture (height, width, 3) uint8 at `SIDE_PX`."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, SIDE_PX / max(height, width))
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
+def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background:
+    """What stays in pictures (h, w, 3) of one place, `LEAST_PHOTOS` or more.
+
+    Args:
+        pictures: of it, see `small`.
+        places: (N, 2) where the background has features that stay, as shares of width and height, 0...1.
+    """
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), _MOST_PHOTOS)).astype(int))
+    stack = np.stack([pictures[index] for index in chosen]).astype(np.float32)  # (n, h, w, 3)
+    window = max(3, round(_SHARE * len(stack)))
+    light = stack.mean(axis=3)
+    order = np.argsort(light, axis=0)
+    ranked = np.take_along_axis(light, order, axis=0)
+    spread = ranked[window - 1 :] - ranked[: len(ranked) - window + 1]
+    first = spread.argmin(axis=0)  # (h, w)
+    members = np.take_along_axis(order, first[None] + np.arange(window)[:, None, None], axis=0)
+    values = np.take_along_axis(stack, members[..., None], axis=0)  # (window, h, w, 3)
+    colours = np.median(values, axis=0)
+    noise = cv2.GaussianBlur(np.median(np.abs(values - colours), axis=0).max(axis=2), (0, 0), 2)
+    height, width = noise.shape
+    columns, rows = (places * (width, height)).astype(int).clip(0, (width - 1, height - 1)).T
+    usual = float(np.quantile(noise[rows, columns], _AT_MOST_WORST))
+    most = _LESS_PRECISE * usual + _LESS_PRECISE_LEVELS
+    grey = colours.mean(axis=2)
+    across, down = cv2.Sobel(grey, cv2.CV_32F, 1, 0) / 8, cv2.Sobel(grey, cv2.CV_32F, 0, 1) / 8
+    edges = cv2.dilate(np.hypot(across, down), np.ones((3, 3), np.uint8))
+    tolerance = _LEVELS + _NOISES * np.minimum(noise, most) + _DISPLACED_PX * edges
+    return Background(colours, tolerance, noise > most)
+
+
+def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
+    """Where a picture (h, w, 3) shows something else than the background, (h, w) bool: the object, a little wider."""
+    raw = ((cv2.medianBlur(_distances(picture, behind), 5) > 1) | behind.covered).astype(np.uint8)
+    raw = cv2.morphologyEx(raw, cv2.MORPH_OPEN, _disc(1))
+    closed = cv2.morphologyEx(np.pad(raw, _CLOSED_PX), cv2.MORPH_CLOSE, _disc(_CLOSED_PX))
+    closed = closed[_CLOSED_PX:-_CLOSED_PX, _CLOSED_PX:-_CLOSED_PX]
+    whole = np.asarray(binary_fill_holes(closed), dtype=np.uint8)
+    count, labels, facts, _ = cv2.connectedComponentsWithStats(whole)
+    areas = facts[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0
+    least = max(_LEAST_OF_LARGEST * areas.max(), _LEAST_OF_PICTURE * whole.size)
+    kept = np.isin(labels, [label for label in range(1, count) if areas[label] >= least])
+    return cv2.dilate(kept.astype(np.uint8), _disc(_WIDER_PX)) > 0
+
+
+def agreement(picture: np.ndarray, behind: Background) -> float:
+    """Of the places where there is a background, the share that a picture (h, w, 3) shows as it is there."""
+    free = ~behind.covered
+    return float(np.mean(_distances(picture, behind)[free] <= 1)) if free.any() else 0.0
+
+
+def enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask in the size (width, height) of its photo, with smooth edges."""
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
+
+
+def _distances(picture: np.ndarray, behind: Background) -> np.ndarray:
+    """How far each pixel is from the background's colour, in tolerances, float32 (h, w)."""
+    levels = picture.astype(np.float32)
+    return np.abs(levels * _gain(levels, behind) - behind.colours).max(axis=2) / behind.tolerance
+
+
+def _gain(picture: np.ndarray, behind: Background) -> np.ndarray:
+    """What the picture's channels are to be multiplied by, so that most of it is as light as the background."""
+    bright = (behind.colours > 16) & (behind.colours < 240) & (picture > 8) & (picture < 245)
+    gains = []
+    for channel in range(3):
+        usable = bright[..., channel]
+        if usable.sum() < 0.05 * usable.size:
+            gains.append(1.0)
+            continue
+        ratios = np.log(behind.colours[..., channel][usable] / picture[..., channel][usable])
+        # The densest part of the ratios, not their middle: the object may take more than half of the picture.
+        heights, edges = np.histogram(ratios, bins=np.arange(-1.0, 1.02, 0.02))
+        peak = int(np.convolve(heights, np.ones(3), mode="same").argmax())
+        near = np.abs(ratios - (edges[peak] + 0.01)) < 0.03
+        gains.append(float(np.exp(np.median(ratios[near]))) if near.any() else 1.0)
+    return np.array(gains, dtype=np.float32)
+
+
+def _disc(radius_px: int) -> np.ndarray:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1))

@@ -1,0 +1,206 @@
+"""Whether a capture shows two motions: a background that keeps its place in the picture, and an object that turns.
+
+A tripod and a turntable give two sets of matches. Those of the background do not move at all, whatever the two photos
+are; those of the object follow an epipolar geometry of their own, which the first set contradicts. No other capture
+does both. A camera that moves leaves hardly any match in its place, and what there is (the far distance, the point that
+it keeps in the middle, the point that it moves towards) agrees with the geometry of the rest. Photos that were copied
+have matches that do not move, but no others.
+
+Letters: x and y are the pixels of a match in the first and in the second photo, F a fundamental matrix.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+# A match is still if it moved by less than this share of the picture's diagonal; that is 2 px at 1600 x 1200.
+_STILL = 0.001
+# In small pictures features are found no better than this.
+_LEAST_STILL_PX = 0.75
+# Of matches that change smoothly over the picture, eight times as many moved by one to three such lengths as by less.
+_RING = 3.0
+_LEAST_PEAK = 2.0
+# From so many such lengths on a match moved for certain.
+_MOVED = 4.0
+_LEAST_MATCHES = 15
+# A geometry that explains so much of what stays and of what moves, to twice a length, makes them one motion.
+_MOST_AGREEING = 0.7
+# Cells of the picture in which still matches are counted.
+_CELLS = (16, 12)
+
+# Of the pairs that tell anything, the share that must show two motions or nothing but the still one. Measured: all of
+# them on turntables, none on captures with a camera that moves.
+_LEAST_SHARE = 0.5
+_LEAST_PAIRS = 3
+# Less of the picture than this is a time stamp or a mark, not a background.
+_LEAST_CELLS = 12
+_LEAST_EXTENT = 0.25
+
+
+@dataclass(frozen=True)
+class Motions:
+    """What the matches of two photos say.
+
+    Args:
+        stays: (N,) bool, matches in their place; none if they are no more than what a smooth motion leaves there.
+        moves: (N,) bool, the others that agree on one geometry of two views.
+        agreeing: share of both that one geometry explains, of that part of which it explains less; NaN without both.
+        cells: those of the picture in which still matches are, by number.
+    """
+
+    stays: np.ndarray
+    moves: np.ndarray
+    agreeing: float
+    cells: frozenset[int]
+
+    @property
+    def still(self) -> int:
+        """Matches that stayed in their place."""
+        return int(self.stays.sum())
+
+    @property
+    def moving(self) -> int:
+        """Matches that moved, by one geometry."""
+        return int(self.moves.sum())
+
+    @property
+    def two(self) -> bool:
+        """Whether there are two motions, one of which is none."""
+        return self.still >= _LEAST_MATCHES and self.moving >= _LEAST_MATCHES and self.agreeing < _MOST_AGREEING
+
+    @property
+    def only_still(self) -> bool:
+        """Whether nothing but the still matches is there."""
+        return self.still >= _LEAST_MATCHES and self.moving < _LEAST_MATCHES
+
+    @property
+    def one(self) -> bool:
+        """Whether all that moved follows one motion, and what stayed with it."""
+        return self.moving >= _LEAST_MATCHES and not self.two
+
+
+@dataclass(frozen=True)
+class Stationary:
+    """What many pairs say together.
+
+    Args:
+        two, still, moved: pairs with two motions, with the still one alone, and with one that moves.
+        photos: that are in a pair with two motions.
+        cells: share of the picture in which matches stay in their place in two pairs or more.
+        extent: share of the picture that a box around these takes.
+    """
+
+    two: int
+    still: int
+    moved: int
+    photos: int
+    cells: float
+    extent: float
+
+    @property
+    def share(self) -> float:
+        """Of the pairs that tell, those with two motions; 0 where none tells."""
+        return self.two / max(self.two + self.moved, 1)
+
+    @property
+    def two_motions(self) -> bool:
+        """Whether most pairs show two motions, however small what stays is."""
+        return self.two >= _LEAST_PAIRS and self.share >= _LEAST_SHARE
+
+    @property
+    def wide(self) -> bool:
+        """Whether what stays in its place is wide enough for a background."""
+        return self.cells * _CELLS[0] * _CELLS[1] >= _LEAST_CELLS and self.extent >= _LEAST_EXTENT
+
+    @property
+    def found(self) -> bool:
+        """Whether an object turns, or is moved, before a background that stays."""
+        return self.two_motions and self.wide
+
+
+def still_px(size: tuple[int, int]) -> float:
+    """How far a feature of what stands still may be found from its place, pixels, in a picture of (width, height)."""
+    return max(_LEAST_STILL_PX, _STILL * float(np.hypot(*size)))
+
+
+def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
+    """What matches (N, 2) of two pictures of the same size (width, height) say. Deterministic."""
+    within = still_px(size)
+    distances = np.linalg.norm(y - x, axis=1)
+    stays = distances < within
+    around = int(((distances >= within) & (distances < _RING * within)).sum())
+    if stays.sum() < max(_LEAST_MATCHES, _LEAST_PEAK * around):
+        stays = np.zeros(len(x), dtype=bool)
+    moves = distances > _MOVED * within
+    fundamental, agree = fundamental_of(x[moves], y[moves], within)
+    moves[moves] = agree
+    agreeing = float("nan")
+    if fundamental is not None and stays.any() and agree.any():
+        common = _common(x, y, one=stays, other=moves, within=within)
+        explained = [epipolar_px(x, y, matrix) < 2 * within for matrix in (fundamental, common) if matrix is not None]
+        agreeing = max(float(min(right[stays].mean(), right[moves].mean())) for right in explained)
+    columns, rows = _CELLS
+    cells = frozenset(
+        int(row) * columns + int(column)
+        for column, row in np.floor(x[stays] / np.array(size) * np.array(_CELLS)).clip(0, (columns - 1, rows - 1))
+    )
+    return Motions(stays, moves, agreeing, cells)
+
+
+def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:
+    """What pairs (photo, photo, motions) say together."""
+    two = [pair for pair in pairs if pair[2].two]
+    often = [cell for _, _, pair in two for cell in pair.cells]
+    cells = [cell for cell in set(often) if often.count(cell) >= 2]
+    columns, rows = _CELLS
+    extent = 0.0
+    if cells:
+        down, across = np.divmod(np.array(cells), columns)
+        extent = float((np.ptp(down) + 1) * (np.ptp(across) + 1) / (columns * rows))
+    return Stationary(
+        two=len(two),
+        still=sum(pair.only_still for _, _, pair in pairs),
+        moved=sum(pair.one for _, _, pair in pairs),
+        photos=len({photo for pair in two for photo in pair[:2]}),
+        cells=len(cells) / (columns * rows),
+        extent=extent,
+    )
+
+
+def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray, within: float) -> np.ndarray | None:
+    """The fundamental matrix that most of two sets of matches agree on, as many of the one as of the other.
+
+    What moved may be flat, and then has many such matrices, of which one may hold for what stayed, too.
+    """
+    count = min(one.sum(), other.sum())
+    chosen = np.concatenate(
+        [np.flatnonzero(which)[np.linspace(0, which.sum() - 1, count).astype(int)] for which in (one, other)]
+    )
+    return fundamental_of(x[chosen], y[chosen], within)[0]
+
+
+def fundamental_of(x: np.ndarray, y: np.ndarray, within_px: float) -> tuple[np.ndarray | None, np.ndarray]:
+    """The fundamental matrix that most matches (N, 2) agree on, None where there is none, and which do, (N,) bool."""
+    nothing = np.zeros(len(x), dtype=bool)
+    if len(x) < 12:
+        return None, nothing
+    cv2.setRNGSeed(0)
+    try:
+        matrix, mask = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, within_px, 0.999, 2000)
+    except cv2.error:  # OpenCV's USAC asserts (!model.empty()) on some matches that all lie on a plane
+        matrix, mask = cv2.findFundamentalMat(x, y, cv2.FM_RANSAC, within_px, 0.999, 2000)
+    if matrix is None or mask is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return None, nothing
+    return matrix, mask.ravel().astype(bool)
+
+
+def epipolar_px(x: np.ndarray, y: np.ndarray, fundamental: np.ndarray) -> np.ndarray:
+    """The larger of the two distances of each match (N, 2) from its epipolar lines, pixels."""
+    ones = np.ones((len(x), 1))
+    first, second = np.hstack([x, ones]), np.hstack([y, ones])
+    lines, back = first @ fundamental.T, second @ fundamental
+    products = np.abs((second * lines).sum(axis=1))
+    lengths = np.minimum(np.linalg.norm(lines[:, :2], axis=1), np.linalg.norm(back[:, :2], axis=1))
+    return products / np.maximum(lengths, 1e-12)

@@ -1,0 +1,278 @@
+"""An object that turns before a still background: recognised, masked, solved; and what must not be taken for one."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_captures as synthetic
+from PIL import Image
+from scipy.spatial.transform import Rotation
+from synthetic_captures import WIDE, Scene, View
+from turntable_capture import Turntable, turntable, write
+
+from nerfcli import scene as scenes
+from nerfcli.errors import UserError
+from nerfcli.poses import background as still
+from nerfcli.poses.settings import PoseSettings
+from nerfcli.poses.stationary import Motions, Stationary, motions, still_px, together
+from nerfcli.poses.structure_from_motion import estimate_poses
+from nerfcli.poses.turntable import advised, sentence
+from nerfcli.scale.alignment import align
+
+SIZE = (WIDE.width, WIDE.height)
+
+
+def matched(one: View, other: View, scene: Scene, *, seed: int, noise_px: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
+    """Where two views see the points that both see, with noise and a tenth of wrong matches."""
+    rng = np.random.default_rng(seed)
+    (first, x), (second, y) = synthetic.seen(one, scene), synthetic.seen(other, scene)
+    _, a, b = np.intersect1d(first, second, return_indices=True)
+    x, y = (pixels + rng.normal(scale=noise_px, size=pixels.shape) for pixels in (x[a], y[b]))
+    wrong = rng.choice(len(y), len(y) // 10, replace=False)
+    y[wrong] = rng.permutation(y[wrong])
+    return x, y
+
+
+def staying(
+    count: int, *, seed: int, box: tuple[float, float, float, float] = (0, 0, 1, 1)
+) -> tuple[np.ndarray, np.ndarray]:
+    """Matches that stay in their place within a box: left, top, right, bottom as shares of the picture."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(np.array(box[:2]) * SIZE, np.array(box[2:]) * SIZE, size=(count, 2))
+    return x + rng.normal(scale=0.3, size=x.shape), x + rng.normal(scale=0.3, size=x.shape)
+
+
+def both(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> Motions:
+    return motions(np.vstack([one[0], other[0]]), np.vstack([one[1], other[1]]), SIZE)
+
+
+def ring_pairs(count: int = 24) -> list[tuple[int, int, tuple[np.ndarray, np.ndarray]]]:
+    """(i, j, matches) of a boulder that is photographed all around."""
+    scene = synthetic.boulder(1500, seed=3)
+    views = synthetic.ring(count, [WIDE], seed=4)
+    return [
+        (i, i + step, matched(views[i], views[i + step], scene, seed=100 * i + step))
+        for step in (1, 2)
+        for i in range(0, count - step, 3)
+    ]
+
+
+class TestMotions:
+    @pytest.mark.parametrize("still_count", [40, 150, 600])
+    def test_background_that_stays_and_object_that_turns_are_two_motions(self, still_count: int) -> None:
+        for i, j, moving in ring_pairs():
+            found = both(moving, staying(still_count, seed=i + j))
+            assert found.two
+            assert not found.only_still
+            assert not found.one
+            assert abs(found.still - still_count) <= 0.05 * still_count + 6  # the object passes through its axis
+            assert found.moving > 0.6 * len(moving[0])
+            assert found.agreeing < 0.6
+
+    def test_object_alone_is_one_motion(self) -> None:
+        for _, _, moving in ring_pairs():
+            found = motions(*moving, SIZE)
+            assert found.one
+            assert found.still == 0  # that few matches are near the axis is no peak
+
+    def test_copies_of_a_photo_are_no_two_motions(self) -> None:
+        found = motions(*staying(400, seed=0), SIZE)
+        assert found.only_still
+        assert not found.two
+
+    def test_what_is_far_away_agrees_with_a_camera_that_moves_sideways(self) -> None:
+        """The horizon stays while the camera slides past what is near: one motion."""
+        near = synthetic.room(1500, seed=1)
+        middle = np.array([0.0, 0.0, 0.0])
+        one, other = (
+            View(WIDE, synthetic.looking_at(middle + offset, middle + offset + np.array([1.0, 0.0, 0.0])))
+            for offset in (np.zeros(3), np.array([0.0, 0.4, 0.0]))
+        )
+        found = both(matched(one, other, near, seed=5), staying(200, seed=6))
+        assert found.still >= 190
+        assert found.agreeing > 0.9
+        assert found.one
+
+    def test_towards_the_middle_of_a_zoom_there_is_no_peak(self) -> None:
+        """A camera that goes forward leaves what it goes towards in its place, but around it all changes smoothly."""
+        rng = np.random.default_rng(2)
+        x = rng.uniform(0, SIZE, size=(20_000, 2))
+        y = (x - np.array(SIZE) / 2) * 1.02 + np.array(SIZE) / 2
+        within = still_px(SIZE)
+        assert (np.linalg.norm(y - x, axis=1) < within).sum() > 100  # which is more than what counts as still
+        assert motions(x, y, SIZE).still == 0
+
+    def test_nothing_says_nothing(self) -> None:
+        found = motions(np.zeros((0, 2)), np.zeros((0, 2)), SIZE)
+        assert (found.still, found.moving, found.two, found.one, found.only_still) == (0, 0, False, False, False)
+
+    def test_same_matches_say_the_same(self) -> None:
+        _, _, moving = ring_pairs()[0]
+        one, other = (both(moving, staying(100, seed=1)) for _ in range(2))
+        np.testing.assert_array_equal(one.moves, other.moves)
+        assert one.agreeing == other.agreeing
+
+
+class TestTogether:
+    @staticmethod
+    def of(box: tuple[float, float, float, float], *, copies: int = 0, moved: int = 0) -> Stationary:
+        pairs = [(i, j, both(moving, staying(60, seed=i + j, box=box))) for i, j, moving in ring_pairs()]
+        pairs += [(i, i + 1, motions(*staying(200, seed=i), SIZE)) for i in range(copies)]
+        pairs += [(i, j, motions(*moving, SIZE)) for i, j, moving in ring_pairs()[:moved]]
+        return together(pairs)
+
+    def test_background_around_an_object_is_found(self) -> None:
+        said = self.of((0, 0, 1, 1))
+        assert said.found
+        assert said.share == 1
+        assert said.photos >= 20
+
+    @pytest.mark.parametrize("box", [(0.75, 0.93, 0.99, 0.99), (0.0, 0.94, 1.0, 1.0), (0.85, 0.02, 0.98, 0.15)])
+    def test_time_stamp_or_mark_is_no_background(self, box: tuple[float, float, float, float]) -> None:
+        said = self.of(box)
+        assert said.two_motions
+        assert not said.wide
+        assert not said.found
+
+    def test_copies_neither_make_nor_hide_it(self) -> None:
+        assert self.of((0, 0, 1, 1), copies=40).found
+        copies = together([(i, i + 1, motions(*staying(200, seed=i), SIZE)) for i in range(40)])
+        assert not copies.found
+        assert copies.share == 0
+
+    def test_few_such_pairs_among_others_are_not_enough(self) -> None:
+        pairs = [(i, j, motions(*moving, SIZE)) for i, j, moving in ring_pairs()]
+        several = [(i, j, both(moving, staying(60, seed=i))) for i, j, moving in ring_pairs()[:5]]
+        assert together(several).found
+        assert not together(several + pairs).found
+
+
+@pytest.fixture(scope="module")
+def capture() -> Turntable:
+    return turntable(16, size=(480, 360), turn_deg=160, supersampled=1, seed=1)
+
+
+class TestMasks:
+    @staticmethod
+    def around(capture: Turntable) -> np.ndarray:
+        """Places of the background, as shares of the picture."""
+        height, width = capture.masks.shape[1:]
+        rows, columns = np.nonzero(~capture.masks.any(axis=0))
+        return np.column_stack([columns / width, rows / height])
+
+    def check(self, capture: Turntable, pictures: list[np.ndarray], *, cut: float = 0.03, extra: float = 0.03) -> None:
+        behind = still.background(pictures, self.around(capture))
+        for picture, truth in zip(pictures, capture.masks, strict=True):
+            found = still.enlarged(still.differs(picture, behind), truth.shape[::-1])
+            assert (truth & ~found).sum() < cut * truth.sum()
+            assert (found & ~truth).sum() < extra * truth.size
+            assert still.agreement(picture, behind) > 0.8
+
+    def test_masks_hold_the_object_and_little_else(self, capture: Turntable) -> None:
+        self.check(capture, [still.small(photo) for photo in capture.photos])
+
+    def test_light_that_changes_from_photo_to_photo_changes_little(self, capture: Turntable) -> None:
+        rng = np.random.default_rng(0)
+        gains = rng.uniform(0.8, 1.1, size=len(capture.photos))
+        lit = [
+            np.clip(photo * gain, 0, 255).astype(np.uint8) for photo, gain in zip(capture.photos, gains, strict=True)
+        ]
+        self.check(capture, [still.small(photo) for photo in lit], cut=0.05, extra=0.06)
+
+    def test_photos_of_another_place_do_not_agree(self, capture: Turntable) -> None:
+        behind = still.background([still.small(photo) for photo in capture.photos], self.around(capture))
+        other = turntable(1, size=(480, 360), supersampled=1, seed=7)
+        assert still.agreement(still.small(other.photos[0]), behind) < 0.3
+
+
+SETTINGS = PoseSettings(max_image_size=480, threads=1)
+
+
+def solved(photos: Path, scene_dir: Path, **options: object) -> tuple[dict, list[str]]:
+    notes: list[str] = []
+    settings = replace(SETTINGS, **options)
+    estimate_poses(photos, scene_dir, settings=settings, notify=notes.append, progress=lambda *told: None)
+    return json.loads((scene_dir / "poses_report.json").read_text(encoding="utf-8")), notes
+
+
+def errors(capture: Turntable, scene_dir: Path) -> tuple[float, float]:
+    """Largest error of a position as a share of the radius, and of a rotation in degrees, after the best similarity."""
+    frames = scenes.load(scene_dir).frames
+    truth = np.array([capture.object_from_cam[int(frame.name[5:8])] for frame in frames])
+    found = np.array([frame.world_from_cam for frame in frames])
+    moved = align(found[:, :3, 3], truth[:, :3, 3])
+    aligned = np.array([moved.apply_pose(pose) for pose in found])
+    radius = np.linalg.norm(truth[:, :3, 3], axis=1).mean()
+    off = np.swapaxes(truth[:, :3, :3], 1, 2) @ aligned[:, :3, :3]
+    distances = np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1)
+    return float(distances.max() / radius), float(np.degrees(Rotation.from_matrix(off).magnitude()).max())
+
+
+@pytest.fixture(scope="module")
+def made(capture: Turntable, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict, list[str]]:
+    folder = tmp_path_factory.mktemp("turntable")
+    write(capture, folder)
+    return folder, *solved(folder / "images", folder / "scene")
+
+
+class TestPoses:
+    def test_object_is_solved_as_if_the_camera_went_around_it(
+        self, capture: Turntable, made: tuple[Path, dict, list[str]]
+    ) -> None:
+        folder, report, notes = made
+        assert report["registered"] == len(capture.photos)
+        position, rotation_deg = errors(capture, folder / "scene")
+        assert position < 0.02
+        assert rotation_deg < 0.5
+        assert sum("an object turns" in note for note in notes) == 1
+
+    def test_report_has_the_numbers(self, capture: Turntable, made: tuple[Path, dict, list[str]]) -> None:
+        found = made[1]["moving_foreground"]
+        assert found["masked"]
+        assert found["unmasked"] == []
+        assert found["pairs_two_motions"] > 0.8 * found["pairs"]
+        assert abs(found["white_share"][1] - capture.masks.mean()) < 0.03
+        assert found["object_matches_in_white"] > 0.95
+        assert found["background_matches_in_black"] > 0.95
+
+    def test_scene_has_masks_for_training(self, capture: Turntable, made: tuple[Path, dict, list[str]]) -> None:
+        for frame in scenes.load(made[0] / "scene").frames:
+            assert frame.mask is not None
+            mask = np.asarray(Image.open(frame.mask).convert("L")) > 127
+            truth = capture.masks[int(frame.name[5:8])]
+            assert (truth & ~mask).sum() < 0.03 * truth.sum()
+            assert (mask & ~truth).sum() < 0.03 * truth.size
+
+    def test_masks_that_were_mended_by_hand_are_used(self, made: tuple[Path, dict, list[str]]) -> None:
+        """Masks that are there stay as they are when poses are made again."""
+        folder = made[0]
+        mask = sorted((folder / "scene" / "masks").iterdir())[0]
+        narrower = np.asarray(Image.open(mask)).copy()
+        narrower[:200] = False
+        Image.fromarray(narrower).save(mask)
+        report, _ = solved(folder / "images", folder / "scene", seed=1)
+        assert (np.asarray(Image.open(mask)) == narrower).all()
+        assert report["moving_foreground"]["masked"]
+        assert report["images"][0]["registered"]
+
+    def test_object_in_a_room_that_turns_with_it_needs_no_masks(self, capture: Turntable, tmp_path: Path) -> None:
+        """A camera that goes around is left alone: the background is made of the truth's masks, grey."""
+        photos = np.where(capture.masks[..., None], capture.photos, np.uint8(128))
+        write(replace(capture, photos=photos), tmp_path)
+        report, notes = solved(tmp_path / "images", tmp_path / "scene")
+        assert report["moving_foreground"] is None
+        assert not (tmp_path / "scene" / "masks").exists()
+        assert not any("turns" in note for note in notes)
+        assert all(frame.mask is None for frame in scenes.load(tmp_path / "scene").frames)
+
+
+def test_refusal_says_what_to_do_about_it() -> None:
+    error = UserError("only 3 of 66 photos could be placed", "take more", 4)
+    facts = {"wide": True, "masked": False, "why_not": "x", "pairs": 9, "pairs_two_motions": 9, "unmasked": []}
+    assert "--masks" in (advised(error, facts).hint or "")
+    assert advised(error, facts).exit_code == 4
+    assert advised(error, None) is error
+    assert advised(error, facts | {"wide": False}) is error
+    assert "--masks" in sentence(facts)
