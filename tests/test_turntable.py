@@ -13,6 +13,9 @@ from synthetic_captures import WIDE, Scene, View
 from turntable_capture import Turntable, turntable, write
 
 from nerfcli import scene as scenes
+from nerfcli.doctor.examination import Diagnosis, examine
+from nerfcli.doctor.findings import LOOK
+from nerfcli.doctor.subject import find_subject
 from nerfcli.errors import UserError
 from nerfcli.poses import background as still
 from nerfcli.poses.settings import PoseSettings
@@ -266,6 +269,30 @@ class TestPoses:
         assert not (tmp_path / "scene" / "masks").exists()
         assert not any("turns" in note for note in notes)
         assert all(frame.mask is None for frame in scenes.load(tmp_path / "scene").frames)
+
+
+class TestDoctor:
+    @staticmethod
+    def examined(folder: Path) -> Diagnosis:
+        subject = find_subject(folder)
+        return examine(subject, threads=1, progress=lambda done, what: None)
+
+    def test_turntable_is_named_and_nothing_is_said_of_the_camera(self, capture: Turntable, tmp_path: Path) -> None:
+        """The camera stood still: that it "only turned, or hardly moved" would be the wrong advice."""
+        write(capture, tmp_path)
+        diagnosis = self.examined(tmp_path / "images")
+        found = {finding.check: finding for finding in diagnosis.findings}
+        assert found["turning object"].verdict == LOOK
+        assert "turntable" in found["turning object"].summary
+        assert "--masks" in found["turning object"].advice
+        assert not {"movement", "moving content", "depth relief"} & found.keys()
+
+    def test_camera_that_goes_around_is_examined_as_before(self, capture: Turntable, tmp_path: Path) -> None:
+        photos = np.where(capture.masks[..., None], capture.photos, np.uint8(128))
+        write(replace(capture, photos=photos), tmp_path)
+        checks = {finding.check for finding in self.examined(tmp_path / "images").findings}
+        assert "turning object" not in checks
+        assert {"movement", "moving content"} <= checks
 
 
 def test_refusal_says_what_to_do_about_it() -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
-from nerfcli.doctor import coverage, geometry, graph, inventory, quality
+from nerfcli.doctor import coverage, geometry, graph, inventory, quality, turntable
 from nerfcli.doctor.findings import Finding, as_json, worst
 from nerfcli.doctor.matching import Pair, compare, focal_px
 from nerfcli.doctor.photos import MOST_FEATURES, PhotoFacts, read_all
@@ -147,14 +147,18 @@ def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unr
     ]
     not_checked: list[tuple[str, str]] = []
     if len(photos) > 1:
-        found += [graph.connectivity(photos, pairs), geometry.moving_content(photos, pairs)]
-        for name, finding in (
-            ("movement", geometry.movement(photos, pairs)),
-            ("depth relief", geometry.flatness(pairs)),
-        ):
-            found.append(finding)
-            if finding is None:
-                not_checked.append((name, "too few pairs with enough matches tell"))
+        found.append(graph.connectivity(photos, pairs))
+        turning = turntable.turning_object(pairs)
+        if turning is None:
+            movement, relief = geometry.movement(photos, pairs), geometry.flatness(pairs)
+            found += [geometry.moving_content(photos, pairs), movement, relief]
+            for name, finding in (("movement", movement), ("depth relief", relief)):
+                if finding is None:
+                    not_checked.append((name, "too few pairs with enough matches tell"))
+        else:
+            found.append(turning)
+            reason = "the camera stood still while an object turned before it"
+            not_checked.append(("moving content, movement, depth relief", reason))
     else:
         not_checked.append(("connectivity, movement, moving content", "one photo cannot tell"))
     found.append(coverage.gps(photos))

@@ -14,6 +14,7 @@ from nerfcli.doctor.photos import Features, PhotoFacts
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import Exif
 from nerfcli.poses.nearest import mutual_matches
+from nerfcli.poses.stationary import Motions, in_place, motions
 
 # Of each photo so many features are compared at first; all of them where these link it to nothing.
 QUICK_FEATURES = 1000
@@ -43,6 +44,7 @@ class Pair:
         redder: median difference of log2 red over blue; NaN where too few tell.
         views: how the camera moved between the photos; None where too few inliers tell.
         patches: what else moved.
+        motions: what the matches say of a background that stays in its place; None where none stay.
     """
 
     first: int
@@ -56,6 +58,7 @@ class Pair:
     redder: float
     views: two_views.TwoViews | None
     patches: tuple[Patch, ...]
+    motions: Motions | None = None
 
     @property
     def linked(self) -> bool:
@@ -89,7 +92,9 @@ def compare(
     chosen = agree & same_size
     lighter, redder = (other.light[b[agree]] - one.light[a[agree]]).T
     stops = _median(lighter)
-    views, patches = None, ()
+    views, patches, still = None, (), None
+    if one.size == other.size and in_place(x, y, one.size).any():
+        still = motions(x, y, one.size)
     if count >= _LEAST_FOR_GEOMETRY:
         centres = [np.array(features.size) / 2 for features in (one, other)]
         views = two_views.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px)
@@ -105,6 +110,7 @@ def compare(
         redder=_median(redder),
         views=views,
         patches=patches,
+        motions=still,
     )
 
 

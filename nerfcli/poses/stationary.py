@@ -32,7 +32,7 @@ _CELLS = (16, 12)
 
 # Of the pairs that tell anything, the share that must show two motions or nothing but the still one. Measured: all of
 # them on turntables, none on captures with a camera that moves.
-_LEAST_SHARE = 0.5
+LEAST_SHARE = 0.5
 _LEAST_PAIRS = 3
 # Less of the picture than this is a time stamp or a mark, not a background.
 _LEAST_CELLS = 12
@@ -107,7 +107,7 @@ class Stationary:
     @property
     def two_motions(self) -> bool:
         """Whether most pairs show two motions, however small what stays is."""
-        return self.two >= _LEAST_PAIRS and self.share >= _LEAST_SHARE
+        return self.two >= _LEAST_PAIRS and self.share >= LEAST_SHARE
 
     @property
     def wide(self) -> bool:
@@ -125,15 +125,23 @@ def still_px(size: tuple[int, int]) -> float:
     return max(_LEAST_STILL_PX, _STILL * float(np.hypot(*size)))
 
 
-def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
-    """What matches (N, 2) of two pictures of the same size (width, height) say. Deterministic."""
+def in_place(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Which matches (N, 2) of two pictures of (width, height) stay in their place, (N,) bool.
+
+    None do if so few are no more than what a motion that changes smoothly over the picture leaves there.
+    """
     within = still_px(size)
     distances = np.linalg.norm(y - x, axis=1)
     stays = distances < within
     around = int(((distances >= within) & (distances < _RING * within)).sum())
-    if stays.sum() < max(_LEAST_MATCHES, _LEAST_PEAK * around):
-        stays = np.zeros(len(x), dtype=bool)
-    moves = distances > _MOVED * within
+    return stays if stays.sum() >= max(_LEAST_MATCHES, _LEAST_PEAK * around) else np.zeros(len(x), dtype=bool)
+
+
+def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
+    """What matches (N, 2) of two pictures of the same size (width, height) say. Deterministic."""
+    within = still_px(size)
+    stays = in_place(x, y, size)
+    moves = np.linalg.norm(y - x, axis=1) > _MOVED * within
     fundamental, agree = fundamental_of(x[moves], y[moves], within)
     moves[moves] = agree
     agreeing = float("nan")
