@@ -105,6 +105,14 @@ def test_the_package_is_imported_without_its_parts():
     assert set(result.stdout.split()) <= {"nerfcli", "zlib"}
 
 
+def test_what_comes_after_training_loads_no_trainer():
+    parts = "evaluate, render, report"
+    code = f"import sys; from nerfcli.workflows import {parts}; print(*(m for m in sys.modules if 'nerfcli' in m))"
+    loaded = in_python(code).stdout.split()
+    assert "nerfcli.runs.run" in loaded
+    assert not [name for name in loaded if name.startswith("nerfcli.train")]
+
+
 @pytest.mark.parametrize("name", nerfcli.__all__)
 def test_a_public_function_says_how_it_is_called(name):
     function = getattr(nerfcli, name)

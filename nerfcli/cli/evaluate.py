@@ -63,7 +63,6 @@ def evaluate(
     from nerfcli.evaluate.predictions import KINDS
     from nerfcli.runs.run import Run
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run
-    from nerfcli.workflows.train import train_other_seeds
 
     one_of(align, ("pose",), "--align")
     one_of(save_predictions, KINDS, "--save-predictions")
@@ -99,6 +98,8 @@ def evaluate(
         return
     folders = [Path(run) for run in runs]
     if seeds > 1:
+        from nerfcli.workflows.train import train_other_seeds
+
         with console.progress(f"train {seeds - 1} other seeds") as update:
             folders += train_other_seeds(
                 Run(folders[0]),
