@@ -59,7 +59,7 @@ MAY_IMPORT = {
     "selftest": {"render", "field", "kernels", "cameras"},
     "report": {"runs", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},
     "workflows": {
-        *("ablate", "report", "export", "evaluate", "train", "runs", "photos", "poses", "convert"),
+        *("ablate", "report", "export", "evaluate", "train", "runs", "photos", "doctor", "poses", "convert"),
         *("render", "field", "scene", "cameras", "media", "pages"),
     },
     "viewer": {"render", "field", "scene", "cameras", "media"},

@@ -1,6 +1,5 @@
 """nerfcli doctor: what to know of a capture before any long work."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,7 +7,7 @@ import typer
 
 from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, thread_count
+from nerfcli.cli.options import Json, Output, Overwrite, Quiet, Threads, one_of, thread_count
 from nerfcli.cli.poses import Intrinsics
 from nerfcli.errors import GATE_NOT_MET, UserError
 
@@ -47,63 +46,30 @@ def doctor(
       nerfcli doctor photos/kitchen --require look
       ls -d captures/*/ | nerfcli doctor - -o pages/
     """
-    if require is not None and require not in _GATES:
-        raise typer.BadParameter(f"{require!r}; choose {' or '.join(_GATES)}", param_hint="--require")
+    one_of(require, _GATES, "--require")
+    from nerfcli.doctor.examination import content
+    from nerfcli.workflows.doctor import examine_capture
+
     console = Console(quiet=quiet, json_lines=json)
 
     def work(path: Path, one_of_many: bool) -> None:
         page = result_path(path, suffix="-doctor.html", output=output, one_of_many=one_of_many)
-        diagnosis = examine_capture(
-            path,
-            page,
-            threads=thread_count(threads),
-            overwrite=overwrite,
-            console=console,
-            intrinsics=intrinsics,
-        )
-        from nerfcli.doctor.examination import content
-
+        with console.progress(f"doctor {path.name}") as update:
+            diagnosis = examine_capture(
+                path,
+                page,
+                threads=thread_count(threads),
+                overwrite=overwrite,
+                intrinsics=intrinsics,
+                notify=console.note,
+                progress=update,
+            )
+        _print_table(diagnosis, console)
         console.result(page, content(diagnosis))
         if require is not None:
             _hold_against(diagnosis, require)
 
     for_each_input(capture, work)
-
-
-def examine_capture(
-    path: Path, page: Path, *, threads: int, overwrite: bool, console: Console, intrinsics: Path | None = None
-) -> "Diagnosis":
-    """Examine a capture, write its page and print the table of findings; with a file of intrinsics, if they are known.
-
-    Raises:
-        UserError: see `find_subject`, `read_calibration` and `refuse_foreign`; or the page cannot be written.
-    """
-    import cv2
-
-    from nerfcli.atomic import cannot_write
-    from nerfcli.convert.intrinsics import read_calibration
-    from nerfcli.doctor.examination import estimated_seconds, examine
-    from nerfcli.doctor.page import refuse_foreign, write_page
-    from nerfcli.doctor.subject import find_subject
-
-    subject = find_subject(path)
-    calibration = None if intrinsics is None else read_calibration(intrinsics, images=path)
-    if page.is_dir():
-        raise UserError(f"{page} is a folder", "give the page's file name with -o")
-    if not overwrite:
-        refuse_foreign(page, path)
-    home = next(folder for folder in page.absolute().parents if folder.exists())
-    if not os.access(home, os.W_OK):  # before the work rather than after it
-        raise cannot_write(page, PermissionError(13, "no permission to write there"))
-    count = len(subject.sources)
-    seconds = estimated_seconds(count, threads)
-    console.note(f"{path}: {count} photos, about {_time(seconds)}")
-    cv2.setNumThreads(1)  # photos and pairs are worked on in parallel; threads within them only wait for each other
-    with console.progress(f"doctor {path.name}") as update:
-        diagnosis = examine(subject, threads=threads, progress=update, calibration=calibration)
-    write_page(diagnosis, page)
-    _print_table(diagnosis, console)
-    return diagnosis
 
 
 def _print_table(diagnosis: "Diagnosis", console: Console) -> None:
@@ -129,7 +95,3 @@ def _hold_against(diagnosis: "Diagnosis", require: str) -> None:
             worse[0].advice or "see the table",
             GATE_NOT_MET,
         )
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

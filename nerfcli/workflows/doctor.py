@@ -1,0 +1,59 @@
+"""From a capture to what an expert would say of it: the findings, and a page with thumbnails."""
+
+import os
+from pathlib import Path
+
+import cv2
+
+from nerfcli.atomic import cannot_write
+from nerfcli.convert.intrinsics import read_calibration
+from nerfcli.doctor.examination import Diagnosis, estimated_seconds, examine
+from nerfcli.doctor.page import refuse_foreign, write_page
+from nerfcli.doctor.subject import find_subject
+from nerfcli.errors import UserError
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+
+
+def examine_capture(
+    path: Path,
+    page: Path,
+    *,
+    threads: int,
+    overwrite: bool = False,
+    intrinsics: Path | None = None,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> Diagnosis:
+    """Examine a capture and write its page.
+
+    Args:
+        path: a folder of photos, or a scene.
+        page: the file to write.
+        threads: of the CPU.
+        overwrite: replace whatever stands at `page`.
+        intrinsics: a file with the cameras, if they are known.
+        notify: takes lines for the user.
+        progress: takes the share that is done and a few words.
+
+    Raises:
+        UserError: see `find_subject`, `read_calibration` and `refuse_foreign`; or the page cannot be written.
+    """
+    subject = find_subject(path)
+    calibration = None if intrinsics is None else read_calibration(intrinsics, images=path)
+    if page.is_dir():
+        raise UserError(f"{page} is a folder", "give the page's file name with -o")
+    if not overwrite:
+        refuse_foreign(page, path)
+    home = next(folder for folder in page.absolute().parents if folder.exists())
+    if not os.access(home, os.W_OK):  # before the work rather than after it
+        raise cannot_write(page, PermissionError(13, "no permission to write there"))
+    count = len(subject.sources)
+    notify(f"{path}: {count} photos, about {_time(estimated_seconds(count, threads))}")
+    cv2.setNumThreads(1)  # photos and pairs are worked on in parallel; threads within them only wait for each other
+    diagnosis = examine(subject, threads=threads, progress=progress, calibration=calibration)
+    write_page(diagnosis, page)
+    return diagnosis
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
