@@ -317,10 +317,9 @@ def _photo_sizes(capture: Capture) -> dict[str, tuple[int, int]]:
 
 
 def _report(target: Path) -> dict[str, Any]:
-    """poses_report.json, of a scene or of what a refusal leaves beside it."""
-    places = [target, *sorted(target.parent.glob(f"{target.name}*"))]
-    path = next((place / "poses_report.json" for place in places if (place / "poses_report.json").is_file()), None)
-    return {} if path is None else json.loads(path.read_text(encoding="utf-8"))
+    """poses_report.json, which a refusal leaves too; nothing where the command did not get so far."""
+    path = target / "poses_report.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
 
 
 def _error_text(log: Path) -> str:
