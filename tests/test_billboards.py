@@ -112,6 +112,25 @@ def test_the_spheres_have_a_shape(spheres_run):
     assert metrics["shape"]["field_psnr"] == pytest.approx(metrics["mean"]["psnr"], abs=0.5)
 
 
+def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(spheres_run, monkeypatch: pytest.MonkeyPatch):
+    """The photos' own numbers are those without the comparison, and the warning says why it is missing."""
+    scene = scenes.load(SPHERES)
+    photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
+    held_out = [HeldOut(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames[:1], factor=1, threads=1)]
+    model = load_model(spheres_run / "field.safetensors", "cpu")
+    billboards = Billboards(scene.train_frames, photos)
+
+    def singular(frame: Frame, pixels: np.ndarray) -> np.ndarray:
+        raise np.linalg.LinAlgError("singular matrix")
+
+    monkeypatch.setattr(billboards, "colours", singular)
+    plain = evaluate_model(model, held_out, on_image=lambda done, total: None)
+    metrics = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras(billboards=billboards))
+    assert metrics["shape"] is None
+    assert metrics["warnings"] == ["whether the field shows a shape could not be checked: LinAlgError: singular matrix"]
+    assert metrics["mean"] == plain["mean"]
+
+
 def test_one_training_view_and_a_view_that_none_has_seen_are_no_trouble():
     views = turned(2)
     billboards = Billboards(views[:1], [far_photo(views[0])])

@@ -166,7 +166,7 @@ def test_a_contradicted_model_is_mapped_again_from_its_sound_part(solved: Solved
     assert chance.examined.model is not None
     assert [attempt["models"] for attempt in chance.mapped.attempts] == [[10], [10]]
     assert told[0].endswith("the photos are mapped again, for 25 min at most")
-    assert told[-1] == "the largest part that agrees with itself, and the rest anew: 10 of 10 photos placed, accepted"
+    assert told[-1] == "from the largest part that agrees with itself: 10 of 10 photos placed, accepted"
     truth = synthetic.true_model(solved.views)
     for image_id in range(2, 11):
         relative = [
@@ -183,7 +183,7 @@ def test_each_hypothesis_stands_in_for_the_one_before(
     """The first, the first two, or all that map again give nothing; the last one keeps what agrees with itself."""
     wrong = wrongly_mapped(solved, tmp_path / "again")
     first = examine(wrong.models, wrong.job, lambda *told: None)
-    for name in ("_regrown", "_without_suspects", "_all_at_once")[:failing]:
+    for name in ("_regrown", "_from_nothing", "_all_at_once")[:failing]:
         monkeypatch.setattr(chances, name, lambda *arguments: None)
     chance = second_chance(wrong, first, lambda *progress: None, lambda note: None, checks=Checks)
     assert chance.examined.verdict.accepted
@@ -206,6 +206,8 @@ def test_groups_hold_together_against_what_speaks_against_them():
     joins = [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 5.0), (1, 4, -6.0), (5, 1, -1.0)]
     assert consistent_groups([1, 2, 3, 4, 5], joins) == [[1, 2], [3, 4], [5]]
     assert consistent_groups([4, 3, 2, 1], [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 7.0), (1, 4, -6.0)]) == [[4, 3, 2, 1]]
+    many_weak = [(1, 2, 9.0), (3, 4, 9.0), (1, 4, -6.0), *((one, other, 5.0) for one in (1, 2) for other in (3, 4))]
+    assert consistent_groups([1, 2, 3, 4], many_weak) == [[1, 2], [3, 4]]
     assert consistent_groups([], []) == []
 
 

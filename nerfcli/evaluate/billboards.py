@@ -18,6 +18,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of, focus_point, views_of
 from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.errors import reason_of
 from nerfcli.evaluate.metrics import psnr_of, to_8_bit
 from nerfcli.media.images import downscale
 
@@ -178,6 +179,8 @@ def reduction(frame: Frame) -> float:
 class ShapeEvidence:
     """Compares a field with billboards, photo by photo.
 
+    A comparison that cannot be computed ends none of the evaluation: `failure` then says why, and there is no shape.
+
     Args:
         billboards: fitted to the training photos.
     """
@@ -187,6 +190,7 @@ class ShapeEvidence:
         self._generator = np.random.default_rng(SEED + 1)
         self._pairs: list[tuple[float, float]] = []
         self._seconds = billboards.seconds
+        self.failure: str | None = None
 
     def add(self, frame: Frame, rendered: np.ndarray, photo: np.ndarray, used: np.ndarray) -> None:
         """Compare on some pixels of one held-out photo, made as small as the billboards are.
@@ -197,6 +201,13 @@ class ShapeEvidence:
             photo: (H, W, 3) uint8.
             used: (H, W) bool, the pixels that count; at least one.
         """
+        if self.failure is None:
+            try:
+                self._compare(frame, rendered, photo, used)
+            except Exception as error:  # it is auxiliary: the photo's own numbers are there
+                self.failure = reason_of(error)
+
+    def _compare(self, frame: Frame, rendered: np.ndarray, photo: np.ndarray, used: np.ndarray) -> None:
         began = time.perf_counter()
         factor = reduction(frame)
         small = downscale(photo, factor)
@@ -215,7 +226,7 @@ class ShapeEvidence:
 
     def shape(self) -> Shape | None:
         """What speaks for a shape; None where no photo could be compared."""
-        if not self._pairs:
+        if not self._pairs or self.failure is not None:
             return None
         pairs = np.array(self._pairs)
         gains = pairs[:, 0] - pairs[:, 1]

@@ -13,7 +13,7 @@ import torch
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.alignment import align_pose, halves
-from nerfcli.evaluate.billboards import Billboards, ShapeEvidence
+from nerfcli.evaluate.billboards import Billboards, Shape, ShapeEvidence
 from nerfcli.evaluate.colour import colour_aligned
 from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.novelty import novelty
@@ -146,7 +146,7 @@ def evaluate_model(
     return {
         "protocol": _protocol_name(held_out, extras),
         "shape": shape.to_json() if shape is not None else None,
-        "warnings": [shape.in_words()] if shape is not None and not shape.shown else [],
+        "warnings": _warnings(shape, evidence),
         "mean": mean_of(images),
         "images": images,
         "kinds": _kinds(images),
@@ -156,6 +156,12 @@ def evaluate_model(
             "slowest_seconds": max(seconds),
         },
     }
+
+
+def _warnings(shape: Shape | None, evidence: ShapeEvidence | None) -> list[str]:
+    if evidence is not None and evidence.failure is not None:
+        return [f"whether the field shows a shape could not be checked: {evidence.failure}"]
+    return [shape.in_words()] if shape is not None and not shape.shown else []
 
 
 def mean_of(images: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from nerfcli.atomic import write_json
+from nerfcli.errors import reason_of
 
 T = TypeVar("T")
 
@@ -49,9 +50,3 @@ class Checks:
         finally:
             if marker is not None:
                 marker.unlink(missing_ok=True)
-
-
-def reason_of(error: BaseException) -> str:
-    """Return one line for an exception: its type and the first line of its text."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

@@ -6,7 +6,7 @@ out other evidence and maps again; what it finds passes the same checks, against
 
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +24,7 @@ from nerfcli.poses.mapping import Start, map_globally, map_photos
 from nerfcli.poses.pairs import capture_order
 from nerfcli.poses.plan import duration
 from nerfcli.poses.stages import stage_key
-from nerfcli.poses.two_views import Agreement, agreements, read_verified_pairs
+from nerfcli.poses.two_views import agreements, read_verified_pairs
 from nerfcli.poses.view_graph import consistent_groups
 
 # Numbers of the mapper's runs that follow those of the ladder; they are part of the seed.
@@ -67,8 +67,8 @@ def second_chance(
     attempts = list(mapped.attempts)
     core = _core(mapped)
     hypotheses: list[tuple[str, Callable[[], Mapped | None]]] = [
-        ("the largest part that agrees with itself, and the rest anew", lambda: _regrown(mapped, core, report)),
-        ("without pairs that contradict that part", lambda: _without_suspects(mapped, core, report)),
+        ("from the largest part that agrees with itself", lambda: _regrown(mapped, core, report)),
+        ("from nothing, without pairs that contradict that part", lambda: _from_nothing(mapped, core, report)),
         ("all photos at once (global mapper)", lambda: _all_at_once(mapped, core)),
         ("that part alone", lambda: replace(mapped, models=[core.model, *mapped.models[1:]])),
     ]
@@ -101,69 +101,70 @@ def is_contradicted(verdict: Verdict) -> bool:
 
 @dataclass(frozen=True)
 class _Core:
-    """The largest group of photos that no pair contradicts strongly: image ids, model, all agreements of the model."""
+    """The largest group of photos that its strongest pairs hold together.
 
-    photos: frozenset[int]
+    model: with the photos of the group only. suspects: pairs of photo numbers that may be mistaken: they contradict the
+    group from within, or would join it with photos that stronger pairs keep apart from it.
+    """
+
     model: pycolmap.Reconstruction
-    found: list[Agreement]
+    suspects: frozenset[tuple[int, int]]
 
 
 def _core(mapped: Mapped) -> _Core:
-    model = mapped.models[0]
-    with closing(pycolmap.Database.open(str(mapped.job.database))) as database:
+    model, job = mapped.models[0], mapped.job
+    with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     found = agreements(model, pairs)
-    joins = [(a.one, a.other, a.matches * (2 * a.share - 1)) for a in found]
-    largest = frozenset(consistent_groups(sorted(model.reg_image_ids()), joins)[0])
+    joins = [(a.one, a.other, -a.matches if a.contradicts else a.matches * a.share) for a in found]
+    groups = consistent_groups(sorted(model.reg_image_ids()), joins)
+    group_of = {photo: number for number, group in enumerate(groups) for photo in group}
     rest = pycolmap.Reconstruction(model)
-    for photo in sorted(set(model.reg_image_ids()) - largest):
+    for photo in sorted(set(model.reg_image_ids()) - set(groups[0])):
         rest.deregister_frame(rest.image(photo).frame_id)
     rest.tear_down()
-    return _Core(largest, rest, found)
+    numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
+    suspects = {
+        (numbers[a.one], numbers[a.other]) for a in found if a.contradicts == (group_of[a.one] == group_of[a.other])
+    }
+    return _Core(rest, frozenset(suspects - _neighbours_in_order(job, suspects)))
+
+
+def _neighbours_in_order(job: Job, pairs: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Of an ordered capture, the pairs that are near in the order: the camera was in nearly the same place."""
+    order = capture_order(job.names)
+    if order is None:
+        return set()
+    place = {number: index for index, number in enumerate(order)}
+    return {(one, other) for one, other in pairs if abs(place[one] - place[other]) <= _NEAR_IN_ORDER}
 
 
 def _regrown(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
-    """Adjust the core, and place the other photos from there."""
-    job = mapped.job
-    if len(core.photos) < _LEAST_CORE * mapped.models[0].num_reg_images():
+    """Adjust the core, and place the other photos from there without the suspects."""
+    if core.model.num_reg_images() < _LEAST_CORE * mapped.models[0].num_reg_images():
         return None
     base = pycolmap.Reconstruction(core.model)
-    settle(base, threads=job.threads, fixed=job.fixed_cameras)
-    models = map_photos(job, report, attempt=_FIRST_ATTEMPT, start=Start(), base=base)
-    return Mapped(models, job, mapped.attempts)
+    settle(base, threads=mapped.job.threads, fixed=mapped.job.fixed_cameras)
+    return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT, base=base)
 
 
-def _without_suspects(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
-    """Map from the beginning without the pairs that may be mistaken.
+def _from_nothing(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
+    """Map from the beginning without the suspects."""
+    return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT + 1, base=None) if core.suspects else None
 
-    These are the ones that contradict the core from within, and those that hold other photos to it where the model is
-    refused. In an ordered capture, neighbours in the order are above suspicion.
-    """
-    suspects = {
-        (a.one, a.other)
-        for a in core.found
-        if (a.contradicts and {a.one, a.other} <= core.photos)
-        or (not a.contradicts and len({a.one, a.other} & core.photos) == 1)
-    }
-    if not suspects:
-        return None
-    numbers = {image_id: number for number, image_id in enumerate(mapped.job.image_ids)}
-    order = capture_order(mapped.job.names)
-    place = {} if order is None else {number: index for index, number in enumerate(order)}
-    dropped = {
-        (numbers[one], numbers[other])
-        for one, other in suspects
-        if not place or abs(place[numbers[one]] - place[numbers[other]]) > _NEAR_IN_ORDER
-    }
-    job = _with_own_database(mapped.job, without=dropped)
-    models = map_photos(job, report, attempt=_FIRST_ATTEMPT + 1, start=Start())
+
+def _mapped_without(
+    mapped: Mapped, core: _Core, report: Report, *, attempt: int, base: pycolmap.Reconstruction | None
+) -> Mapped:
+    job = _with_own_database(mapped.job, without=core.suspects)
+    models = map_photos(job, report, attempt=attempt, start=Start(), base=base)
     job.database.unlink()
     return Mapped(models, mapped.job, mapped.attempts)
 
 
 def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
     """Rotations, then positions, of all photos together; with the intrinsics of the core."""
-    job = _with_own_database(mapped.job, without=set())
+    job = _with_own_database(mapped.job, without=frozenset())
     with closing(pycolmap.Database.open(str(job.database))) as database:
         for camera in core.model.cameras.values():
             camera.has_prior_focal_length = True
@@ -173,7 +174,7 @@ def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
     return Mapped(models, mapped.job, mapped.attempts)
 
 
-def _with_own_database(job: Job, *, without: set[tuple[int, int]]) -> Job:
+def _with_own_database(job: Job, *, without: frozenset[tuple[int, int]]) -> Job:
     """Copy the job's database, without some pairs of photo numbers, and return the job of the copy."""
     copy = replace(job, rung="second-chance")
     shutil.copyfile(job.database, copy.database)

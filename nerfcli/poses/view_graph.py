@@ -4,7 +4,6 @@ A chain of joins is as strong as its weakest; the bottleneck of two photos is th
 """
 
 from collections.abc import Iterable, Sequence
-from heapq import heapify, heappop, heappush
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,10 +50,10 @@ def parts(photos: Sequence[int], joins: Iterable[tuple[int, int]]) -> list[list[
 
 
 def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list[int]]:
-    """Divide photos into groups that hold together against what speaks for keeping them apart.
+    """Divide photos into groups that the strongest evidence allows.
 
-    Joins with a strength above 0 speak for one group, those below 0 against it. The strongest join is contracted, its
-    parallel joins are added up, and so on until none above 0 is left.
+    Joins with a strength above 0 speak for one group, those below 0 against it. The stronger one wins: in the order of
+    their absolute strength, a join for one group brings two groups together unless a stronger one keeps them apart.
 
     Args:
         photos: any numbers.
@@ -67,30 +66,26 @@ def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list
         >>> consistent_groups([1, 2, 3, 4], [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 5.0), (1, 4, -6.0)])
         [[1, 2], [3, 4]]
 
-    Source: greedy additive edge contraction, Keuper et al. 2015, Efficient Decomposition of Image and Mesh Graphs by
-    Lifted Multicuts, arXiv:1505.06973, algorithm 1.
+    Source: mutex watershed, Wolf et al. 2019, The Mutex Watershed and its Objective, arXiv:1904.12654, algorithm 1.
     """
+    group_of = {photo: photo for photo in photos}
     members = {photo: [photo] for photo in photos}
-    strengths: dict[int, dict[int, float]] = {photo: {} for photo in photos}
-    for one, other, strength in joins:
-        for a, b in ((one, other), (other, one)):
-            strengths[a][b] = strengths[a].get(b, 0.0) + strength
-    heap = [(-s, a, b) for a, row in strengths.items() for b, s in row.items() if a < b and s > 0]
-    heapify(heap)
-    while heap:
-        strength, one, other = heappop(heap)
-        if strengths.get(one, {}).get(other) != -strength:
-            continue  # of a join that was contracted or added to since
-        members[one].extend(members.pop(other))
-        del strengths[one][other]
-        for third, more in strengths.pop(other).items():
-            if third == one:
-                continue
-            del strengths[third][other]
-            together = strengths[one].get(third, 0.0) + more
-            strengths[one][third] = strengths[third][one] = together
-            if together > 0:
-                heappush(heap, (-together, min(one, third), max(one, third)))
+    apart: dict[int, set[int]] = {photo: set() for photo in photos}
+    for one, other, strength in sorted(joins, key=lambda join: -abs(join[2])):
+        first, second = group_of[one], group_of[other]
+        if first == second or strength == 0:
+            continue
+        if strength < 0:
+            apart[first].add(second)
+            apart[second].add(first)
+        elif second not in apart[first]:
+            for photo in members[second]:
+                group_of[photo] = first
+            members[first].extend(members.pop(second))
+            for third in apart.pop(second):
+                apart[third].remove(second)
+                apart[third].add(first)
+                apart[first].add(third)
     order = {photo: index for index, photo in enumerate(photos)}
     groups = [sorted(group, key=order.__getitem__) for group in members.values()]
     return sorted(groups, key=lambda group: (-len(group), order[group[0]]))

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.errors import UserError
+from nerfcli.errors import UserError, reason_of
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
-from nerfcli.train.camera_check import check_cameras
+from nerfcli.train.camera_check import CameraCheck, check_cameras
 from nerfcli.train.error_map import ErrorMap
 from nerfcli.train.extent import Extent, choose_extent, lacks_depth
 from nerfcli.train.fitting import Fitting
@@ -151,13 +151,13 @@ def prepare(
         settings = replace(settings, components=begun.components)
     elif settings.model == "auto":
         began = time.perf_counter()
-        facts, known = _facts(scene, album, extent, settings, pool=pool, shared=shared)
+        facts, known = _facts(scene, album, extent, settings, pool=pool, shared=shared, notify=notify)
         selection = _search(
             scene, album, extent, settings, facts=facts, known=known, room=room, began=began, notify=notify
         )
         settings, log_focal = replace(settings, components=selection.components), selection.log_focal
     elif settings.components.cameras in LEARN_FOCAL:
-        facts, _ = _facts(scene, album, extent, settings, pool=pool, shared=shared)
+        facts, _ = _facts(scene, album, extent, settings, pool=pool, shared=shared, notify=notify)
         _, log_focal, decisions = with_known_cameras(settings.components, facts)
         for decision in decisions:
             notify(decision.in_words())
@@ -179,7 +179,14 @@ def prepare(
 
 
 def _facts(
-    scene: Scene, album: Album, extent: Extent, settings: TrainSettings, *, pool: PixelPool, shared: Shared
+    scene: Scene,
+    album: Album,
+    extent: Extent,
+    settings: TrainSettings,
+    *,
+    pool: PixelPool,
+    shared: Shared,
+    notify: Callable[[str], None],
 ) -> tuple[Facts, PointDepths | None]:
     """What is known before anything is learned, and the pixels whose distance is known, where these may be asked."""
     lacks_points = album.fills_frame and len(scene.points) == 0
@@ -192,7 +199,7 @@ def _facts(
         has_alpha=album.colours.shape[-1] == 4,
         has_exif=bool(np.ptp(_exif(scene)) > 0.0),
         cameras_known=_known(scene) or (None if has_time else "there is no time to compare photos"),
-        cameras=check_cameras(album.photos, shared.matched) if lacks_points and has_time else None,
+        cameras=_camera_check(album, shared, notify=notify) if lacks_points and has_time else None,
         fixed=settings.fixed,
     )
     if not tells_points(settings.components, facts):
@@ -204,6 +211,15 @@ def _facts(
     else:
         return facts, None
     return replace(facts, points=len(known.numbers)), known
+
+
+def _camera_check(album: Album, shared: Shared, *, notify: Callable[[str], None]) -> CameraCheck | None:
+    """Check the cameras against matched features; a check that cannot be computed says nothing and ends no training."""
+    try:
+        return check_cameras(album.photos, shared.matched)
+    except Exception as error:
+        notify(f"the cameras could not be checked against matched features: {reason_of(error)}")
+        return None
 
 
 def _search(
