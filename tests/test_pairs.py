@@ -222,11 +222,38 @@ def test_the_outlook_measures_and_stretches_what_is_to_come():
     # Half of it was there already: what is left is measured on the rest alone.
     outlook.update("match", 20, 40)
     now = 25.0
-    assert outlook.update("match", 30, 40)[1] == pytest.approx(5.0 + 10.0 * 20 / 30)
+    # 25 s for what the plan has 10 + 7.5 s for.
+    assert outlook.update("match", 30, 40)[1] == pytest.approx(5.0 + 10.0 * 25 / 17.5)
     now = 30.0
     outlook.update("map", 10, 10)
     assert outlook.update("map", 10, 10) == (1.0, 0.0)
     assert outlook.update("check", 1, 4) == (1.0, 0.0)
+
+
+def test_a_short_stage_that_takes_long_stretches_the_others_only_a_little():
+    """A stage planned for 1 s takes 20; the other 100 s are not announced to take 2000."""
+    now = 0.0
+    seconds = {"extract": 50.0, "pair": 1.0, "match": 100.0}
+    outlook = Outlook(Plan(10, 1600, 4096, "sequential", 45, seconds), clock=lambda: now)
+    outlook.update("extract", 0, 10)
+    now = 50.0
+    outlook.update("extract", 10, 10)
+    outlook.update("pair", 0, 10)
+    now = 70.0
+    outlook.update("pair", 10, 10)
+    assert outlook.update("match", 0, 45)[1] == pytest.approx(100.0 * 70 / 51)
+
+
+@pytest.mark.parametrize("seconds_per_photo", [0.2, 1.0, 5.0])
+def test_the_mapper_takes_longer_for_later_photos(seconds_per_photo: float):
+    """Closed form: seconds grow as the number of photos to the power of 1.3, and the remaining time is exact."""
+    now = 0.0
+    outlook = Outlook(Plan(300, 1600, 4096, "sequential", 9000, {"map": 100.0}), clock=lambda: now)
+    whole = seconds_per_photo * 300**1.3
+    outlook.update("map", 0, 300)
+    for done in range(30, 300, 30):
+        now = seconds_per_photo * done**1.3
+        assert outlook.update("map", done, 300)[1] == pytest.approx(whole - now)
 
 
 def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_from_the_share():

@@ -16,7 +16,11 @@ _SECONDS_PER_MEGAPIXEL = 0.4
 _SECONDS_PER_PAIR = 0.045
 _FEATURES_PER_PAIR = 4096
 _SECONDS_PER_LOOK = 0.0006
-_MAP_SECONDS_PER_PHOTO = 0.3
+# Of the mapper: the first for few photos; the second for each other photo, since all are adjusted again and again.
+_MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.3, 0.0025
+_CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.1
+# How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
+_GROWTH = {"map": 1.3}
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Plan:
 
 
 # In the order of the work.
-_WORDS = {"extract": "features", "pair": "pairs", "match": "matches", "map": "poses"}
+_WORDS = {"extract": "features", "pair": "pairs", "match": "matches", "map": "poses", "check": "checks"}
 
 
 def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threads: int) -> Plan:
@@ -58,7 +62,8 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
         "extract": megapixels * _SECONDS_PER_MEGAPIXEL / threads,
         "pair": all_pairs * _SECONDS_PER_LOOK / threads if pairing.neighbours else 0.0,
         "match": pairs * _SECONDS_PER_PAIR * settings.max_features / _FEATURES_PER_PAIR / threads,
-        "map": count * _MAP_SECONDS_PER_PHOTO,
+        "map": count * (_MAP_SECONDS_PER_PHOTO + count * _MAP_SECONDS_PER_TWO),
+        "check": _CHECK_SECONDS + count * _CHECK_SECONDS_PER_PHOTO,
     }
     return Plan(
         photos=count,
@@ -73,9 +78,10 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
 class Outlook:
     """How much is left, told as the work goes on: measured for the stage at hand, for later ones from the plan.
 
-    The plan's seconds are stretched by what the stages so far took longer, so that after a few photos it fits the
-    machine and what else it does. Which photos are enlarged to find more features in them is known only after the first
-    search; where that adds work, the share that is done stands still until it is true again.
+    The plan's seconds are stretched by how much longer all work so far took, so that after a few photos it fits the
+    machine and what else it does. Work that an earlier call has done counts for nothing. Which photos are enlarged to
+    find more features in them is known only after the first search; where that adds work, the share that is done stands
+    still until it is true again.
 
     Args:
         plan: for the stages that have not begun.
@@ -87,8 +93,9 @@ class Outlook:
         self._clock = clock
         self._start = clock()
         self._stage = ""
-        self._began = (0.0, 0)
-        self._stretch = 1.0
+        self._began = (0.0, 0.0)
+        self._worked = (0.0, 0.0)  # seconds, and what the plan has for the same work, of the stages before
+        self._latest = (0.0, 0.0)  # the same of the stage at hand
         self._seconds = dict(plan.seconds)
         self._share = 0.0
 
@@ -97,21 +104,22 @@ class Outlook:
         now = self._clock()
         if stage == "enlarge":
             self._plan_enlarging(total)
-        if stage != self._stage or done < self._began[1]:
-            self._stage, self._began = stage, (now, done)
+        ratio = (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
+        if stage != self._stage or ratio < self._began[1]:
+            self._worked = (self._worked[0] + self._latest[0], self._worked[1] + self._latest[1])
+            self._stage, self._began = stage, (now, ratio)
         planned = self._seconds.get(stage, 0.0)
-        began, done_before = self._began
-        if done > done_before:
-            left = (now - began) * (total - done) / (done - done_before)
-            whole = (now - began) * total / (done - done_before)
-            if planned > 0:
-                self._stretch = whole / planned
+        began, ratio_before = self._began
+        self._latest = (now - began, planned * (ratio - ratio_before))
+        seconds, of_plan = self._worked[0] + self._latest[0], self._worked[1] + self._latest[1]
+        stretch = seconds / of_plan if of_plan > 0 else 1.0
+        if ratio > ratio_before:
+            left = (now - began) * (1 - ratio) / (ratio - ratio_before)
         else:
-            left = self._stretch * planned * (total - done) / max(total, 1)
+            left = stretch * planned * (1 - ratio)
         stages = list(self._seconds)
-        # What is not planned comes last, and is short.
         later = stages[stages.index(stage) + 1 :] if stage in stages else []
-        left += self._stretch * sum(self._seconds[name] for name in later)
+        left += stretch * sum(self._seconds[name] for name in later)
         spent = now - self._start
         self._share = max(self._share, spent / (spent + left) if left > 0 else 1.0)
         return self._share, left
