@@ -386,6 +386,22 @@ def test_damaged_files_are_named_and_the_rest_is_examined(tmp_path):
     assert content(diagnosis)["verdict"] == BAD
 
 
+def test_a_check_that_raises_is_listed_and_the_others_are_made(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    folder = write(tmp_path / "photos", [view((0.2 * step, 0, 0)) for step in range(3)])
+
+    def singular(*arguments: object) -> None:
+        raise np.linalg.LinAlgError("singular matrix")
+
+    monkeypatch.setattr("nerfcli.doctor.geometry.movement", singular)
+    monkeypatch.setattr("nerfcli.doctor.quality.stops", singular)
+    diagnosis = examine(find_subject(folder), threads=2, progress=lambda share, detail: None)
+    why = "could not be computed: LinAlgError: singular matrix"
+    assert dict(diagnosis.not_checked).items() >= {"movement": why, "stops": why}.items()
+    assert finding(diagnosis, "count").verdict == BAD
+    assert page_html(diagnosis).count("singular matrix") == 2
+    assert [photo["stops"] for photo in content(diagnosis)["photos"]] == [None] * 3
+
+
 def test_nothing_readable_is_a_finding_too(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"no picture")
     diagnosis = examine(find_subject(tmp_path), threads=1, progress=lambda share, detail: None)

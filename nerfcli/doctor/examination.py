@@ -12,6 +12,7 @@ from nerfcli.doctor.findings import Finding, as_json, worst
 from nerfcli.doctor.matching import Pair, compare, focal_px
 from nerfcli.doctor.photos import MOST_FEATURES, PhotoFacts, read_all
 from nerfcli.doctor.subject import Subject
+from nerfcli.poses.checks import Checks
 
 # Measured on one core of a 2-core server; within a factor of two on other CPUs.
 _SECONDS_PER_PHOTO = 0.45
@@ -128,47 +129,68 @@ def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Seq
 
 
 def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unreadable: dict[str, str]) -> Diagnosis:
-    """All findings on photos that were read and compared; unreadable tells by name why others could not be read."""
-    lack = quality.lacking_detail(photos, pairs)
-    lighter, redder = quality.stops(photos, pairs)
-    found: list[Finding | None] = [
-        inventory.readable(unreadable, len(photos)),
-        inventory.enough(len(photos)),
-        inventory.size(photos),
-        inventory.cameras(photos),
-        inventory.focal_length(photos),
-        inventory.orientation(photos),
-        inventory.duplicates(photos, pairs),
-        quality.sharpness(photos, lack),
-        quality.texture(photos),
-        quality.exposure(photos, lighter),
-        quality.white_balance(photos, redder),
-        quality.clipping(photos),
+    """All findings on photos that were read and compared; unreadable tells by name why others could not be read.
+
+    A check that raises is listed among those that were not made, and the others go on.
+    """
+    checks = Checks()
+    unknown = np.full(len(photos), np.nan)
+    lack = checks.run("lacking detail", lambda: quality.lacking_detail(photos, pairs), otherwise=unknown)
+    lighter, redder = checks.run("stops", lambda: quality.stops(photos, pairs), otherwise=(unknown, unknown))
+    planned: list[tuple[str, Callable[[], Finding | None]]] = [
+        ("readable photos", lambda: inventory.readable(unreadable, len(photos))),
+        ("number of photos", lambda: inventory.enough(len(photos))),
+        ("size", lambda: inventory.size(photos)),
+        ("cameras", lambda: inventory.cameras(photos)),
+        ("focal length", lambda: inventory.focal_length(photos)),
+        ("orientation", lambda: inventory.orientation(photos)),
+        ("duplicates", lambda: inventory.duplicates(photos, pairs)),
+        ("sharpness", lambda: quality.sharpness(photos, lack)),
+        ("texture", lambda: quality.texture(photos)),
+        ("exposure", lambda: quality.exposure(photos, lighter)),
+        ("white balance", lambda: quality.white_balance(photos, redder)),
+        ("clipping", lambda: quality.clipping(photos)),
     ]
     not_checked: list[tuple[str, str]] = []
+    few = "too few pairs with enough matches tell"
     if len(photos) > 1:
-        found.append(graph.connectivity(photos, pairs))
-        turning = turntable.turning_object(pairs)
+        turning = checks.run("turning object", lambda: turntable.turning_object(pairs), otherwise=None)
+        planned.append(("connectivity", lambda: graph.connectivity(photos, pairs)))
         if turning is None:
-            movement, relief = geometry.movement(photos, pairs), geometry.flatness(pairs)
-            found += [geometry.moving_content(photos, pairs), movement, relief]
-            for name, finding in (("movement", movement), ("depth relief", relief)):
-                if finding is None:
-                    not_checked.append((name, "too few pairs with enough matches tell"))
+            planned += [
+                ("moving content", lambda: geometry.moving_content(photos, pairs)),
+                ("movement", lambda: _or_not_checked("movement", geometry.movement(photos, pairs), few, not_checked)),
+                ("depth relief", lambda: _or_not_checked("depth relief", geometry.flatness(pairs), few, not_checked)),
+            ]
         else:
-            found.append(turning)
+            planned.append(("turning object", lambda: turning))
             reason = "the camera stood still while an object turned before it"
             not_checked.append(("moving content, movement, depth relief", reason))
     else:
         not_checked.append(("connectivity, movement, moving content", "one photo cannot tell"))
-    found.append(coverage.gps(photos))
+    planned.append(("GPS", lambda: coverage.gps(photos)))
+    found = [checks.run(name, compute, otherwise=None) for name, compute in planned]
     if subject.scene is None:
         not_checked.append(("directions", "needs poses: find them with nerfcli poses, then examine the scene"))
     else:
-        found += [coverage.spread(subject.scene), coverage.directions(subject.scene), coverage.points(subject.scene)]
-        found += coverage.belongings(subject.scene)
+        of_scene = subject.scene
+        found += [
+            checks.run("spread of cameras", lambda: coverage.spread(of_scene), otherwise=None),
+            checks.run("directions", lambda: coverage.directions(of_scene), otherwise=None),
+            checks.run("points", lambda: coverage.points(of_scene), otherwise=None),
+        ]
+        found += checks.run("files of the scene", lambda: coverage.belongings(of_scene), otherwise=[])
+    not_checked += [(name, f"could not be computed: {why}") for name, why in checks.not_computed.items()]
     findings = tuple(finding for finding in found if finding is not None)
     return Diagnosis(subject, findings, tuple(not_checked), tuple(photos), lack, lighter, tuple(pairs))
+
+
+def _or_not_checked(
+    name: str, finding: Finding | None, reason: str, not_checked: list[tuple[str, str]]
+) -> Finding | None:
+    if finding is None:
+        not_checked.append((name, reason))
+    return finding
 
 
 def _focals(subject: Subject, photos: Sequence[PhotoFacts]) -> list[float]:
