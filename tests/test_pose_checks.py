@@ -25,7 +25,7 @@ from synthetic_captures import LONG, WIDE, Noise
 from nerfcli import scene as scenes
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.finite import finite
-from nerfcli.poses import acceptance, examine
+from nerfcli.poses import acceptance, examine, worker
 from nerfcli.poses.checks import UNDERWAY, Checks
 from nerfcli.poses.components import describe_components
 from nerfcli.poses.job import Job
@@ -34,7 +34,6 @@ from nerfcli.poses.mapped import mapping_key, read_mapped, write_mapped
 from nerfcli.poses.report import PosesReport, closing_notes
 from nerfcli.poses.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
-from nerfcli.poses.worker import solve
 
 ONE_THREAD = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
 PLACES = st.sampled_from([0.0, 1e-300, 1.0, 1e30, math.inf, -math.inf, math.nan])
@@ -146,7 +145,10 @@ def test_a_skipped_check_is_not_started(job: Job, tmp_path: Path):
 def test_a_result_that_is_not_finite_is_written_as_null(job: Job, monkeypatch: pytest.MonkeyPatch):
     infinite = dict.fromkeys(range(1, 9), math.inf)
     monkeypatch.setattr(examine, "pose_blur_px", lambda model, **options: infinite)
-    solve(job, lambda *progress: None, lambda note: None)
+    # There are no photos: their features are in the database already.
+    monkeypatch.setattr(worker, "extract", lambda job, report: None)
+    monkeypatch.setattr(worker, "with_object_masks", lambda job, training, tell: (job, None))
+    worker.solve(job, lambda *progress: None, lambda note: None)
     content = json.loads((Path(job.folder) / "result.json").read_text(encoding="utf-8"))["content"]
     assert set(content["pose_blur_px"].values()) == {None}
     assert content["not_finite"]["pose_blur_px.0"] == "inf"

@@ -19,6 +19,7 @@ from nerfcli.poses.database import keep_geometries
 from nerfcli.poses.examine import Examined, examine
 from nerfcli.poses.intrinsics import settle
 from nerfcli.poses.job import Job, Report, Tell
+from nerfcli.poses.ladder import SMALLER_BASELINE
 from nerfcli.poses.mapped import Mapped, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.mapping import Start, map_globally, map_photos
 from nerfcli.poses.pairs import capture_order
@@ -33,6 +34,7 @@ _FIRST_ATTEMPT = 100
 _LEAST_CORE = 0.3
 # In an ordered capture, photos so near in the order are taken to be neighbours in space.
 _NEAR_IN_ORDER = 10
+_ALL_AT_ONCE = "all photos at once (global mapper)"
 # A hypothesis is not started when those before it took this many times as long as the first mapping.
 _MOST_TIME = 1.5
 
@@ -65,12 +67,18 @@ def second_chance(
     against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
     tell(f"{against}: the photos are mapped again, for {duration(_MOST_TIME * mapped.seconds)} at most")
     attempts = list(mapped.attempts)
-    core = _core(mapped)
+    core = _core(mapped.models[0], mapped.job)
+    at_once: list[Mapped] = []  # what the global mapper gave, to build upon
+
+    def grown_from_all() -> Mapped | None:
+        return _regrown(mapped, _core(at_once[0].models[0], mapped.job), report) if at_once else None
+
     hypotheses: list[tuple[str, Callable[[], Mapped | None]]] = [
         ("from the largest part that agrees with itself", lambda: _regrown(mapped, core, report)),
-        ("from nothing, without pairs that contradict that part", lambda: _from_nothing(mapped, core, report)),
-        ("all photos at once (global mapper)", lambda: _all_at_once(mapped, core)),
-        ("that part alone", lambda: replace(mapped, models=[core.model, *mapped.models[1:]])),
+        (_ALL_AT_ONCE, lambda: _all_at_once(mapped, core)),
+        ("from the largest part of that", grown_from_all),
+        ("from nothing, from other pairs of photos", lambda: _from_nothing(mapped, core, report)),
+        ("the largest part of the first model alone", lambda: replace(mapped, models=[core.model, *mapped.models[1:]])),
     ]
     for number, (what, make) in enumerate(hypotheses):
         last = number == len(hypotheses) - 1
@@ -83,6 +91,8 @@ def second_chance(
         if found is None or not found.models:
             tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
             continue
+        if what == _ALL_AT_ONCE:
+            at_once.append(found)
         examined = examine(found.models[:1], found.job, report, checks=runner)
         size = 0 if examined.model is None else examined.model.num_reg_images()
         attempts.append({"what": what, "models": [size, *(m.num_reg_images() for m in found.models[1:])]})
@@ -111,8 +121,7 @@ class _Core:
     suspects: frozenset[tuple[int, int]]
 
 
-def _core(mapped: Mapped) -> _Core:
-    model, job = mapped.models[0], mapped.job
+def _core(model: pycolmap.Reconstruction, job: Job) -> _Core:
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
     found = agreements(model, pairs)
@@ -149,15 +158,16 @@ def _regrown(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
 
 
 def _from_nothing(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
-    """Map from the beginning without the suspects."""
-    return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT + 1, base=None) if core.suspects else None
+    """Map from the beginning, with another seed, from a pair of photos nearer to each other, without the suspects."""
+    return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT + 1, base=None)
 
 
 def _mapped_without(
     mapped: Mapped, core: _Core, report: Report, *, attempt: int, base: pycolmap.Reconstruction | None
 ) -> Mapped:
     job = _with_own_database(mapped.job, without=core.suspects)
-    models = map_photos(job, report, attempt=attempt, start=Start(), base=base)
+    start = Start() if base is not None else SMALLER_BASELINE
+    models = map_photos(job, report, attempt=attempt, start=start, base=base)
     job.database.unlink()
     return Mapped(models, mapped.job, mapped.attempts)
 
