@@ -161,6 +161,22 @@ def ring(
     return views
 
 
+def dome(count: int, lens: Lens, *, seed: int, radius: float = 4.2, span_deg: float = 60) -> list[View]:
+    """Photos from one side of the origin, in rows that span so much of the sphere to both sides, as a robot takes."""
+    rng = np.random.default_rng(seed)
+    side = int(np.ceil(np.sqrt(count)))
+    views = []
+    for index in range(count):
+        across, up = (index % side) / (side - 1), (index // side) / (side - 1)
+        angle, height = np.radians([span_deg * (2 * across - 1), 20 + 0.6 * span_deg * up]) + rng.normal(
+            scale=0.02, size=2
+        )
+        ahead = np.array([np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)])
+        centre = radius * rng.uniform(0.97, 1.03) * ahead
+        views.append(View(lens, looking_at(centre, rng.normal(scale=0.05, size=3))))
+    return views
+
+
 def panorama(count: int, lens: Lens, *, turn_deg: float = 300) -> list[View]:
     """Photos from one place, the camera only being turned."""
     angles = np.radians(turn_deg) * np.arange(count) / count
@@ -342,13 +358,32 @@ def true_model(views: Sequence[View]) -> pycolmap.Reconstruction:
     return model
 
 
-def observed_model(views: Sequence[View], scene: Scene, *, noise_px: float, seed: int) -> pycolmap.Reconstruction:
-    """The true cameras, poses and points, and where each view sees the points, with noise."""
+def observed_model(
+    views: Sequence[View], scene: Scene, *, noise_px: float, seed: int, shiny: float = 0.0, slide: float = 0.05
+) -> pycolmap.Reconstruction:
+    """The true cameras, poses and points, and where each view sees the points, with noise.
+
+    shiny: share of the points that are highlights: they slide along the surface as the view moves, each in a direction
+    of its own, by about `slide` of the scene's unit from the middle to the side.
+    """
     rng = np.random.default_rng(seed)
     model = true_model(views)
+    highlights = np.random.default_rng([seed, 1])
+    directions = np.cross(scene.normals, highlights.normal(size=scene.points.shape))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    slides = (
+        slide * np.abs(highlights.normal(size=len(directions))) * (highlights.uniform(size=len(directions)) < shiny)
+    )
     sightings: dict[int, list[tuple[int, int]]] = {}
     for number, view in enumerate(views):
         points, pixels = seen(view, scene)
+        if shiny:
+            towards = view.centre - scene.points[points]
+            towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+            along = slides[points] * np.einsum("ij,ij->i", towards, directions[points])
+            slid = scene.points[points] + along[:, None] * directions[points]
+            local = slid @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
+            pixels = np.asarray(_camera(view.lens, 1).img_from_cam(local), dtype=np.float64)
         noisy = pixels + rng.normal(scale=noise_px, size=pixels.shape)
         model.image(number + 1).points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in noisy])
         for index, point in enumerate(points):

@@ -232,7 +232,7 @@ def test_a_dry_run_says_which_cameras_are_used(tmp_path: Path):
     ("line", "named"),
     [
         ("--intrinsics-as prior", "there are no intrinsics to use so"),
-        ("--intrinsics c.txt --intrinsics-as loose", "'loose'; choose fixed, prior"),
+        ("--intrinsics c.txt --intrinsics-as loose", "'loose'; choose fixed or prior"),
         ("--intrinsics c.txt --camera-model OPENCV", "leave out --camera-model"),
     ],
 )

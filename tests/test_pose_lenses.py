@@ -66,39 +66,39 @@ def camera_of(model: pycolmap.Reconstruction) -> pycolmap.Camera:
 )
 def test_the_lens_model_is_the_one_that_took_the_pictures(name: str, params: tuple[float, ...]):
     """Synthetic truth; nothing richer is kept than what was there, and the principal point stays at the centre."""
-    chosen, tried = choose_lenses(started_from(ring_model(name, params), "SIMPLE_RADIAL"), seed=0, threads=1)
-    camera = camera_of(chosen)
+    lenses = choose_lenses(started_from(ring_model(name, params), "SIMPLE_RADIAL"), seed=0, threads=1)
+    camera = camera_of(lenses.model)
     assert camera.model.name == name
     assert (camera.principal_point_x, camera.principal_point_y) == (512.0, 384.0)
     assert camera.mean_focal_length() == pytest.approx(params[0], rel=0.005)
-    kept = [candidate for candidate in tried if candidate.kept]
+    kept = [candidate for candidate in lenses.candidates if candidate.kept]
     assert kept[-1].model == name
-    # Half a pixel of noise in both coordinates is a mean distance of 0.63 px; points of few photos are uncertain too.
-    assert kept[-1].held_out_px is not None
-    assert 0.6 < kept[-1].held_out_px < 1.3
+    if kept[-1].held_out_px is not None:  # a wide lens
+        # Half a pixel of noise in both coordinates is a mean distance of 0.63 px; points of few photos are uncertain.
+        assert 0.6 < kept[-1].held_out_px < 1.3
 
 
 def test_a_principal_point_off_the_centre_is_found():
     """Synthetic truth: 1.5 % of the width off, recovered to two pixels."""
     noisy = ring_model("SIMPLE_RADIAL", (800.0, 527.0, 380.0, 0.05))
-    chosen, tried = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1)
-    assert camera_of(chosen).params[1:3] == pytest.approx((527.0, 380.0), abs=2.0)
-    assert any(candidate.principal_point and candidate.kept for candidate in tried)
+    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1)
+    assert camera_of(lenses.model).params[1:3] == pytest.approx((527.0, 380.0), abs=2.0)
+    assert any(candidate.principal_point and candidate.kept for candidate in lenses.candidates)
 
 
 def test_intrinsics_that_are_given_stay():
     _, noisy = synthetic_model("SIMPLE_RADIAL", [1280.0, 527.0, 380.0, 0.05])
     camera_of(noisy).params = [1300.0, 512.0, 384.0, 0.04]
-    chosen, tried = choose_lenses(noisy, seed=0, threads=1, fixed=[1])
-    assert camera_of(chosen).params.tolist() == [1300.0, 512.0, 384.0, 0.04]
-    assert tried == []
+    lenses = choose_lenses(noisy, seed=0, threads=1, fixed=[1])
+    assert camera_of(lenses.model).params.tolist() == [1300.0, 512.0, 384.0, 0.04]
+    assert lenses.candidates == []
 
 
 def test_a_named_model_stays():
     noisy = ring_model("RADIAL", (1000.0, 512.0, 384.0, 0.1, -0.2))
-    chosen, tried = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1, named=[1])
-    assert camera_of(chosen).model.name == "SIMPLE_RADIAL"
-    assert {candidate.model for candidate in tried} == {"SIMPLE_RADIAL"}
+    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1, named=[1])
+    assert camera_of(lenses.model).model.name == "SIMPLE_RADIAL"
+    assert {candidate.model for candidate in lenses.candidates} == {"SIMPLE_RADIAL"}
 
 
 @pytest.mark.parametrize("name", ["RADIAL", "OPENCV", "SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"])

@@ -14,7 +14,7 @@ import pycolmap
 from nerfcli.poses import held_out
 from nerfcli.poses.checks import Checks
 from nerfcli.poses.contradictions import Contradiction, strong_contradictions
-from nerfcli.poses.intrinsics import is_centred
+from nerfcli.poses.determined import is_centred
 from nerfcli.poses.parallax import Turn
 from nerfcli.poses.two_views import Agreement, RotationError, VerifiedPair, agreements, rotation_errors
 

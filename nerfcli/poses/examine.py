@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import pycolmap
@@ -10,7 +10,7 @@ import pycolmap
 from nerfcli.poses.acceptance import MIN_MATCHES, Verdict, judge, nothing_placed
 from nerfcli.poses.checks import Checks
 from nerfcli.poses.contradictions import leave_out_contradicting
-from nerfcli.poses.intrinsics import Candidate, choose_lenses
+from nerfcli.poses.intrinsics import Lenses, choose_lenses
 from nerfcli.poses.job import Job
 from nerfcli.poses.localise import shared_pairs
 from nerfcli.poses.parallax import best_turn
@@ -28,6 +28,7 @@ class Examined:
     """A model after examination, and what is to be said of it.
 
     left_out: why photos were taken out, by number. blur_px: of each photo's pose, by number. details: for the report.
+    uncertainty: of the lenses, by camera id, see `determined.uncertainty`.
     """
 
     model: pycolmap.Reconstruction | None
@@ -35,6 +36,7 @@ class Examined:
     left_out: dict[int, str]
     blur_px: dict[int, float]
     details: dict[str, Any]
+    uncertainty: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 def examine(
@@ -76,8 +78,9 @@ def examine(
 
     model, left_out = checks.run("contradicting photos", without_contradicting, otherwise=(mapped, {}))
     report("check", 1, 4)
-    model, tried = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=(model, []))
-    details["lenses"] = [asdict(candidate) for candidate in tried]
+    lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=Lenses(model, [], {}))
+    model = lenses.model
+    details["lenses"] = [asdict(candidate) for candidate in lenses.candidates]
     report("check", 2, 4)
     verdict = judge(
         model,
@@ -101,7 +104,10 @@ def examine(
     report("check", 4, 4)
     reasons = {numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
     details["not_computed"] = checks.not_computed
-    return Examined(model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details)
+    uncertainty = {str(camera_id): certain for camera_id, certain in lenses.uncertainty.items()}
+    return Examined(
+        model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details, uncertainty
+    )
 
 
 def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -111,10 +117,22 @@ def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return copy
 
 
-def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> tuple[pycolmap.Reconstruction, list[Candidate]]:
+def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> Lenses:
     """Lens models by evidence, where neither the user nor a file has said what they are."""
     named = [number for number, group in enumerate(job.groups, start=1) if not group.choose]
-    return choose_lenses(model, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras, named=named)
+    exif_focal_px = {
+        number: group.focal_px
+        for number, group in enumerate(job.groups, start=1)
+        if group.focal_px is not None and group.focal_is_prior
+    }
+    return choose_lenses(
+        model,
+        seed=job.seed,
+        threads=job.threads,
+        fixed=job.fixed_cameras,
+        named=named,
+        exif_focal_px=exif_focal_px,
+    )
 
 
 def _with_names(reason: str, job: Job) -> str:

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 _SHARE = 0.1
 # Beyond this, more observations cost time and change nothing; a part of the points is adjusted instead.
 _MOST_OBSERVATIONS = 40_000
+# A robust adjustment counts observations less from this many times the usual error on: 95 % as sharp for normal noise.
+_LOSS_FROM = 2.4
+_LEAST_LOSS_PX = 0.3
 # With the others of its point left, it must still be two that hold the point, and better three.
 _MIN_TRACK = 3
 
@@ -73,6 +76,7 @@ def adjust(
     threads: int,
     principal_points: bool = False,
     fixed: Sequence[int] = (),
+    robust_px: float | None = None,
 ) -> pycolmap.CeresBundleAdjuster:
     """Bundle adjustment of a whole model, in place, until it no longer moves; the adjuster, for the covariance.
 
@@ -81,6 +85,7 @@ def adjust(
         threads: -1 for all.
         principal_points: whether they are adjusted too.
         fixed: camera ids whose intrinsics stay as they are.
+        robust_px: where observations begin to count less (Cauchy's loss); None: all count by their square.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -89,6 +94,12 @@ def adjust(
     # To the end: of two models that are compared, the one that was adjusted longer must not look better for that.
     options.ceres.solver_options.max_num_iterations = 200
     options.ceres.solver_options.function_tolerance = 1e-9
+    if robust_px is not None:
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = robust_px
+        # It creeps towards its end for a hundred steps that change nothing any more.
+        options.ceres.solver_options.max_num_iterations = 40
+        options.ceres.solver_options.function_tolerance = 1e-6
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)
@@ -101,6 +112,32 @@ def adjust(
     return adjuster
 
 
+def loss_scale_px(errors: Array) -> float:
+    """Where a robust adjustment begins to count observations less, from their errors (distances in the picture)."""
+    finite = errors[np.isfinite(errors)]
+    if len(finite) == 0:
+        return _LEAST_LOSS_PX
+    usual = float(np.median(finite)) / 1.1774  # of one coordinate, if the noise is normal
+    return max(_LOSS_FROM * usual, _LEAST_LOSS_PX)
+
+
+def observation_errors_px(model: pycolmap.Reconstruction) -> Array:
+    """(n,) distance of each observation of a model from where it projects its point; those that it cannot left out."""
+    errors = []
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        seen = image.get_observation_points2D()
+        if not seen:
+            continue
+        points = np.array([model.point3D(point.point3D_id).xyz for point in seen])
+        pose = image.cam_from_world()
+        local = points @ pose.rotation.matrix().T + pose.translation
+        projected = np.asarray(model.camera(image.camera_id).img_from_cam(local), dtype=np.float64).reshape(-1, 2)
+        errors.append(np.linalg.norm(projected - np.array([point.xy for point in seen]), axis=1))
+    joined = np.concatenate([np.zeros(0), *errors])
+    return joined[np.isfinite(joined)]
+
+
 def intrinsic_deviations(
     model: pycolmap.Reconstruction, adjuster: pycolmap.CeresBundleAdjuster, *, principal_points: bool
 ) -> dict[int, Array]:
@@ -110,7 +147,10 @@ def intrinsic_deviations(
     """
     options = pycolmap.BACovarianceOptions()
     options.params = pycolmap.BACovarianceOptionsParams.ALL
-    covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
+    try:
+        covariance = pycolmap.estimate_ba_covariance(options, model, adjuster)
+    except (RuntimeError, ValueError):  # an image without a pose
+        covariance = None
     deviations: dict[int, Array] = {}
     for camera_id, camera in model.cameras.items():
         deviations[camera_id] = np.full(len(camera.params), np.nan)

@@ -1,12 +1,14 @@
-"""Which lens model a capture can hold: chosen by observations that the adjustment did not see.
+"""Which lens model a capture can hold, and the adjustment with it.
 
-Mapping starts from one distortion term. Afterwards each camera is adjusted with richer models, each time without a
-tenth of the observations. A richer model is kept if it foresees these better by more than chance, and if what it adds
-is larger than its own uncertainty; the principal point is freed by the same measure.
+Mapping starts from one distortion term. Of a perspective camera the observations then tell which parameters are
+determined (see `determined`). Fisheyes and very wide lenses are adjusted with richer models, each time without a tenth
+of the observations: a richer model is kept if it foresees these better by more than chance, and if what it adds is
+larger than its own uncertainty; the principal point is freed by the same measure.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -14,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nerfcli.poses import held_out
+from nerfcli.poses.determined import Determined, determine, is_centred, uncertainty
+from nerfcli.poses.lens_evidence import UndeterminedError, parameters_of
 
 Array = NDArray[np.float64]
 
@@ -32,11 +36,10 @@ _GAIN_SHARE = 0.001
 _CLIP_PX = 4.0
 # What a model adds must be this many standard deviations from nothing.
 _PARAMETER_DEVIATIONS = 3.0
-# A principal point farther than this from the centre, as a share of the size, is a fit to something else.
-_PRINCIPAL_POINT_RANGE = 0.1
 # Each lens costs some adjustments; beyond this many, and for lenses with fewer photos, the simplest model stays.
 _MOST_CAMERAS = 4
 _LEAST_PHOTOS = 3
+_MOST_DESCRIBED = 8
 # As in pycolmap's mapper.
 _LEAST_ANGLE_DEG = 1.5
 _FIT_GRID = 15
@@ -44,11 +47,11 @@ _FIT_GRID = 15
 
 @dataclass(frozen=True)
 class Candidate:
-    """A lens model that was tried for a camera.
+    """A lens model that was tried for a camera, or decided on by what the observations determine.
 
-    held_out_px: mean error of the held-out observations of this camera, each counted up to 4 px. gain: how many
-    standard errors that is below the model kept before it. significance: value over standard deviation of what it
-    adds, the largest. kept: whether it was chosen over the ones before.
+    held_out_px: of a wide lens, mean error of the held-out observations of this camera, each counted up to 4 px. gain:
+    how many standard errors that is below the model kept before it. significance: of a wide lens, value over standard
+    deviation of what it adds, the largest; else see `determined.Step`. kept: whether it was chosen.
     """
 
     camera: int
@@ -68,6 +71,15 @@ class _Trial:
     deviations: Array  # of the camera's parameters, NaN where held
 
 
+@dataclass(frozen=True)
+class Lenses:
+    """A model with the lenses that were chosen, the decisions, and by camera id how certain each is, for the report."""
+
+    model: pycolmap.Reconstruction
+    candidates: list[Candidate]
+    uncertainty: dict[int, dict[str, Any]]
+
+
 def choose_lenses(
     model: pycolmap.Reconstruction,
     *,
@@ -75,44 +87,116 @@ def choose_lenses(
     threads: int,
     fixed: Sequence[int] = (),
     named: Sequence[int] = (),
-) -> tuple[pycolmap.Reconstruction, list[Candidate]]:
-    """The model with the lens models that held-out observations ask for, adjusted anew; and every trial.
+    exif_focal_px: Mapping[int, float] | None = None,
+) -> Lenses:
+    """The model with the lens models that it can hold, adjusted anew.
 
     Args:
         model: a converged model; it is not changed.
-        seed: which observations are held out.
+        seed: which observations are looked at or held out.
         threads: of the adjustments, -1 for all.
         fixed: camera ids that keep their intrinsics as they are.
         named: camera ids that keep their model; whether its principal point is free is still tried.
+        exif_focal_px: by camera id, where a focal length stays that the observations leave open.
     """
-    training, held = held_out.split(model, seed=seed)
     photos = _photos_by_camera(model)
     cameras = sorted((c for c in photos if c not in fixed and photos[c] >= _LEAST_PHOTOS), key=lambda c: -photos[c])
     candidates: list[Candidate] = []
-    freed = []
-    for camera_id in cameras[:_MOST_CAMERAS]:
-        choice = _Choice(held, camera_id, threads=threads, fixed=fixed)
-        best = choice.make(training, named=camera_id in named)
-        candidates.extend(choice.tried)
-        freed.append(best.principal_point)
-        training = best.model
+    freed: list[int] = []
+    held: list[int] = []
     result = pycolmap.Reconstruction(model)
-    for camera_id, camera in result.cameras.items():
-        camera.model = training.cameras[camera_id].model
-        camera.params = training.cameras[camera_id].params
-    # pycolmap frees the principal points of all cameras or of none; what some trials have found stays as it is.
-    everywhere = bool(freed) and all(freed) and len(freed) == len(photos)
-    settle(result, threads=threads, principal_points=everywhere, fixed=fixed)
-    return result, candidates
+    held_out.adjust(result, threads=threads, fixed=fixed)
+    for camera_id in cameras[:_MOST_CAMERAS]:
+        camera = result.cameras[camera_id]
+        if not parameters_of(camera) or field_of_view_deg(camera) > _FISHEYE_FROM_DEG:
+            free, tried = _by_trials(result, camera_id, seed=seed, threads=threads, fixed=fixed, named=named)
+            candidates.extend(tried)
+        else:
+            try:
+                found = determine(
+                    result,
+                    camera_id,
+                    seed=seed,
+                    fixed=fixed,
+                    named=camera_id in named,
+                    exif_focal_px=(exif_focal_px or {}).get(camera_id),
+                )
+            except (UndeterminedError, np.linalg.LinAlgError):
+                continue  # the uncertainty says why
+            free = found.principal_point
+            candidates.extend(_decisions(camera_id, found))
+            camera.model = found.camera.model
+            camera.params = found.camera.params.tolist()
+            held += [camera_id] if found.held else []
+        freed += [camera_id] if free else []
+    adjusted_fixed = [*fixed, *held]
+    # pycolmap frees the principal points of all cameras or of none; those of some are found first and then stay.
+    everywhere = bool(freed) and len(freed) == len(photos)
+    if freed and not everywhere:
+        held_out.adjust(result, threads=threads, principal_points=True, fixed=[c for c in photos if c not in freed])
+    settle(result, threads=threads, principal_points=everywhere, fixed=adjusted_fixed)
+    strayed = [c for c in freed if not is_centred(result.cameras[c])]
+    if strayed:
+        for camera_id in strayed:
+            camera = result.cameras[camera_id]
+            camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
+        settle(result, threads=threads, fixed=adjusted_fixed)
+    certain = {
+        camera_id: uncertainty(
+            result, camera_id, principal_point=camera_id in freed and camera_id not in strayed, seed=seed, fixed=fixed
+        )
+        for camera_id in sorted(photos)[:_MOST_DESCRIBED]
+    }
+    return Lenses(result, candidates, certain)
+
+
+def _decisions(camera_id: int, found: Determined) -> list[Candidate]:
+    return [
+        Candidate(
+            camera_id,
+            step.model,
+            step.principal_point,
+            held_out_px=None,
+            gain=None,
+            significance=step.distance,
+            kept=step.taken,
+        )
+        for step in found.steps
+    ]
+
+
+def _by_trials(
+    result: pycolmap.Reconstruction,
+    camera_id: int,
+    *,
+    seed: int,
+    threads: int,
+    fixed: Sequence[int],
+    named: Sequence[int],
+) -> tuple[bool, list[Candidate]]:
+    """Whether the principal point is free after trials with held-out observations, and these; sets the camera."""
+    training, held = held_out.split(result, seed=seed)
+    choice = _Choice(held, camera_id, threads=threads, fixed=fixed)
+    best = choice.make(training, named=camera_id in named)
+    found = best.model.cameras[camera_id]
+    result.cameras[camera_id].model = found.model
+    result.cameras[camera_id].params = found.params.tolist()
+    return best.principal_point, choice.tried
 
 
 def settle(
     model: pycolmap.Reconstruction, *, threads: int, principal_points: bool = False, fixed: Sequence[int] = ()
 ) -> None:
-    """Adjust a whole model in place, drop the observations that do not fit any more, and adjust once more."""
-    for _ in range(2):
-        held_out.adjust(model, threads=threads, principal_points=principal_points, fixed=fixed)
-        pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
+    """Adjust a whole model in place, drop the observations that do not fit any more, and adjust once more.
+
+    The last adjustment is robust: highlights and things that move are seldom far enough off to be dropped, and are
+    wrong in the same way in many photos; counted by their square, they would pull the lens.
+    """
+    held_out.adjust(model, threads=threads, principal_points=principal_points, fixed=fixed)
+    pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
+    scale_px = held_out.loss_scale_px(held_out.observation_errors_px(model))
+    held_out.adjust(model, threads=threads, principal_points=principal_points, fixed=fixed, robust_px=scale_px)
+    pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
     model.update_point_3d_errors()
 
 
@@ -141,12 +225,6 @@ def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
     params[free] = fitted.x
     start.params = params.tolist()
     return start
-
-
-def is_centred(camera: pycolmap.Camera) -> bool:
-    """Whether the principal point is within a tenth of the size of the centre."""
-    x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
-    return abs(x - 0.5) < _PRINCIPAL_POINT_RANGE and abs(y - 0.5) < _PRINCIPAL_POINT_RANGE
 
 
 def field_of_view_deg(camera: pycolmap.Camera) -> float:

@@ -1,6 +1,7 @@
 """From matches to a model: one run of the incremental mapper, and COLMAP files."""
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,8 +33,10 @@ def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
     return sorted(numbers[model.image(image_id).name] for image_id in model.reg_image_ids())
 
 
-def describe_cameras(model: pycolmap.Reconstruction, job: Job) -> list[dict[str, Any]]:
-    """Intrinsics, for the report, of the cameras that took the placed photos."""
+def describe_cameras(
+    model: pycolmap.Reconstruction, job: Job, uncertainty: Mapping[str, dict[str, Any]] | None = None
+) -> list[dict[str, Any]]:
+    """Intrinsics, for the report, of the cameras that took the placed photos, and how uncertain they are."""
     counts: dict[int, int] = {}
     for image_id in model.reg_image_ids():
         camera_id = model.image(image_id).camera_id
@@ -46,6 +49,7 @@ def describe_cameras(model: pycolmap.Reconstruction, job: Job) -> list[dict[str,
             "params": [float(value) for value in camera.params],
             "focal_from_exif": camera.has_prior_focal_length and camera_id not in job.given_cameras,
             "images": counts[camera_id],
+            "uncertainty": (uncertainty or {}).get(str(camera_id)),
         }
         for camera_id, camera in sorted(model.cameras.items())
         if camera_id in counts

@@ -136,6 +136,14 @@ def closing_notes(report: PosesReport) -> list[str]:
         some = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
         why = f": {component['apart']}" if component["apart"] else ""
         notes.append(f"component {number} has {component['size']} photos ({some}){why}; --component {number} takes it")
+    for camera in report.cameras:
+        certain = camera.get("uncertainty")
+        if certain and certain["weak"]:
+            notes.append(
+                f"intrinsics are weakly determined (camera of {camera['images']} photos: focal length "
+                f"+-{certain['focal_percent']:.1f} %, distortion +-{certain['distortion_border_px']:.1f} px at the "
+                "corners): give --intrinsics"
+            )
     for check, why in report.not_computed.items():
         notes.append(f"a check could not be computed ({check}): {why}")
     return notes

@@ -15,6 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from nerfcli.poses import held_out
+from nerfcli.poses.lens_evidence import projection_jacobians
 
 Array = NDArray[np.float64]
 
@@ -89,7 +90,7 @@ def _pixel_metric(model: pycolmap.Reconstruction, photo: int) -> Array:
     rotated = points @ pose.rotation.matrix().T
     local = rotated + pose.translation
     metric, counted = np.zeros((6, 6)), 0
-    for turned, point, jacobian in zip(rotated, local, _projection_jacobians(camera, local), strict=True):
+    for turned, point, jacobian in zip(rotated, local, projection_jacobians(camera, local), strict=True):
         if not np.isfinite(jacobian).all() or point[2] <= 0:
             continue
         x, y, z = turned
@@ -98,19 +99,6 @@ def _pixel_metric(model: pycolmap.Reconstruction, photo: int) -> Array:
         metric += both.T @ both
         counted += 1
     return metric / max(counted, 1)
-
-
-def _projection_jacobians(camera: pycolmap.Camera, local: Array) -> Array:
-    """(n, 2, 3) pixels per unit of a point in the camera's axes, by central differences."""
-    step = 1e-5 * np.linalg.norm(local, axis=1, keepdims=True)
-    columns = []
-    for axis in range(3):
-        offset = np.zeros((1, 3))
-        offset[0, axis] = 1.0
-        ahead = np.asarray(camera.img_from_cam(local + step * offset), dtype=np.float64)
-        behind = np.asarray(camera.img_from_cam(local - step * offset), dtype=np.float64)
-        columns.append((ahead - behind) / (2 * step))
-    return np.stack(columns, axis=-1)
 
 
 def _gauge_directions(image: pycolmap.Image) -> Array:

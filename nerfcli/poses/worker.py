@@ -139,7 +139,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     if model is not None:
         model = _coloured(model, job, checks)
         result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
-        result["cameras"] = describe_cameras(model, job)
+        result["cameras"] = describe_cameras(model, job, examined.uncertainty)
         result["points"] = model.num_points3D()
         write_model(model, job)
     result["model_files"] = model_keys(job) if model is not None else {}
