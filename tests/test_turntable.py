@@ -107,6 +107,18 @@ class TestMotions:
         assert (np.linalg.norm(y - x, axis=1) < within).sum() > 100  # which is more than what counts as still
         assert motions(x, y, SIZE).still == 0
 
+    @pytest.mark.parametrize("angle", np.linspace(0, 2 * np.pi, 5)[:4])
+    def test_tripod_that_gives_way_leaves_two_motions(self, angle: float) -> None:
+        """The background is shifted as a whole, by more than its features are wrong, and less than the object moves."""
+        shift = 2.5 * still_px(SIZE) * np.array([np.cos(angle), np.sin(angle)])
+        two = 0
+        for i, j, moving in ring_pairs():
+            x, y = staying(150, seed=i + j)
+            found = both(moving, (x, y + shift))
+            assert found.still >= 140
+            two += found.two
+        assert two == len(ring_pairs())
+
     def test_nothing_says_nothing(self) -> None:
         found = motions(np.zeros((0, 2)), np.zeros((0, 2)), SIZE)
         assert (found.still, found.moving, found.two, found.one, found.only_still) == (0, 0, False, False, False)

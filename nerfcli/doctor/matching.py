@@ -93,7 +93,7 @@ def compare(
     lighter, redder = (other.light[b[agree]] - one.light[a[agree]]).T
     stops = _median(lighter)
     views, patches, still = None, (), None
-    if one.size == other.size and in_place(x, y, one.size).any():
+    if one.size == other.size and in_place(x, y, one.size)[0].any():
         still = motions(x, y, one.size)
     if count >= _LEAST_FOR_GEOMETRY:
         centres = [np.array(features.size) / 2 for features in (one, other)]

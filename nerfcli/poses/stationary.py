@@ -22,6 +22,8 @@ _LEAST_STILL_PX = 0.75
 # Of matches that change smoothly over the picture, eight times as many moved by one to three such lengths as by less.
 _RING = 3.0
 _LEAST_PEAK = 2.0
+# A tripod that gives way shifts the whole background by so many lengths at most.
+_SHAKEN = 4.0
 # From so many such lengths on a match moved for certain.
 _MOVED = 4.0
 _LEAST_MATCHES = 15
@@ -125,23 +127,46 @@ def still_px(size: tuple[int, int]) -> float:
     return max(_LEAST_STILL_PX, _STILL * float(np.hypot(*size)))
 
 
-def in_place(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Which matches (N, 2) of two pictures of (width, height) stay in their place, (N,) bool.
+def in_place(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return which matches (N, 2) of pictures of (width, height) stay in their place, (N,) bool, and its shift (2,).
 
-    None do if so few are no more than what a motion that changes smoothly over the picture leaves there.
+    The whole place may be shifted by a few pixels, as by a tripod that gives way. None stay if so few do that they are
+    no more than what a motion that changes smoothly over the picture leaves there.
     """
     within = still_px(size)
-    distances = np.linalg.norm(y - x, axis=1)
+    motion = y - x
+    small = motion[np.linalg.norm(motion, axis=1) < _SHAKEN * within]
+    shift = np.zeros(2)
+    if len(small) >= _LEAST_MATCHES:
+        starts = np.zeros(2), np.median(small, axis=0)
+        shift = max(
+            (_densest(small, start, within) for start in starts),
+            key=lambda at: int((np.linalg.norm(small - at, axis=1) < within).sum()),
+        )
+    distances = np.linalg.norm(motion - shift, axis=1)
     stays = distances < within
     around = int(((distances >= within) & (distances < _RING * within)).sum())
-    return stays if stays.sum() >= max(_LEAST_MATCHES, _LEAST_PEAK * around) else np.zeros(len(x), dtype=bool)
+    if stays.sum() < max(_LEAST_MATCHES, _LEAST_PEAK * around):
+        stays = np.zeros(len(x), dtype=bool)
+    return stays, shift
+
+
+def _densest(motion: np.ndarray, start: np.ndarray, within: float) -> np.ndarray:
+    """Return the centre of the most motions (N, 2) near a start: the mean of those nearby, again and again."""
+    at = start
+    for _ in range(10):
+        near = np.linalg.norm(motion - at, axis=1) < within
+        if not near.any():
+            break
+        at = motion[near].mean(axis=0)
+    return at
 
 
 def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
     """What matches (N, 2) of two pictures of the same size (width, height) say. Deterministic."""
     within = still_px(size)
-    stays = in_place(x, y, size)
-    moves = np.linalg.norm(y - x, axis=1) > _MOVED * within
+    stays, shift = in_place(x, y, size)
+    moves = np.linalg.norm(y - x - shift, axis=1) > _MOVED * within
     fundamental, agree = fundamental_of(x[moves], y[moves], within)
     moves[moves] = agree
     agreeing = float("nan")
