@@ -4,6 +4,7 @@ The photos are drawn by `walks`: boards with known textures at known distances, 
 """
 
 import hashlib
+import json
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -362,6 +363,27 @@ def test_cameras_at_one_place_and_one_far_off_are_told():
     pose[:3, 3] *= 40
     off = (*scene.frames[:5], replace(scene.frames[5], world_from_cam=pose), *scene.frames[6:])
     assert coverage.spread(replace(scene, frames=off)).names == ("5.jpg",)
+
+
+def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
+    """As nerfcli poses reports them: weak, firm, and of a report that says nothing of it."""
+    scene = replace(ring(24, span_deg=360), root=tmp_path, kind="nerfcli")
+
+    def found(*cameras: dict[str, object]) -> Finding | None:
+        (tmp_path / "poses_report.json").write_text(json.dumps({"cameras": cameras}))
+        return coverage.intrinsics(scene)
+
+    firm = {"weak": False, "focal_percent": 0.2, "distortion_border_px": 0.5}
+    weak = {"weak": True, "focal_percent": 4.0, "distortion_border_px": 3.0}
+    assert coverage.intrinsics(scene) is None
+    assert found({"model": "OPENCV"}, {"uncertainty": None}, {"uncertainty": {"weak": None}}) is None
+    good, bad = found({"uncertainty": firm}), found({"uncertainty": firm}, {"uncertainty": weak})
+    assert good is not None
+    assert bad is not None
+    assert (good.verdict, good.number) == (GOOD, 0.2)
+    assert (bad.verdict, bad.number) == (LOOK, 4.0)
+    assert "weakly determined: focal length +-4 %" in bad.summary
+    assert "--intrinsics" in bad.advice
 
 
 def test_missing_photos_and_masks_that_only_some_have_are_named():

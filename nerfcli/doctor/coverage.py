@@ -1,5 +1,6 @@
 """How the cameras of a scene stand: how far apart for the depth they see, from which sides, and whether all belong."""
 
+import json
 from collections.abc import Sequence
 
 import numpy as np
@@ -108,6 +109,31 @@ def points(scene: Scene) -> Finding | None:
         f"a photo: look below {_POINTS_LOOK}",
         "their poses are uncertain: look at renders from there before trusting them" if few else "",
         tuple((name, several(count, "point")) for count, name in few),
+    )
+
+
+def intrinsics(scene: Scene) -> Finding | None:
+    """Whether the photos determined the lens, by the report of `nerfcli poses`; None where there is no such report."""
+    path = scene.root / "poses_report.json"
+    if scene.kind != "nerfcli" or not path.is_file():
+        return None
+    cameras = json.loads(path.read_text(encoding="utf-8"))["cameras"]
+    certain = [camera["uncertainty"] for camera in cameras if (camera.get("uncertainty") or {}).get("weak") is not None]
+    if not certain:
+        return None
+    weak = [one for one in certain if one["weak"]]
+    focal = max(one["focal_percent"] for one in certain)
+    border_px = max(one["distortion_border_px"] for one in certain)
+    said = f"focal length +-{focal:.2g} %, distortion +-{border_px:.2g} px at the corners"
+    return Finding(
+        "intrinsics",
+        LOOK if weak else GOOD,
+        f"intrinsics are weakly determined: {said}" if weak else said,
+        focal,
+        "one standard deviation: look from 1 % of the focal length, or half a per cent of the picture's half diagonal",
+        "give --intrinsics to nerfcli poses; or take photos from more sides and distances, of things with depth"
+        if weak
+        else "",
     )
 
 

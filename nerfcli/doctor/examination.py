@@ -178,6 +178,7 @@ def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unr
             checks.run("spread of cameras", lambda: coverage.spread(of_scene), otherwise=None),
             checks.run("directions", lambda: coverage.directions(of_scene), otherwise=None),
             checks.run("points", lambda: coverage.points(of_scene), otherwise=None),
+            checks.run("intrinsics", lambda: coverage.intrinsics(of_scene), otherwise=None),
         ]
         found += checks.run("files of the scene", lambda: coverage.belongings(of_scene), otherwise=[])
     not_checked += [(name, f"could not be computed: {why}") for name, why in checks.not_computed.items()]
