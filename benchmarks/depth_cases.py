@@ -17,9 +17,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from nerfcli import kernels
-from nerfcli.kernels import depth
-from nerfcli.kernels.depth import LightEnds
+from nerfcli.kernels import LightEnds, numba_cpu
+from nerfcli.kernels.reference import depth
 from nerfcli.render.depth import CONVENTIONS, DepthRequest, requested
 from nerfcli.selftest import exact_depths
 from nerfcli.selftest.rays import Ray, depth_rays
@@ -37,7 +36,7 @@ def single(ray: Ray) -> list[list[float]]:
 def computed(case: Ray, backend: str) -> dict[str, float]:
     """Every row by one of the implementations."""
     dtype = torch.float64 if backend == "float64" else torch.float32
-    module = kernels if backend == "compiled" else depth
+    module = numba_cpu if backend == "compiled" else depth
     density, starts, ends = (torch.tensor(values, dtype=dtype) for values in single(case))
     offsets = torch.tensor([0, len(density)])
 

@@ -24,7 +24,7 @@ from rich.table import Table
 from torch import Tensor
 
 from nerfcli.field.hash_field import HashField, HashFieldSettings
-from nerfcli.kernels import numba_cpu, reference
+from nerfcli.kernels import HashGrid, March, Rays, numba_cpu, reference
 
 SAMPLES_PER_RAY = 32
 SECONDS_EACH = 0.4
@@ -80,7 +80,7 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
     yield Operation(
         "hash_encode",
         (table,),
-        lambda t: (numba_cpu.hash_encode(points, t, resolutions, None, None),),
+        lambda t: (numba_cpu.hash_encode(points, t, resolutions),),
         # float64 takes the coordinates as float32 scales them: at 1024 cells these alone cost 4 digits
         lambda t: (reference.hash_encode(points, t, resolutions).to(t.dtype),),
     )
@@ -104,20 +104,17 @@ def operations(samples: int, log2_rows: int) -> Iterator[Operation]:
     origins = begin[:, 0] * 0.5 - 0.25  # rays of 32 steps of 1 / 32, well inside the cube [-1, 1]^3
     edges = torch.arange(SAMPLES_PER_RAY + 2) / SAMPLES_PER_RAY * 0.5
     axis = torch.tensor([0.0, 0.0, 1.0]).expand(rays, 3)
-    marching = {
-        "occupied": torch.ones(64, 64, 64, dtype=torch.bool),
-        "contraction": "none",
-        "resolutions": resolutions,
-        "deepest": 1e9,
-    }
+    occupied = torch.ones(64, 64, 64, dtype=torch.bool)
 
     def follow(module: Any, table: Tensor) -> tuple[Tensor, ...]:
         """Density and features; nothing is dense enough to end a ray. The jitter of 0 keeps all 32 steps of a ray."""
-        o, d, e, w = (x.to(table.dtype) for x in (origins, axis, edges, weights[0]))
+        o, d, e, *layers = (x.to(table.dtype) for x in (origins, axis, edges, *weights))
         out = module.visible_samples(
-            o, d, e, jitter=torch.zeros_like(o[:, 0]), table=table, weights=(w, weights[1].to(table.dtype)), **marching
+            Rays(o, d, torch.zeros_like(o[:, 0])),
+            March(e, occupied, "none", 1e9),
+            HashGrid(table, resolutions, tuple(layers)),
         )
-        return out[2], out[3]
+        return out.density, out.encoded
 
     yield Operation(
         "visible_samples",

@@ -33,8 +33,8 @@ class Group:
 
 GROUPS: tuple[Group, ...] = (
     Group(
-        "kernels/reference.py",
-        ("tests/test_reference_kernels.py", "tests/test_worked_examples.py"),
+        "kernels/reference/encoding.py",
+        ("tests/test_reference_kernels.py",),
         "",
         (),
         (
@@ -45,9 +45,26 @@ GROUPS: tuple[Group, ...] = (
             Mutant("points.clamp(0.0, 1.0) * resolution", "points * resolution"),
             Mutant(".clamp_max(resolution - 1)", ".clamp_max(resolution)"),
             Mutant("torch.where(corners == 1, inside,", "torch.where(corners == 0, inside,"),
+        ),
+    ),
+    Group(
+        "kernels/reference/marching.py",
+        ("tests/test_reference_kernels.py", "tests/test_field_kinds.py"),
+        "",
+        (),
+        (
             Mutant("* ((starts + ends) / 2)[..., None]", "* starts[..., None]"),
-            Mutant("edges[:-1] + jitter[:, None] *", "edges[:-1] - jitter[:, None] *"),
+            Mutant("edges[:-1] + rays.jitter[:, None] *", "edges[:-1] - rays.jitter[:, None] *"),
             Mutant("((coordinates >= 0) & (coordinates <= 1))", "((coordinates >= 0) & (coordinates <= 2))"),
+            Mutant("return starts, ends, coordinates, offsets", "return ends, starts, coordinates, offsets"),
+        ),
+    ),
+    Group(
+        "kernels/reference/compositing.py",
+        ("tests/test_reference_kernels.py", "tests/test_worked_examples.py", "tests/test_priors.py"),
+        "",
+        (),
+        (
             Mutant("(rays, place + 1)", "(rays, place)"),
             Mutant("weights = torch.exp(-before) * opacity(depth)", "weights = torch.exp(-before) * depth"),
             Mutant("weights = torch.exp(-before) *", "weights = torch.exp(before) *"),
@@ -56,21 +73,44 @@ GROUPS: tuple[Group, ...] = (
             Mutant("2 * gaps * before", "gaps * before"),
             Mutant("(weights + behind)", "behind"),
             Mutant("(ends - starts) / 3", "(ends - starts) / 2"),
+            Mutant("of_targets) + transmittance[first:]", "of_targets)"),
+            Mutant("first = len(transmittance) - len(distances)", "first = 0"),
+            Mutant("(MOST_DEVIATION * distance)).clamp_max(1.0)", "(MOST_DEVIATION * distance))"),
         ),
     ),
     Group(
-        "kernels/reference.py",
+        "kernels/composition.py",
+        ("tests/test_backends.py",),
+        "",
+        (),
+        (
+            Mutant("transmittance <= math.exp(-march.max", "transmittance >= math.exp(-march.max"),
+            Mutant("if targets.near_scaling and", "if not targets.near_scaling and"),
+            Mutant("contracted_distance(starts), contracted_distance(ends)", "starts, ends"),
+            Mutant("middles = (starts + ends) / 2", "middles = starts"),
+            Mutant("if not grid.antialias or", "if grid.antialias or"),
+            Mutant("UNSEEN * sum_along_rays", "sum_along_rays"),
+            Mutant("unseen = weights <=", "unseen = weights >="),
+            Mutant(
+                "rgb[seen] = self._networks(samples.encoded[seen]", "rgb[seen] = self._networks(samples.encoded[:1]"
+            ),
+            Mutant("< march.max_optical_depth\n", "< 2 * march.max_optical_depth\n"),
+            Mutant("(1, 0))[offsets]", "(0, 1))[offsets]"),
+        ),
+    ),
+    Group(
+        "kernels/reference/marching.py",
         ("tests/test_numba_kernels.py",),
         "visible and not misses",
         (),
         (
             Mutant("occupied[z, y, x]", "occupied[x, y, z]"),
             Mutant("* ((starts + ends) / 2)[:, None]", "* ends[:, None]"),
-            Mutant("< deepest\n", "< 2 * deepest\n"),
+            Mutant("< along.max_optical_depth\n", "< 2 * along.max_optical_depth\n"),
         ),
     ),
     Group(
-        "kernels/reference.py",
+        "kernels/reference/networks.py",
         ("tests/test_numba_kernels.py",),
         "radiance",
         (),
@@ -80,13 +120,21 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "kernels/reference.py",
+        "kernels/reference/pixels.py",
         ("tests/test_numba_kernels.py", "tests/test_selftest.py"),
-        "pixel_rays or adam or bound",
+        "pixel_rays or bound",
         (),
         (
             Mutant("right=True) - 1", "right=False) - 1"),
             Mutant("/ 255.0", "/ 256.0"),
+        ),
+    ),
+    Group(
+        "kernels/reference/row_adam.py",
+        ("tests/test_numba_kernels.py", "tests/test_selftest.py"),
+        "adam or bound",
+        (),
+        (
             Mutant("(1 - betas[1]) * g * g", "(1 - betas[1]) * g"),
             Mutant("(1 - betas[0] ** step)", "(1 - betas[0])"),
             Mutant("/ (spread + eps)", "/ spread"),
@@ -107,7 +155,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "kernels/depth.py",
+        "kernels/reference/depth.py",
         ("tests/test_depth_functionals.py", "tests/test_selftest.py"),
         "",
         (),
@@ -360,7 +408,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "field/encodings.py",
+        "kernels/harmonics.py",
         ("tests/test_field.py",),
         "",
         (),
@@ -370,6 +418,14 @@ GROUPS: tuple[Group, ...] = (
             Mutant(
                 "math.sqrt(7 / (16 * math.pi)) * z * (5 * zz - 3)", "math.sqrt(7 / (16 * math.pi)) * z * (5 * zz - 2)"
             ),
+        ),
+    ),
+    Group(
+        "field/encodings.py",
+        ("tests/test_field.py",),
+        "",
+        (),
+        (
             Mutant("frequencies = math.pi *", "frequencies ="),
             Mutant("[phases.sin(), phases.cos()]", "[phases.cos(), phases.sin()]"),
         ),
@@ -403,21 +459,6 @@ GROUPS: tuple[Group, ...] = (
             Mutant("(2.0 - 1.0 / norm) / norm / 4.0", "(2.0 - 1.0 / norm) / 4.0"),
             Mutant("middles[:, None], cones[rays] * middles", "middles[:, None], cones[rays]"),
             Mutant("middles = (starts + ends) / 2\n", "middles = starts\n"),
-        ),
-    ),
-    Group(
-        "kernels/marching.py",
-        ("tests/test_field_kinds.py",),
-        "marching or samples or composite",
-        (),
-        (
-            Mutant(
-                "deepest: float) -> tuple[Tensor, Tensor]:",
-                "deepest: float) -> tuple[Tensor, Tensor]:\n    deepest *= 2",
-            ),
-            Mutant("offsets) < deepest", "offsets) > deepest"),
-            Mutant("(1, 0))[offsets]", "(0, 1))[offsets]"),
-            Mutant("return starts, ends, coordinates, offsets", "return ends, starts, coordinates, offsets"),
         ),
     ),
     Group(

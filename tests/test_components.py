@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kernel_parts import radiance_of
 from typer.testing import CliRunner
 
 from nerfcli.cli import app
 from nerfcli.errors import UserError
-from nerfcli.field.encodings import spherical_harmonics
 from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.kernels import reference, spherical_harmonics
 from nerfcli.runs.components import CHOICES, Components, choose, differences
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.fitting import scale_gradients
 
 
 def test_with_and_without_set_what_they_name_and_nothing_else():
@@ -83,10 +83,10 @@ def test_a_field_of_low_degree_sees_only_its_harmonics(degree):
 def test_without_view_dependence_a_colour_is_the_same_from_everywhere():
     field = HashField(HashFieldSettings(contraction="none", log2_rows=4, view_degree=0))
     points, directions = torch.rand(5, 3), torch.nn.functional.normalize(torch.randn(2, 3), dim=-1)
-    first, second = (field.radiance(points, directions, torch.full((5,), ray))[1] for ray in (0, 1))
+    first, second = (radiance_of(field, points, directions, torch.full((5,), ray))[1] for ray in (0, 1))
     assert torch.equal(first, second)
     seen = HashField(HashFieldSettings(contraction="none", log2_rows=4))
-    first, second = (seen.radiance(points, directions, torch.full((5,), ray))[1] for ray in (0, 1))
+    first, second = (radiance_of(seen, points, directions, torch.full((5,), ray))[1] for ray in (0, 1))
     assert (first != second).any()
 
 
@@ -94,7 +94,7 @@ def test_gradients_near_a_camera_shrink_with_the_square_of_the_distance():
     distance = torch.tensor([0.0, 0.5, 1.0, 3.0])
     density, rgb = torch.ones(4, requires_grad=True), torch.ones(4, 3, requires_grad=True)
     scaled, colours = density * 1.0, rgb * 1.0
-    scale_gradients(scaled, colours, distance=distance)
+    reference.scale_gradients(scaled, colours, distance=distance)
     (scaled.sum() + colours.sum()).backward()
     assert density.grad is not None
     assert rgb.grad is not None

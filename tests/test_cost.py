@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from kernel_parts import radiance_of
 from torch.utils.flop_counter import FlopCounterMode
 
 from nerfcli import kernels
@@ -16,6 +17,7 @@ from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field
 from nerfcli.field.sizes import chosen_size
 from nerfcli.field.voxel_field import VoxelFieldSettings
+from nerfcli.kernels import reference
 from nerfcli.train.optimiser import FieldOptimiser
 
 HASH = HashFieldSettings(contraction="none")
@@ -34,7 +36,7 @@ def test_bytes_are_those_of_the_module_and_of_its_optimiser(settings):
     field = fresh_field(settings)
     assert parameter_bytes(work(settings).parameters) == field_bytes(field)
     optimiser = FieldOptimiser(field)
-    density, rgb = field.radiance(torch.rand(3, 3), torch.eye(3), torch.arange(3))
+    density, rgb = radiance_of(field, torch.rand(3, 3), torch.eye(3), torch.arange(3))
     (density.sum() + rgb.sum()).backward()
     optimiser.step(1, 0.0)
     moments = [value for name, value in optimiser.state().items() if not name.endswith("step")]
@@ -58,7 +60,7 @@ def test_operations_of_the_hash_grids_networks_are_those_that_torch_counts():
     rays = torch.zeros(samples, dtype=torch.int64)
     weights = tuple(field.parameters())[1:]
     with FlopCounterMode(display=False) as counted:
-        kernels.reference.radiance(torch.rand(samples, 32), torch.rand(2, 16), rays, weights)
+        reference.radiance(torch.rand(samples, 32), torch.rand(2, 16), rays, weights)
     interpolation = 8 * 8 * (2 + 2 * 4)  # levels, corners, two products for the weight, a multiply-add per feature
     assert counted.get_total_flops() == samples * (work(HASH).operations - interpolation)
 

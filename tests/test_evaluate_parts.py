@@ -22,9 +22,9 @@ from nerfcli.evaluate.ledger import leak_ledger, told
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
 from nerfcli.evaluate.spread import spread
+from nerfcli.kernels import RaysSeen
 from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
-from nerfcli.render.tracing import RaysSeen
 from nerfcli.runs.config import RunConfig
 
 UP = np.array([0.0, -1.0, 0.0])

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from kernel_parts import density_of, radiance_of
 from safetensors.torch import save_file
 from scipy.special import sph_harm_y
 
@@ -17,8 +18,9 @@ from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.contraction import training_points, uncontract, uncontract_from_cube
 from nerfcli.field.cost import field_bytes
-from nerfcli.field.encodings import fourier_features, spherical_harmonics
+from nerfcli.field.encodings import fourier_features
 from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.kernels import spherical_harmonics
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log
 from nerfcli.render import model as model_file
 from nerfcli.render.model import Marching, Model, load_model, save_model
@@ -158,12 +160,12 @@ def test_field_shapes_and_ranges(contraction, count):
     g = torch.Generator().manual_seed(0)
     coordinates = torch.rand(count, 3, generator=g)
     directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=g), dim=-1)
-    density, rgb = field.radiance(coordinates, directions, torch.arange(count) * 7 // max(count, 1))
+    density, rgb = radiance_of(field, coordinates, directions, torch.arange(count) * 7 // max(count, 1))
     assert density.shape == (count,)
     assert rgb.shape == (count, 3)
     assert (density > 0).all()
     assert ((rgb > 0) & (rgb < 1)).all()
-    torch.testing.assert_close(field.density(coordinates), density, rtol=1e-5, atol=0)
+    torch.testing.assert_close(density_of(field, coordinates), density, rtol=1e-5, atol=0)
 
 
 def test_a_fresh_field_is_a_thin_grey_fog():
@@ -171,7 +173,7 @@ def test_a_fresh_field_is_a_thin_grey_fog():
     field = HashField(HashFieldSettings(contraction="l2", log2_rows=12))
     g = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(1000, 3, generator=g), dim=-1)
-    density, rgb = field.radiance(torch.rand(1000, 3, generator=g), directions, torch.arange(1000))
+    density, rgb = radiance_of(field, torch.rand(1000, 3, generator=g), directions, torch.arange(1000))
     torch.testing.assert_close(density, torch.full((1000,), 1.0), rtol=0.01, atol=0)
     # Grey on the mean: the colour depends on the direction from the start, by random weights.
     assert (rgb.mean(0) - 0.5).abs().max() < 0.25
@@ -182,10 +184,9 @@ def test_fine_levels_learn_later(share, learning):
     """Of 6 levels, 4 from the start and the others one after the other up to half of the budget; a field that is read
     from a file has all. Those that do not learn have no gradient, nor have the weights that read them."""
     field = HashField(HashFieldSettings(contraction="none", levels=6, log2_rows=8, coarsest=4, finest=64, width=16))
-    if share is not None:
-        field.refine(share)
+    detail = {} if share is None else {"detail": share}
     directions = torch.nn.functional.normalize(torch.randn(5, 3), dim=-1)
-    density, rgb = field.radiance(torch.rand(50, 3), directions, torch.arange(50) // 10)
+    density, rgb = radiance_of(field, torch.rand(50, 3), directions, torch.arange(50) // 10, **detail)
     (density.sum() + rgb.sum()).backward()
     by_weight = field.weights[0].grad
     assert field.table.grad is not None

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from kernel_parts import density_of, radiance_of
 from scipy.ndimage import map_coordinates
 from scipy.special import sph_harm_y
 
@@ -13,13 +14,13 @@ from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
-from nerfcli.field.encodings import fourier_features, spherical_harmonics
+from nerfcli.field.encodings import fourier_features
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
-from nerfcli.kernels import marching
+from nerfcli.kernels import March, Rays, numba_cpu, reference, spherical_harmonics
 from nerfcli.render.model import Marching, Model, load_model, save_model
 from nerfcli.train.optimiser import FieldOptimiser
 
@@ -139,19 +140,19 @@ def test_gradients_of_every_kind(field):
 
 
 class _Radiance(torch.nn.Module):
-    """`Field.radiance` as a call."""
+    """`radiance_of` as a module."""
 
     def __init__(self, field: Field):
         super().__init__()
         self.field = field
 
     def forward(self, *asked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.field.radiance(*asked)
+        return radiance_of(self.field, *asked)
 
 
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_visible_samples_are_the_definition(kind, contraction):
+def test_rays_see_the_definition(kind, contraction):
     """Marched by the reference, with the field's own density, and cut where the optical depth reaches the limit."""
     torch.manual_seed(0)
     field = fresh_field(replace(SMALL[kind], contraction=contraction))
@@ -162,44 +163,35 @@ def test_visible_samples_are_the_definition(kind, contraction):
     g = torch.Generator().manual_seed(3)
     directions = looks(17)
     origins, jitter = -2 * directions + 0.2 * torch.randn(17, 3, generator=g), torch.rand(17, generator=g)
-    edges = torch.linspace(0.5, 4.0, 60)
-    occupied = torch.rand(8, 8, 8, generator=g) > 0.4
+    rays = Rays(origins, directions, jitter)
+    march = March(torch.linspace(0.5, 4.0, 60), torch.rand(8, 8, 8, generator=g) > 0.4, contraction, 1e9)
     with torch.no_grad():
-        everything = field.visible_samples(origins, directions, edges, jitter=jitter, occupied=occupied, deepest=1e9)
+        everything = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3)).intervals
         depths = everything.density * (everything.ends - everything.starts)
         deepest = 0.3 * float(kernels.sum_along_rays(depths, everything.offsets).median())
-        samples = field.visible_samples(origins, directions, edges, jitter=jitter, occupied=occupied, deepest=deepest)
-        starts, ends, offsets = kernels.reference.march(
-            origins, directions, edges, jitter=jitter, occupied=occupied, contraction=contraction
-        )
-        kept = []
+        march = march._replace(max_optical_depth=deepest)
+        seen = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3))
+        starts, ends, offsets = reference.march(rays, march)
+        kept, coordinates = [], []
         for ray in range(17):
             depth = 0.0
             for i in range(int(offsets[ray]), int(offsets[ray + 1])):
                 if depth >= deepest:
                     break
                 point = origins[ray] + directions[ray] * (starts[i] + ends[i]) / 2
-                at = kernels.grid_coordinates(point[None], contraction)
-                density = float(field.density(at))
+                coordinates.append(kernels.grid_coordinates(point[None], contraction))
+                density = float(density_of(field, coordinates[-1]))
                 kept.append((ray, float(starts[i]), float(ends[i]), density))
                 depth += density * float(ends[i] - starts[i])
-        rays = kernels.ray_indices(samples.offsets)
-        found = torch.stack([rays.float(), samples.starts, samples.ends, samples.density], dim=1)
+        samples = seen.intervals
+        index = kernels.ray_indices(samples.offsets)
+        found = torch.stack([index.float(), samples.starts, samples.ends, samples.density], dim=1)
         np.testing.assert_allclose(found.numpy(), np.array(kept), rtol=2e-4, atol=1e-6)
         assert len(kept) < int(offsets[-1])  # some stand behind others
-        density, rgb = field.radiance(samples.coordinates, directions, rays)
-        torch.testing.assert_close(samples.density, density, rtol=1e-4, atol=0)
-        torch.testing.assert_close(field.colour_of_code(samples.code, directions, rays), rgb, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("module", [kernels, marching])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_samples_are_lit_up_to_the_one_behind_which_it_is_dark(module, dtype):
-    """By hand: optical depths 0, 2, 4 and 6 in front of four intervals, 0 and 8 of two, and a ray without."""
-    density = torch.tensor([4.0, 4.0, 4.0, 4.0, 16.0, 1.0], dtype=dtype)
-    lit, offsets = module.lit_samples(density, torch.full_like(density, 0.5), torch.tensor([0, 4, 4, 6]), deepest=5.0)
-    assert lit.tolist() == [True, True, True, False, True, False]
-    assert offsets.tolist() == [0, 3, 3, 4]
+        density, rgb = radiance_of(field, torch.cat(coordinates), directions, index)
+        lengths = samples.ends - samples.starts
+        wanted, _, _ = reference.composite(density, rgb, lengths, offsets=samples.offsets, background=torch.zeros(3))
+        torch.testing.assert_close(seen.rgb, wanted, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("sizes", [(0, 9), (1, 9), (5, 3), (123, 40)])
@@ -210,9 +202,8 @@ def test_compiled_marching_is_the_reference(sizes, contraction):
     directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=g), dim=-1)
     origins, jitter = torch.randn(rays, 3, generator=g), torch.rand(rays, generator=g)
     edges, occupied = torch.linspace(0.1, 5.0, intervals + 2), torch.rand(6, 6, 6, generator=g) > 0.5
-    arguments = {"jitter": jitter, "occupied": occupied, "contraction": contraction}
-    fast = kernels.occupied_samples(origins, directions, edges, **arguments)
-    slow = kernels.marching.occupied_samples(origins, directions, edges, **arguments)
+    given = (Rays(origins, directions, jitter), March(edges, occupied, contraction, 7.0))
+    fast, slow = numba_cpu.occupied_samples(*given), reference.occupied_samples(*given)
     assert torch.equal(fast[3], slow[3])
     for one, other in zip(fast[:3], slow[:3], strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
@@ -220,23 +211,24 @@ def test_compiled_marching_is_the_reference(sizes, contraction):
 
 def test_the_sink_gets_the_gradient_of_the_rows(field):
     """As autograd gives it, up to the order of sums; then the optimiser has changed only what a sample touched."""
-    directions, occupied = looks(5), torch.ones(4, 4, 4, dtype=torch.bool)
-    samples = field.visible_samples(
-        -2 * directions, directions, torch.linspace(1, 3, 9), jitter=torch.zeros(5), occupied=occupied, deepest=50.0
-    )
-    rays = kernels.ray_indices(samples.offsets)
+    directions, background = looks(5), torch.rand(5, 3, generator=torch.Generator().manual_seed(4))
+    rays = Rays(-2 * directions, directions, torch.zeros(5))
+    march = March(torch.linspace(1, 3, 9), torch.ones(4, 4, 4, dtype=torch.bool), "none", 50.0)
     optimiser = FieldOptimiser(field)
     before = {name: value.detach().clone() for name, value in field.named_parameters()}
-    density, rgb = field.radiance_of_samples(samples, directions, rays, sink=optimiser.sink)
-    (density.sum() + rgb.sum()).backward()
+
+    def rendered(sink: torch.Tensor | None) -> torch.Tensor:
+        return field.backend.render_rays(rays, march, field.medium(), background=background, sink=sink).rgb.sum()
+
+    rendered(optimiser.sink).backward()
     rows, sink = field.rows(), optimiser.sink
     touched = torch.zeros(0)
     if rows is not None and sink is not None:
         assert rows.grad is None
-        density, rgb = field.radiance(samples.coordinates, directions, rays)
-        (wanted,) = torch.autograd.grad(density.sum() + rgb.sum(), rows)
+        (wanted,) = torch.autograd.grad(rendered(None), rows)
         torch.testing.assert_close(sink, wanted, rtol=1e-4, atol=1e-4 * float(wanted.abs().max()))
-        touched = (wanted != 0).any(-1)
+        touched = (sink != 0).any(-1)
+        assert touched.any()
     optimiser.step(1, 1e-3)
     assert sink is None or not sink.any()
     for name, value in field.named_parameters():
@@ -256,29 +248,38 @@ def test_marching_and_learning_see_pixels_of_the_same_width():
         blurred.table.normal_()
         sharp.load_state_dict(blurred.state_dict())
     torch.manual_seed(0)
-    directions = looks(5)
-    marched = {"jitter": torch.zeros(5), "occupied": torch.ones(4, 4, 4, dtype=torch.bool), "deepest": 50.0}
-    rays = (-2 * directions, directions, torch.linspace(1, 3, 9))
+    directions, background = looks(5), torch.zeros(5, 3)
+    march = March(torch.linspace(1, 3, 9), torch.ones(4, 4, 4, dtype=torch.bool), "l2", 50.0)
+    plain = sharp.backend.trace_rays(
+        Rays(-2 * directions, directions, torch.zeros(5)), march, sharp.medium(), background=background
+    )
     for width in (1e-6, 0.05, 1e9):
-        cones = torch.full((5,), width)
-        samples = blurred.visible_samples(*rays, **marched, cones=cones)
-        of_rays = kernels.ray_indices(samples.offsets)
-        density, rgb = blurred.radiance_of_samples(samples, directions, of_rays, sink=None)
-        torch.testing.assert_close(density, samples.density, rtol=1e-5, atol=0)
-        torch.testing.assert_close(rgb, blurred.colour_of_code(samples.code, directions, of_rays), rtol=1e-5, atol=0)
-        assert sharp.visible_samples(*rays, **marched, cones=cones).widths is None
-        whole = kernels.hash_encode(samples.coordinates, blurred.table, settings.resolutions)
-        middles = (samples.starts + samples.ends) / 2
+        rays = Rays(-2 * directions, directions, torch.zeros(5), torch.full((5,), width))
+        shown: dict[str, torch.Tensor] = {}
+        learned = blurred.backend.render_rays(
+            rays,
+            march,
+            blurred.medium(),
+            background=background,
+            trace=lambda name, values, index, shown=shown: shown.update({name: values}),
+        )
+        seen = blurred.backend.trace_rays(rays, march, blurred.medium(), background=background)
+        torch.testing.assert_close(shown["density of samples"], seen.intervals.density, rtol=1e-5, atol=0)
+        torch.testing.assert_close(learned.rgb, seen.rgb, rtol=1e-5, atol=1e-7)
+        assert torch.equal(sharp.backend.trace_rays(rays, march, sharp.medium(), background=background).rgb, plain.rgb)
+        whole = reference.hash_encode(shown["coordinates of samples"], blurred.table, settings.resolutions)
+        middles = (seen.intervals.starts + seen.intervals.ends) / 2
         # All of them lie inside the unit ball, where a coordinate is a quarter of a length.
         assert (middles < 3).all()
         left = 1 / (width * middles[:, None] / 4 * torch.tensor(settings.resolutions)).clamp_min(1.0)
-        torch.testing.assert_close(samples.code, whole * left.repeat_interleave(4, dim=1), rtol=1e-4, atol=1e-6)
+        code = whole * left.repeat_interleave(4, dim=1)
+        torch.testing.assert_close(shown["code of samples"], code, rtol=1e-4, atol=1e-6)
 
 
 def test_the_state_of_the_optimiser_comes_back(field):
     def stepped(optimiser: FieldOptimiser, number: int) -> None:
         optimiser.zero_grad()
-        density, rgb = field.radiance(places(9), looks(9), torch.arange(9))
+        density, rgb = radiance_of(field, places(9), looks(9), torch.arange(9))
         (density.sum() + rgb.sum()).backward()
         rows = field.rows()
         if rows is not None and optimiser.sink is not None and rows.grad is not None:
@@ -328,7 +329,7 @@ def test_a_field_from_before_there_were_kinds_is_a_hash_grid(tmp_path):
     save_tensors(tmp_path / "old.safetensors", tensors, description)
     loaded = load_model(tmp_path / "old.safetensors", "cpu").field
     assert loaded.settings == field.settings
-    assert torch.equal(loaded.density(places(7)), field.density(places(7)))
+    assert torch.equal(density_of(loaded, places(7)), density_of(field, places(7)))
 
 
 def test_a_kind_of_a_later_version_is_told():

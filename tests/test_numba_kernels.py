@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from nerfcli import kernels
-from nerfcli.kernels import numba_cpu, reference
+from nerfcli.kernels import HashGrid, March, PixelTable, Rays, numba_cpu, reference
 from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
@@ -132,6 +132,7 @@ def test_hash_encode_reads_no_row_that_is_no_vertex():
 
 
 WEIGHTS = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
+EMPTY = HashGrid(torch.zeros(8, 16, 4), (2,) * 8, tuple(torch.zeros(shape) for shape in WEIGHTS))
 
 
 def test_radiance_ends_where_the_logarithm_of_a_density_does():
@@ -193,7 +194,7 @@ def test_sample_coordinates(samples, contraction, reach, generator):
         coordinates.backward(gradient.to(dtype))
         return coordinates.detach(), *(x.grad for x in inputs)
 
-    fast, exact = run(kernels.sample_coordinates, torch.float32), run(reference.sample_coordinates, torch.float64)
+    fast, exact = run(numba_cpu.sample_coordinates, torch.float32), run(reference.sample_coordinates, torch.float64)
     for name, actual, expected in zip(("coordinates", "origins", "directions"), fast, exact, strict=True):
         assert_close(actual, expected, name)
 
@@ -203,7 +204,7 @@ def test_sample_coordinates_that_are_known_are_taken(generator):
     ray = torch.randn(1, 3, generator=generator)
     known, offsets = torch.rand(2, 3, generator=generator), torch.tensor([0, 2])
     starts = torch.tensor([0.0, 1.0])
-    taken = kernels.sample_coordinates(ray, ray, starts, starts + 1, offsets=offsets, contraction="l2", known=known)
+    taken = numba_cpu.sample_coordinates(ray, ray, starts, starts + 1, offsets=offsets, contraction="l2", known=known)
     assert torch.equal(taken, known)
 
 
@@ -276,18 +277,12 @@ def test_visible_samples(rays, contraction, contrast, with_cones, generator):
     edges = torch.rand(60, generator=generator).cumsum(0) * 0.2
     occupied = torch.rand(8, 8, 8, generator=generator) > 0.4
     weights = tuple(torch.randn(shape, generator=generator) * 0.3 for shape in WEIGHTS)
-    settings = {
-        "jitter": torch.rand(rays, generator=generator),
-        "occupied": occupied,
-        "contraction": contraction,
-        "table": torch.randn(8, 256, 4, generator=generator) * contrast,
-        "resolutions": (4, 5, 6, 7, 9, 11, 13, 16),
-        "weights": weights,
-        "deepest": 7.0,
-        "cones": torch.rand(rays, generator=generator) if with_cones else None,
-    }
-    fast = numba_cpu.visible_samples(origins, directions, edges, **settings)
-    exact = reference.visible_samples(origins, directions, edges, **settings)
+    jitter = torch.rand(rays, generator=generator)
+    table = torch.randn(8, 256, 4, generator=generator) * contrast
+    grid = HashGrid(table, (4, 5, 6, 7, 9, 11, 13, 16), weights, antialias=with_cones)
+    cones = torch.rand(rays, generator=generator) if with_cones else None
+    given = (Rays(origins, directions, jitter, cones), March(edges, occupied, contraction, 7.0), grid)
+    fast, exact = numba_cpu.visible_samples(*given), reference.visible_samples(*given)
     # A middle that rounds into the neighbouring cell, or an optical depth that rounds across the limit, is kept by one
     # and not by the other; none is for these seeds.
     assert torch.equal(fast[5], exact[5])
@@ -308,18 +303,11 @@ def test_visible_samples_misses_no_lonely_cell(side, contraction, steps, generat
     rays = 300 if steps > 20 else 3000
     origins = torch.randn(rays, 3, generator=generator)
     directions = torch.nn.functional.normalize(-origins + 0.5 * torch.randn(rays, 3, generator=generator), dim=-1)
-    settings = {
-        "jitter": torch.rand(rays, generator=generator),
-        "occupied": torch.rand(side, side, side, generator=generator) < 0.002,
-        "contraction": contraction,
-        "table": torch.zeros(8, 16, 4),
-        "resolutions": (2,) * 8,
-        "weights": tuple(torch.zeros(shape) for shape in WEIGHTS),
-        "deepest": 1e9,
-    }
-    edges = torch.linspace(0.0, 5.0, steps)
-    fast = numba_cpu.visible_samples(origins, directions, edges, **settings)
-    exact = reference.visible_samples(origins, directions, edges, **settings)
+    jitter = torch.rand(rays, generator=generator)
+    occupied = torch.rand(side, side, side, generator=generator) < 0.002
+    along = March(torch.linspace(0.0, 5.0, steps), occupied, contraction, 1e9)
+    given = (Rays(origins, directions, jitter), along, EMPTY)
+    fast, exact = numba_cpu.visible_samples(*given), reference.visible_samples(*given)
     assert len(exact[0]) > 20
     # A middle that rounds across a cell's border may differ; a lost block is many samples.
     counts = [out[5].diff() for out in (fast, exact)]
@@ -331,17 +319,9 @@ def test_visible_samples_holds_many_rays_of_many_samples(generator):
     rays, edges = 200, torch.linspace(0, 2, 402)
     origins = torch.tensor([0.0, 0.0, -1.0]).repeat(rays, 1)
     directions = torch.tensor([0.0, 0.0, 1.0]).repeat(rays, 1)
+    along = March(edges, torch.ones(2, 2, 2, dtype=torch.bool), "none", 7.0)
     starts, ends, density, _, coordinates, offsets = numba_cpu.visible_samples(
-        origins,
-        directions,
-        edges,
-        jitter=torch.zeros(rays),
-        occupied=torch.ones(2, 2, 2, dtype=torch.bool),
-        contraction="none",
-        table=torch.zeros(8, 16, 4),
-        resolutions=(2,) * 8,
-        weights=tuple(torch.zeros(shape) for shape in WEIGHTS),
-        deepest=7.0,
+        Rays(origins, directions, torch.zeros(rays)), along, EMPTY
     )
     assert torch.equal(offsets, torch.arange(rays + 1) * 400)
     assert torch.equal(starts.view(rays, 400), edges[:400].expand(rays, 400))
@@ -413,18 +393,13 @@ def test_exponential_and_sigmoid_in_every_range():
 def test_pixel_rays(count, channels, generator):
     # Three photos of 5, 700 and 20 pixels, of which the first and the last share a camera's bearings.
     poses = torch.randn(3, 4, 4, generator=generator)
-    given = {
-        "bearings": torch.randn(720, 3, generator=generator),
-        "poses": poses,
-        "photos": torch.randint(256, (725, channels), generator=generator, dtype=torch.uint8),
-    }
-    where = torch.tensor([0, 5, 705]), torch.tensor([700, 0, 700])
+    bearings = torch.randn(720, 3, generator=generator)
+    photos = torch.randint(256, (725, channels), generator=generator, dtype=torch.uint8)
+    pixels = PixelTable(torch.tensor([0, 5, 705]), torch.tensor([700, 0, 700]), bearings, poses, photos)
     chosen = torch.randint(725, (count,), generator=generator)
-    fast = numba_cpu.pixel_rays(chosen, *where, **given)
-    exact = {key: value if value.dtype == torch.uint8 else value.double() for key, value in given.items()}
-    for name, actual, expected in zip(
-        ("origins", "directions", "colours"), fast, reference.pixel_rays(chosen, *where, **exact), strict=True
-    ):
+    fast = numba_cpu.pixel_rays(chosen, pixels)
+    exact = reference.pixel_rays(chosen, pixels._replace(bearings=bearings.double(), poses=poses.double()))
+    for name, actual, expected in zip(("origins", "directions", "colours"), fast, exact, strict=True):
         assert_close(actual, expected, name)
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.contraction import training_points
+from nerfcli.kernels import backend_for
 from nerfcli.render.occupancy import DECAY, Occupancy
 
 SIDE = 4
@@ -22,11 +23,24 @@ class Size:
     contraction: str
 
 
-class Ramp:
-    """Density x + 10 y + 100 z of the unit cube; notes where it was asked."""
+class Fake:
+    """A field that is its own medium, at any detail; notes which it was asked for."""
 
     def __init__(self, contraction: str = "none"):
         self.settings = Size(contraction)
+        self.backend = backend_for(torch.device("cpu"), torch.float64)
+        self.detail = math.nan
+
+    def medium(self, detail: float) -> "Fake":
+        self.detail = detail
+        return self
+
+
+class Ramp(Fake):
+    """Density x + 10 y + 100 z of the unit cube; notes where it was asked."""
+
+    def __init__(self, contraction: str = "none"):
+        super().__init__(contraction)
         self.asked = torch.zeros(0, 3)
 
     def density(self, coordinates: Tensor) -> Tensor:
@@ -34,11 +48,11 @@ class Ramp:
         return coordinates @ torch.tensor([1.0, 10.0, 100.0])
 
 
-class Even:
+class Even(Fake):
     """The same density everywhere."""
 
     def __init__(self, density: float):
-        self.settings = Size("none")
+        super().__init__()
         self._density = density
 
     def density(self, coordinates: Tensor) -> Tensor:
@@ -47,7 +61,8 @@ class Even:
 
 def refreshed(grid: Occupancy, field: Any, *, cells: slice = EVERYTHING, step: float = 0.5, growth: float = 0.0):
     generator = torch.Generator().manual_seed(1)
-    grid.refresh(field, cells=cells, shortest_step=step, growth=growth, generator=generator)
+    grid.refresh(field, detail=0.25, cells=cells, shortest_step=step, growth=growth, generator=generator)
+    assert field.detail == 0.25
     return grid
 
 

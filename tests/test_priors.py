@@ -9,13 +9,13 @@ import pytest
 import torch
 from PIL import Image
 
-from nerfcli import kernels
 from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap_write import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
+from nerfcli.kernels import reference
 from nerfcli.photos.loading import load_photos
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
@@ -25,7 +25,7 @@ from nerfcli.train.loop import train
 from nerfcli.train.losses import opacity_entropy
 from nerfcli.train.matching import chosen_pairs
 from nerfcli.train.photos import PixelPool
-from nerfcli.train.point_depth import LAST_SHARE, PointDepths, PointRays, fading, point_depth_loss, point_depths
+from nerfcli.train.point_depth import LAST_SHARE, PointRays, fading, point_depth_loss, point_depths
 from nerfcli.train.preparation import prepare
 from nerfcli.train.selection import Facts
 from nerfcli.train.shared import Shared
@@ -129,36 +129,37 @@ def test_points_that_are_asked_for_and_not_there_are_missed(spheres, tmp_path):
         prepare(alone, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
 
 
-def test_the_loss_of_points_is_the_mean_deviation_of_where_light_ends():
-    # Three rays; the last two have points at 2 and 1, trusted 1 and 0.5.
+def test_light_off_its_target_counts_by_how_far_it_is():
+    # Three rays; the last two have targets at 2 and 1.
     offsets = torch.tensor([0, 1, 3, 4])
     middles = torch.tensor([5.0, 2.0, 2.25, 9.0])
     weights, left = torch.tensor([0.9, 0.5, 0.3, 0.7]), torch.tensor([0.1, 0.2, 0.3])
-    known = PointDepths(torch.zeros(2, dtype=torch.int64), torch.tensor([2.0, 1.0]), torch.tensor([1.0, 0.5]))
+    distances = torch.tensor([2.0, 1.0])
     # First: 0.5 at the point, 0.3 half of the way to "elsewhere", 0.2 passes; second: all is elsewhere.
-    expected = (1.0 * (0.3 * 0.5 + 0.2) + 0.5 * (0.7 + 0.3)) / 2
-    assert point_depth_loss(weights, left, middles, offsets=offsets, known=known).item() == pytest.approx(expected)
-    at_points = point_depth_loss(
+    expected = [0.3 * 0.5 + 0.2, 0.7 + 0.3]
+    off = reference.off_target(weights, left, middles, offsets=offsets, distances=distances)
+    assert off.tolist() == pytest.approx(expected)
+    trusted = point_depth_loss(off, torch.tensor([1.0, 0.5]))
+    assert trusted.item() == pytest.approx((1.0 * expected[0] + 0.5 * expected[1]) / 2)
+    at_targets = reference.off_target(
         torch.tensor([0.0, 1.0, 0.0, 1.0]), torch.zeros(3), torch.tensor([5.0, 2.0, 3.0, 1.0]),
-        offsets=offsets, known=known,
+        offsets=offsets, distances=distances,
     )  # fmt: skip
-    assert at_points.item() == 0.0
+    assert at_targets.tolist() == [0.0, 0.0]
 
 
-def test_the_gradient_of_the_loss_of_points_is_right():
+def test_the_gradient_of_light_off_its_target_is_right():
     offsets = torch.tensor([0, 2, 2, 5])
     density = torch.rand(5, dtype=torch.float64, requires_grad=True)
     lengths = torch.full((5,), 0.5, dtype=torch.float64)
     middles = torch.tensor([1.0, 2.0, 1.0, 1.1, 1.7], dtype=torch.float64)
-    known = PointDepths(
-        torch.zeros(3, dtype=torch.int64), torch.tensor([1.9, 1.0, 1.2]).double(), torch.ones(3).double()
-    )
+    distances = torch.tensor([1.9, 1.0, 1.2], dtype=torch.float64)
 
-    def loss(density: torch.Tensor) -> torch.Tensor:
-        weights, transmittance = kernels.interval_weights(density, lengths, offsets)
-        return point_depth_loss(weights, transmittance, middles, offsets=offsets, known=known)
+    def off(density: torch.Tensor) -> torch.Tensor:
+        weights, transmittance = reference.interval_weights(density, lengths, offsets)
+        return reference.off_target(weights, transmittance, middles, offsets=offsets, distances=distances)
 
-    assert torch.autograd.gradcheck(loss, (density,))
+    assert torch.autograd.gradcheck(off, (density,))
 
 
 def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):

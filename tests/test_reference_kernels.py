@@ -12,7 +12,7 @@ from oracles import march_through_slabs, trilinear_hash
 
 from nerfcli import kernels
 from nerfcli.field.contraction import training_points, uncontract
-from nerfcli.kernels import reference
+from nerfcli.kernels import March, Rays, reference
 from nerfcli.kernels.contraction import cube_widths
 
 
@@ -286,12 +286,12 @@ def test_march_keeps_what_is_occupied():
     occupied[:, :, 3] = True
     edges = torch.linspace(0.0, 4.0, 42, dtype=torch.float64)
     starts, ends, offsets = reference.march(
-        torch.tensor([[-1.5, 0.1, 0.1], [-1.5, 5.0, 0.0]], dtype=torch.float64),
-        torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(2, 3),
-        edges,
-        jitter=torch.tensor([0.25, 0.25], dtype=torch.float64),
-        occupied=occupied,
-        contraction="none",
+        Rays(
+            torch.tensor([[-1.5, 0.1, 0.1], [-1.5, 5.0, 0.0]], dtype=torch.float64),
+            torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(2, 3),
+            torch.tensor([0.25, 0.25], dtype=torch.float64),
+        ),
+        March(edges, occupied, "none", math.inf),
     )
     middles = (starts + ends) / 2 - 1.5
     assert offsets.tolist() == [0, len(starts), len(starts)]  # the second ray misses the cube
@@ -306,12 +306,12 @@ def test_march_keeps_what_is_occupied():
 def test_march_with_everything_occupied_covers_the_ray():
     edges = torch.tensor([0.1, 0.2, 0.4, 0.8, 1.6, 3.2], dtype=torch.float64)
     starts, ends, offsets = reference.march(
-        torch.zeros(1, 3, dtype=torch.float64),
-        torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64),
-        edges,
-        jitter=torch.zeros(1, dtype=torch.float64),
-        occupied=torch.ones(2, 2, 2, dtype=torch.bool),
-        contraction="l2",
+        Rays(
+            torch.zeros(1, 3, dtype=torch.float64),
+            torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64),
+            torch.zeros(1, dtype=torch.float64),
+        ),
+        March(edges, torch.ones(2, 2, 2, dtype=torch.bool), "l2", math.inf),
     )
     assert offsets.tolist() == [0, 4]
     torch.testing.assert_close(starts, edges[:4])

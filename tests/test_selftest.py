@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from nerfcli import cli, kernels
 from nerfcli.errors import GATE_NOT_MET
-from nerfcli.kernels import depth, numba_cpu, reference
+from nerfcli.kernels import numba_cpu, reference
+from nerfcli.kernels.reference import compositing, depth
 from nerfcli.render import sampling
 from nerfcli.selftest import depths, exact, exact_depths, learning, light, lookup, measure, space, suite, textbook
 from nerfcli.selftest.measure import MET, NOT_HERE, NOT_MET, Errors, Precision, Row, by_formula, largest_error
@@ -67,12 +68,12 @@ def test_weights_by_one_minus_exp_are_caught(monkeypatch):
         total = reference.sum_along_rays(density * lengths, offsets)
         return torch.exp(-before) * (1 - torch.exp(-density * lengths)), torch.exp(-total)
 
-    monkeypatch.setattr(reference, "interval_weights", textbook_weights)
+    monkeypatch.setattr(compositing, "interval_weights", textbook_weights)
     assert failed(light.rows((SINGLE,))) == {"composite"}
 
 
 def test_a_gradient_of_expm1_by_its_value_is_caught(monkeypatch):
-    monkeypatch.setattr(reference, "opacity", lambda x: -torch.expm1(-x))
+    monkeypatch.setattr(compositing, "opacity", lambda x: -torch.expm1(-x))
     assert failed(light.rows((SINGLE,))) == {"composite"}
 
 
@@ -119,19 +120,18 @@ def test_the_gradients_of_depths_are_difference_quotients_in_sixty_digits():
 
 
 def test_optical_depth_by_subtraction_and_half_precision_are_caught(monkeypatch):
-    monkeypatch.setattr(
-        reference, "optical_depth_before", lambda *given: textbook.optical_depth_before(*given[:2], offsets=given[2])
-    )
+    for module in (reference, compositing):  # what is asked, and what the weights of intervals ask
+        monkeypatch.setattr(
+            module, "optical_depth_before", lambda *given: textbook.optical_depth_before(*given[:2], offsets=given[2])
+        )
     assert failed(depths.rows((SINGLE,))) == {"optical_depth_before", "light_ends"}
     interpolated, pixel_rays = reference.hash_encode, reference.pixel_rays
 
-    def in_half(points, table, resolutions, **sink):
+    def in_half(points, table, resolutions, widths=None):
         return interpolated(points.half(), table.half(), resolutions)
 
     monkeypatch.setattr(reference, "hash_encode", in_half)
-    monkeypatch.setattr(
-        reference, "pixel_rays", lambda chosen, *where, **given: pixel_rays(chosen.float().long(), *where, **given)
-    )
+    monkeypatch.setattr(reference, "pixel_rays", lambda chosen, pixels: pixel_rays(chosen.float().long(), pixels))
     assert failed(lookup.rows((SINGLE,))) == {"hash_encode", "pixel_rays"}
 
 

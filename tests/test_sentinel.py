@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from nerfcli import kernels
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.kernels import numba_cpu
+from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 from nerfcli.render.model import load_model, save_model
 from nerfcli.render.pictures import render_picture
 from nerfcli.runs.log import read_log
@@ -96,7 +97,7 @@ def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
 
 def test_a_fault_that_does_not_come_back_changes_nothing(views, tmp_path, monkeypatch):
     fit(views, tmp_path / "straight")
-    composite, calls = kernels.composite, 0
+    composite, calls = numba_cpu.composite, 0
 
     def flaky(*args: torch.Tensor, **named: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         nonlocal calls
@@ -104,11 +105,40 @@ def test_a_fault_that_does_not_come_back_changes_nothing(views, tmp_path, monkey
         rgb, transmittance, shares = composite(*args, **named)
         return (rgb * math.nan if calls == 9 else rgb), transmittance, shares
 
-    monkeypatch.setattr(kernels, "composite", flaky)
+    monkeypatch.setattr(numba_cpu, "composite", flaky)
     told = fit(views, tmp_path / "flaky")
     assert any("are when the step is repeated" in line for line in told)
     assert weights(tmp_path / "flaky") == weights(tmp_path / "straight")
     assert not list((tmp_path / "flaky").glob("failure-*"))
+
+
+def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, tmp_path, monkeypatch):
+    """And what does not come back is nobody's fault."""
+    monkeypatch.setattr(NumbaBackend, "deterministic", False)
+    rate = Fitting.learning_rate
+
+    def poisoned(self: Fitting, share: float) -> float:
+        return math.nan if self.step == 7 and self.rollbacks == 0 else rate(self, share)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Fitting, "learning_rate", poisoned)
+        patched.setattr(sentinel, "SNAPSHOT_EVERY", 4)
+        told = fit(views, tmp_path / "poisoned")
+    (line,) = [line for line in told if "back to step" in line]
+    assert line.startswith("table is not finite at step 8")
+    _, description = load_tensors(tmp_path / "poisoned" / "failure-8.safetensors", "cpu")
+    assert description["state"]["step"] == 7
+    composite, calls = numba_cpu.composite, 0
+
+    def flaky(*args: torch.Tensor, **named: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        nonlocal calls
+        calls += 1
+        rgb, transmittance, shares = composite(*args, **named)
+        return (rgb * math.nan if calls == 9 else rgb), transmittance, shares
+
+    monkeypatch.setattr(numba_cpu, "composite", flaky)
+    told = fit(views, tmp_path / "flaky")
+    assert any("no two runs are the same" in line for line in told)
 
 
 def test_a_poisoned_checkpoint_is_refused_by_name_and_kept(views, tmp_path):

@@ -178,6 +178,7 @@ def test_interrupted_and_resumed_equals_straight_bit_for_bit(views, tmp_path):
         if progress.step == 11:
             raise KeyboardInterrupt
 
+    assert kernels.backend_for(torch.device("cpu"), torch.float32).deterministic
     straight = fit(views, tmp_path / "straight", ADAPTIVE)
     with pytest.raises(KeyboardInterrupt):
         fit(views, tmp_path / "parts", ADAPTIVE, on_progress=stop)

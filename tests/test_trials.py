@@ -129,11 +129,17 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
     fitting.edges = torch.linspace(0.1, 1.4, 14)
     fitting.step, fitting.furthest = DETAILED_STEPS, 1.0  # no steps are left out
     sigma = 0.1
-    monkeypatch.setattr(
-        fitting.field,
-        "radiance_of_samples",
-        lambda samples, *rest, **more: (torch.full_like(samples.starts, sigma), torch.zeros(len(samples.starts), 3)),
-    )
+
+    class Fog:
+        def density(self, coordinates: torch.Tensor) -> torch.Tensor:
+            return torch.full_like(coordinates[:, 0], sigma)
+
+        def radiance(
+            self, coordinates: torch.Tensor, directions: torch.Tensor, rays: torch.Tensor, *, sink: torch.Tensor | None
+        ) -> tuple[torch.Tensor, torch.Tensor]:
+            return self.density(coordinates), torch.zeros_like(coordinates)
+
+    monkeypatch.setattr(fitting.field, "medium", lambda detail: Fog())
     found = fitting.light_from_beyond(trials._pool.rays_of(torch.arange(50)), distance=distance + 0.01)
     assert found.tolist() == pytest.approx([math.exp(-sigma * (min(distance, 1.4) - 0.2))] * 50, rel=1e-5)
 

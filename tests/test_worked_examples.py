@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from kernel_parts import parts_for
 
-from nerfcli import kernels
 from nerfcli.cameras.camera import Camera
 from nerfcli.field.cost import dense_grid_bytes, field_queries, parameter_bytes
 from nerfcli.field.encodings import fourier_features
-from nerfcli.kernels import depth
+from nerfcli.kernels import LightEnds
+from nerfcli.kernels.reference import depth
 from nerfcli.render import sampling, transmission
 from nerfcli.render.depth import DepthRequest, requested
 
@@ -50,29 +51,29 @@ def test_ray_of_a_pixel_has_unit_direction():
 
 def test_slabs_weights_transmittance_and_colour(slabs, dtype):
     density, rgb, lengths = slabs
-    colour, transmittance, weights = kernels.composite(
+    colour, transmittance, weights = parts_for(dtype).composite(
         density, rgb, lengths, offsets=OFFSETS, background=torch.ones(3, dtype=dtype)
     )
     close(weights, [1 / 2, 1 / 4, 3 / 16], dtype)
     close(transmittance, [1 / 16], dtype)
     close(colour, [[9 / 16, 5 / 16, 4 / 16]], dtype)
     close(weights.sum() + transmittance[0], 1.0, dtype)
-    entering = torch.exp(-kernels.optical_depth_before(density, lengths, OFFSETS))
+    entering = torch.exp(-parts_for(dtype).optical_depth_before(density, lengths, OFFSETS))
     close(entering, [1.0, 1 / 2, 1 / 4], dtype)
     close(-torch.expm1(-density * lengths), [1 / 2, 1 / 2, 3 / 4], dtype)
 
 
 def test_weights_are_differences_of_transmittance(slabs, dtype):
     density, _, lengths = slabs
-    weights, behind = kernels.interval_weights(density, lengths, OFFSETS)
-    at_edges = torch.cat([torch.exp(-kernels.optical_depth_before(density, lengths, OFFSETS)), behind])
+    weights, behind = parts_for(dtype).interval_weights(density, lengths, OFFSETS)
+    at_edges = torch.cat([torch.exp(-parts_for(dtype).optical_depth_before(density, lengths, OFFSETS)), behind])
     close(weights, at_edges[:-1] - at_edges[1:], dtype)
 
 
 def test_depths_of_slabs_at_points(slabs, dtype):
     # Depths 1, 2, 3 as given places: the conventions differ, and each is its own number.
     density, _, lengths = slabs
-    weights, transmittance = kernels.interval_weights(density, lengths, OFFSETS)
+    weights, transmittance = parts_for(dtype).interval_weights(density, lengths, OFFSETS)
     places = torch.tensor([1.0, 2.0, 3.0], dtype=dtype)
     close(depth.moment(weights, places, OFFSETS), [25 / 16], dtype)
     close(weights.sum(), 15 / 16, dtype)
@@ -81,7 +82,7 @@ def test_depths_of_slabs_at_points(slabs, dtype):
     heaviest = depth.max_weight(weights, places, OFFSETS)
     close(heaviest, [1.0], dtype)
     none = mean.new_empty(1, 0)
-    ends = depth.LightEnds(1 - transmittance, transmittance, mean, mean, heaviest, weights.max()[None], none)
+    ends = LightEnds(1 - transmittance, transmittance, mean, mean, heaviest, weights.max()[None], none)
     for far in (4.0, 100.0):
         request = DepthRequest("background", "ray", background_distance=far)
         close(requested(request, ends, background_distance=mean.new_tensor([far])), [25 / 16 + far / 16], dtype)
@@ -112,7 +113,7 @@ def test_gradients_of_the_slabs(slabs, dtype):
     density, rgb, lengths = slabs
     density.requires_grad_()
     rgb.requires_grad_()
-    colour, _, weights = kernels.composite(
+    colour, _, weights = parts_for(dtype).composite(
         density, rgb, lengths, offsets=OFFSETS, background=torch.ones(3, dtype=dtype)
     )
     by_density = torch.stack([torch.autograd.grad(colour[0, c], density, retain_graph=True)[0] for c in range(3)])
@@ -125,7 +126,7 @@ def test_gradients_of_the_slabs(slabs, dtype):
 def test_one_observation_is_consistent_with_many_fields(dtype):
     # y = alpha c on black: alpha 1/2 with c 1/2 and alpha 1/4 with c 1 both give 1/4.
     for density, grey in ((math.log(2), 0.5), (-math.log(3 / 4), 1.0)):
-        colour, _, _ = kernels.composite(
+        colour, _, _ = parts_for(dtype).composite(
             torch.tensor([density], dtype=dtype),
             torch.full((1, 3), grey, dtype=dtype),
             torch.ones(1, dtype=dtype),

@@ -7,9 +7,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from nerfcli.field.encodings import fourier_features, spherical_harmonics
-from nerfcli.field.interface import Field, FieldSettings, Samples
-from nerfcli.field.plain_marching import visible_samples
+from nerfcli.field.encodings import fourier_features
+from nerfcli.field.interface import Field, FieldSettings
+from nerfcli.kernels import Medium, spherical_harmonics
 from nerfcli.kernels.activations import density_from_log
 
 HARMONICS = 16
@@ -66,46 +66,21 @@ class FourierField(Field):
     def rows(self) -> None:
         return None
 
+    def medium(self, detail: float = 1.0) -> Medium:
+        return self
+
     def density(self, coordinates: Tensor) -> Tensor:
+        """See `kernels.Medium`."""
         return density_from_log(self.log_density(self._hidden(coordinates))[:, 0])
 
-    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    def radiance(
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """See `kernels.Medium`; there is no table, and nothing goes into the sink."""
         hidden = self._hidden(coordinates)
         harmonics = spherical_harmonics(directions, self.settings.view_degree)[rays]
         rgb = torch.sigmoid(self.colour(torch.cat([hidden, harmonics], dim=-1)))
         return density_from_log(self.log_density(hidden)[:, 0]), rgb
-
-    def visible_samples(
-        self,
-        origins: Tensor,
-        directions: Tensor,
-        edges: Tensor,
-        *,
-        jitter: Tensor,
-        occupied: Tensor,
-        deepest: float,
-        cones: Tensor | None = None,
-    ) -> Samples:
-        # Training needs the layers again, with gradients: the code is no more than the place.
-        return visible_samples(
-            origins,
-            directions,
-            edges,
-            jitter=jitter,
-            occupied=occupied,
-            contraction=self.settings.contraction,
-            deepest=deepest,
-            density=self.density,
-            code=lambda coordinates: coordinates,
-        )
-
-    def colour_of_code(self, code: Tensor, directions: Tensor, rays: Tensor) -> Tensor:
-        return self.radiance(code, directions, rays)[1]
-
-    def radiance_of_samples(
-        self, samples: Samples, directions: Tensor, rays: Tensor, *, sink: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        return self.radiance(samples.coordinates, directions, rays)
 
     def _hidden(self, coordinates: Tensor) -> Tensor:
         """The last hidden layer (N, width)."""

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from nerfcli import kernels
-from nerfcli.field.encodings import spherical_harmonics
-from nerfcli.field.interface import Field, FieldSettings, Samples
+from nerfcli.field.interface import Field, FieldSettings
+from nerfcli.kernels import HashGrid
 
 # Outputs of the density network, the logarithm of the density first; all of them go on to the colour network.
 GEOMETRY = 16
@@ -48,7 +47,7 @@ class HashFieldSettings(FieldSettings):
 
 
 class HashField(Field):
-    """The compiled kernels are written for this field: marching, encoding and density are one operation.
+    """The field that backends compile: see `kernels.HashGrid`.
 
     The table starts near zero and the networks have no biases, so a
     fresh field is a grey fog of density 1: thin enough that every sample of a ray gets a gradient.
@@ -62,7 +61,6 @@ class HashField(Field):
         self.table = nn.Parameter(torch.empty(shape).uniform_(-1e-4, 1e-4))
         sizes = ((width, encoded), (GEOMETRY, width), (width, GEOMETRY + HARMONICS), (width, width), (3, width))
         self.weights = nn.ParameterList([_uniform_weights(*size) for size in sizes])
-        self._resolutions = settings.resolutions
 
     @property
     def settings(self) -> HashFieldSettings:
@@ -71,74 +69,26 @@ class HashField(Field):
     def rows(self) -> nn.Parameter:
         return self.table
 
-    def refine(self, share: float) -> None:
-        resolutions = self.settings.resolutions
-        first = min(FIRST_LEVELS, len(resolutions))
-        learning = max(1, first + math.floor((len(resolutions) - first) * share / ALL_LEVELS_SHARE))
-        self._resolutions = tuple(side if level < learning else 0 for level, side in enumerate(resolutions))
-
-    def density(self, coordinates: Tensor) -> Tensor:
-        encoded = kernels.hash_encode(coordinates, self.table, self._resolutions)
-        return kernels.density(encoded, tuple(self.weights))
-
-    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        encoded = kernels.hash_encode(coordinates, self.table, self._resolutions)
-        return self._radiance_of_encoded(encoded, directions, rays)
-
-    def visible_samples(
-        self,
-        origins: Tensor,
-        directions: Tensor,
-        edges: Tensor,
-        *,
-        jitter: Tensor,
-        occupied: Tensor,
-        deepest: float,
-        cones: Tensor | None = None,
-    ) -> Samples:
-        contraction, cones = self.settings.contraction, cones if self.settings.antialias else None
-        samples = Samples(
-            *kernels.visible_samples(
-                origins,
-                directions,
-                edges,
-                jitter=jitter,
-                occupied=occupied,
-                contraction=contraction,
-                table=self.table,
-                resolutions=self._resolutions,
-                weights=tuple(self.weights),
-                deepest=deepest,
-                cones=cones,
-            )
+    def medium(self, detail: float = 1.0) -> HashGrid:
+        return HashGrid(
+            self.table,
+            _resolutions_at(detail, self.settings.resolutions),
+            tuple(self.weights),
+            self.settings.view_degree,
+            self.settings.antialias,
         )
-        if cones is None:
-            return samples
-        rays = kernels.ray_indices(samples.offsets)
-        widths = kernels.sample_widths(
-            origins, directions, samples.starts, samples.ends, rays=rays, cones=cones, contraction=contraction
-        )
-        return samples._replace(widths=widths)
-
-    def colour_of_code(self, code: Tensor, directions: Tensor, rays: Tensor) -> Tensor:
-        return self._radiance_of_encoded(code, directions, rays)[1]
-
-    def radiance_of_samples(
-        self, samples: Samples, directions: Tensor, rays: Tensor, *, sink: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        encoded = kernels.hash_encode(
-            samples.coordinates, self.table, self._resolutions, sink=sink, known=samples.code, widths=samples.widths
-        )
-        return self._radiance_of_encoded(encoded, directions, rays)
 
     @torch.no_grad()
     def forget_directions(self, degree: int) -> None:
         """Give the harmonics above `degree` no weight. Where they were 0 so far, the field stays what it was."""
         self.weights[2][:, GEOMETRY + (degree + 1) ** 2 :] = 0.0
 
-    def _radiance_of_encoded(self, encoded: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        harmonics = spherical_harmonics(directions, self.settings.view_degree)
-        return kernels.radiance(encoded, harmonics, rays, tuple(self.weights))
+
+def _resolutions_at(detail: float, resolutions: tuple[int, ...]) -> tuple[int, ...]:
+    """Those of the levels that learn at a share of the budget, 0 for the others."""
+    first = min(FIRST_LEVELS, len(resolutions))
+    learning = max(1, first + math.floor((len(resolutions) - first) * detail / ALL_LEVELS_SHARE))
+    return tuple(side if level < learning else 0 for level, side in enumerate(resolutions))
 
 
 def _uniform_weights(outputs: int, inputs: int) -> nn.Parameter:

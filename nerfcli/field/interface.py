@@ -1,10 +1,13 @@
 """What training, rendering and checkpoints ask of a field, whatever it is made of."""
 
 import abc
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Self
 
 from torch import Tensor, nn
+
+from nerfcli import kernels
 
 
 @dataclass(frozen=True)
@@ -26,36 +29,35 @@ class FieldSettings(abc.ABC):
         return {"kind": self.kind, **asdict(self)}
 
 
-class Samples(NamedTuple):
-    """The samples of R rays that light gets to, packed as in `kernels.reference`, without gradients.
-
-    Args:
-        starts, ends: (N,) distances along the ray.
-        density: (N,) what the field says there.
-        code: (N, C) what the field computed on the way to the density and can go on with to the colour.
-        coordinates: (N, 3) in the field's unit cube.
-        offsets: (R + 1,) int64.
-        widths: (N,) of pixels there, see `kernels.hash_encode`; None where they do not matter.
-    """
-
-    starts: Tensor
-    ends: Tensor
-    density: Tensor
-    code: Tensor
-    coordinates: Tensor
-    offsets: Tensor
-    widths: Tensor | None = None
-
-
 class Field(nn.Module, abc.ABC):
     """Density by position, colour by position and direction, on the unit cube of `kernels.grid_coordinates`.
 
-    How this kind is trained best: `rate_factor` times the learning rate, and `closing_steps` until rays pass over cells
-    that hold little.
+    `medium` says what that is; `backend` computes with it. How this kind is trained best: `rate_factor` times the
+    learning rate, and `closing_steps` until rays pass over cells that hold little.
     """
 
     rate_factor: float = 1.0
     closing_steps: ClassVar[int] = 150
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._backend: kernels.Backend | None = None
+
+    @property
+    def backend(self) -> kernels.Backend:
+        """Who computes with this field: chosen when first asked for, again after a move to another device or type."""
+        if self._backend is None:
+            some = next(self.parameters())
+            self._backend = kernels.backend_for(some.device, some.dtype)
+        return self._backend
+
+    @backend.setter
+    def backend(self, backend: kernels.Backend) -> None:
+        self._backend = backend
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        self._backend = None
+        return super()._apply(fn, recurse)
 
     @property
     @abc.abstractmethod
@@ -66,53 +68,15 @@ class Field(nn.Module, abc.ABC):
     def rows(self) -> nn.Parameter | None:
         """(..., F) those of the parameters of which a sample touches only some rows; None where there are none.
 
-        Training changes rows that were touched and leaves the others alone, see `kernels.adam_rows`. All other
+        Training changes rows that were touched and leaves the others alone, see `reference.adam_rows`. All other
         parameters take part in every sample.
         """
 
-    def refine(self, share: float) -> None:
-        """Have the details learn that are due at this share of the budget, see `hash_field`; below 0, fewer than at
-        first.
-
-        Those that do not learn yet are as they were made: nothing that can be seen.
-        """
-
     @abc.abstractmethod
-    def density(self, coordinates: Tensor) -> Tensor:
-        """Density (N,) in 1 / training unit at coordinates (N, 3) of the unit cube."""
-
-    @abc.abstractmethod
-    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        """Density (N,) and sRGB colour (N, 3) at coordinates (N, 3), seen along `directions` (R, 3) of `rays` (N,)."""
-
-    @abc.abstractmethod
-    def visible_samples(
-        self,
-        origins: Tensor,
-        directions: Tensor,
-        edges: Tensor,
-        *,
-        jitter: Tensor,
-        occupied: Tensor,
-        deepest: float,
-        cones: Tensor | None = None,
-    ) -> Samples:
-        """The samples of rays that light gets to; see `kernels.visible_samples`.
+    def medium(self, detail: float = 1.0) -> kernels.HashGrid | kernels.Medium:
+        """What backends render.
 
         Args:
-            cones: (R,) width of the pixel of each ray per distance; what has no levels does not look at it.
-        """
-
-    @abc.abstractmethod
-    def colour_of_code(self, code: Tensor, directions: Tensor, rays: Tensor) -> Tensor:
-        """Colour (N, 3) from what `visible_samples` has computed already, (N, C)."""
-
-    @abc.abstractmethod
-    def radiance_of_samples(
-        self, samples: Samples, directions: Tensor, rays: Tensor, *, sink: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """`radiance` of what `visible_samples` gave, with gradients.
-
-        Args:
-            sink: of the shape of `rows`; their gradient is added to it, and autograd gets none.
+            detail: the share of a training's budget whose details are in it; 1 for all, below 0 for fewer than at
+                first. Those that are not are as they were made: nothing that can be seen.
         """

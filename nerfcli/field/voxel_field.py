@@ -6,10 +6,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from nerfcli import kernels
-from nerfcli.field.encodings import spherical_harmonics
-from nerfcli.field.interface import Field, FieldSettings, Samples
-from nerfcli.field.plain_marching import visible_samples
+from nerfcli.field.interface import Field, FieldSettings
+from nerfcli.kernels import Medium, spherical_harmonics
 from nerfcli.kernels.activations import density_from_log
 
 # Numbers that the compiled interpolation takes at a time.
@@ -71,58 +69,23 @@ class VoxelField(Field):
     def rows(self) -> nn.Parameter:
         return self.table
 
+    def medium(self, detail: float = 1.0) -> Medium:
+        return self
+
     def density(self, coordinates: Tensor) -> Tensor:
+        """See `kernels.Medium`."""
         # The log density stands in the first table; there is no need to look into the others.
-        resolutions = (self.settings.resolution,)
-        return density_from_log(kernels.hash_encode(coordinates, self.table[:1], resolutions)[:, 0])
+        values = self.backend.hash_encode(coordinates, self.table[:1], (self.settings.resolution,))
+        return density_from_log(values[:, 0])
 
-    def radiance(self, coordinates: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        return self._radiance_of_values(self._interpolated(coordinates), directions, rays)
-
-    def visible_samples(
-        self,
-        origins: Tensor,
-        directions: Tensor,
-        edges: Tensor,
-        *,
-        jitter: Tensor,
-        occupied: Tensor,
-        deepest: float,
-        cones: Tensor | None = None,
-    ) -> Samples:
-        return visible_samples(
-            origins,
-            directions,
-            edges,
-            jitter=jitter,
-            occupied=occupied,
-            contraction=self.settings.contraction,
-            deepest=deepest,
-            density=self.density,
-            code=self._interpolated,
-        )
-
-    def colour_of_code(self, code: Tensor, directions: Tensor, rays: Tensor) -> Tensor:
-        return self._radiance_of_values(code, directions, rays)[1]
-
-    def radiance_of_samples(
-        self, samples: Samples, directions: Tensor, rays: Tensor, *, sink: Tensor | None
+    def radiance(
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        values = kernels.hash_encode(
-            samples.coordinates, self.table, self._resolutions(), sink=sink, known=samples.code
-        )
-        return self._radiance_of_values(values, directions, rays)
-
-    def _resolutions(self) -> tuple[int, ...]:
-        return (self.settings.resolution,) * self.settings.layers
-
-    def _interpolated(self, coordinates: Tensor) -> Tensor:
-        """(N, layers * FEATURES): log density, then red, green and blue of each harmonic; numbers at the end unused."""
-        return kernels.hash_encode(coordinates, self.table, self._resolutions())
-
-    def _radiance_of_values(self, values: Tensor, directions: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-        count = self.settings.harmonics
-        harmonics = spherical_harmonics(directions, self.settings.view_degree)[:, :count]
+        """See `kernels.Medium`."""
+        settings, count = self.settings, self.settings.harmonics
+        # (N, layers * FEATURES): log density, then red, green and blue of each harmonic; numbers at the end unused.
+        values = self.backend.hash_encode(coordinates, self.table, (settings.resolution,) * settings.layers, sink=sink)
+        harmonics = spherical_harmonics(directions, settings.view_degree)[:, :count]
         channels = values[:, 1 : 1 + 3 * count].unflatten(1, (count, 3))
         rgb = torch.sigmoid((harmonics[rays][:, :, None] * channels).sum(1))
         return density_from_log(values[:, 0]), rgb

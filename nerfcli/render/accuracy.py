@@ -14,11 +14,12 @@ from torch import Tensor
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.field.background import colours_behind
+from nerfcli.kernels import RaysSeen
 from nerfcli.render.depth import DepthRequest, requested, shares
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Picture
 from nerfcli.render.rays import CENTRES, pixel_rays
-from nerfcli.render.tracing import RaysSeen, render_cut_rays, uniform_cuts
+from nerfcli.render.tracing import render_cut_rays, uniform_cuts
 
 IN_WORDS = (
     "these numbers are about the rendering of the field, not about how far the field is from the scene: "

@@ -9,7 +9,7 @@ With end density p(t) = T(t) sigma(t), whose integral is the opacity:
     median        where half of all light has ended: T(t) = 1/2
     quantile:q    where the share q of all light has ended: T(t) = 1 - q
 
-All are exact for density that is constant inside an interval; `kernels.depth` defines them. Which rays have one:
+All are exact for density that is constant inside an interval; `reference.depth` defines them. Which rays have one:
 moment and background every ray; conditional and max-weight those with at least `min_opacity`, which must not be zero
 opacity; a quantile q those with at least max(q, min_opacity), as it counts all light and not only that which ends.
 What is undefined is NaN, never a plausible number.
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.depth import LightEnds
+from nerfcli.kernels import LightEnds
 
 CONVENTIONS = ("conditional", "moment", "background", "max-weight", "median")
 AXES = ("ray", "z")

@@ -29,12 +29,20 @@ class Occupancy:
 
     @torch.no_grad()
     def refresh(
-        self, field: Field, *, cells: slice, shortest_step: float, growth: float, generator: torch.Generator
+        self,
+        field: Field,
+        *,
+        detail: float,
+        cells: slice,
+        shortest_step: float,
+        growth: float,
+        generator: torch.Generator,
     ) -> None:
         """Ask the field at one random point in each of some cells.
 
         Args:
             field: the field being trained.
+            detail: of the field, see `Field.medium`.
             cells: which of the cells, numbered (z * side + y) * side + x; in this order their features are near in
                 memory.
             shortest_step, growth: the step schedule of `sampling.step_edges`; distance is taken from the origin of
@@ -46,7 +54,8 @@ class Occupancy:
         place = torch.stack([numbers % side, numbers // side % side, numbers // side**2], dim=-1)
         inside = torch.rand(len(numbers), 3, generator=generator, device=device)
         coordinates = (place + inside) / side
-        density = torch.cat([field.density(chunk) for chunk in coordinates.split(2**16)])
+        medium = field.medium(detail)
+        density = torch.cat([field.backend.density(chunk, medium) for chunk in coordinates.split(2**16)])
         radius = training_points(coordinates, field.settings.contraction).norm(dim=-1)
         step = (growth * radius * radius.clamp_min(1.0)).clamp_min(shortest_step)  # as `sampling.step_length`
         chosen = self.optical_depth.view(-1)[cells]

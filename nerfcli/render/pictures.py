@@ -13,7 +13,7 @@ from nerfcli.field.background import Background, colours_behind
 from nerfcli.render.depth import DepthRequest, disagreement, requested, shares, spread
 from nerfcli.render.model import Model
 from nerfcli.render.pixels import pixels_of_rays
-from nerfcli.render.rays import Rays, pixel_rays, places_in_pixel
+from nerfcli.render.rays import PictureRays, pixel_rays, places_in_pixel
 from nerfcli.render.tracing import TOLERANCE, render_rays
 
 RAYS_PER_TILE = 8192
@@ -144,7 +144,7 @@ def straight_rgba(picture: Picture) -> np.ndarray:
 
 
 def _render_tile(
-    model: Model, rays: Rays, part: slice, *, background: Tensor, depth: DepthRequest | None, quality: Quality
+    model: Model, rays: PictureRays, part: slice, *, background: Tensor, depth: DepthRequest | None, quality: Quality
 ) -> tuple[Tensor, ...]:
     """Colour, opacity, truncation error, validity of the pixels of some rays; depth, spread, disagreement if wanted."""
     directions, count = rays.directions[part], quality.samples_per_pixel
@@ -165,7 +165,15 @@ def _render_tile(
     if depth is not None and depth.axis == "z":
         ahead = rays.cosines[part] > 0
         factor = torch.where(ahead, rays.cosines[part], 1.0) / scale
-    pixels = pixels_of_rays(seen, valid=rays.valid[part], background=behind, factor=factor, shares=wanted, count=count)
+    pixels = pixels_of_rays(
+        seen,
+        valid=rays.valid[part],
+        background=behind,
+        factor=factor,
+        shares=wanted,
+        count=count,
+        backend=model.field.backend,
+    )
     colours = (pixels.rgb.clamp(0.0, 1.0), pixels.ends.opacity, pixels.truncation_error, pixels.valid)
     if depth is None:
         return colours

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from nerfcli import kernels
-from nerfcli.kernels.depth import LightEnds
-from nerfcli.render.tracing import RaysSeen
+from nerfcli.kernels import Backend, Intervals, LightEnds, RaysSeen
 
 
 class Pixels(NamedTuple):
@@ -34,7 +33,14 @@ class Pixels(NamedTuple):
 
 
 def pixels_of_rays(
-    seen: RaysSeen, *, valid: Tensor, background: Tensor, factor: Tensor, shares: tuple[float, ...], count: int
+    seen: RaysSeen,
+    *,
+    valid: Tensor,
+    background: Tensor,
+    factor: Tensor,
+    shares: tuple[float, ...],
+    count: int,
+    backend: Backend,
 ) -> Pixels:
     """Pixels of `count` rays each, which stand side by side.
 
@@ -45,10 +51,11 @@ def pixels_of_rays(
         factor: (R,) > 0, from distances along the ray to those wanted.
         shares: of the quantiles.
         count: rays per pixel, a divisor of R.
+        backend: that of the field.
     """
     rgb, error, ends, to_background = seen.rgb, seen.truncation_error, _scaled(seen.ends, factor), factor
     if count > 1:
-        ends = _mixture(seen, ends, factor=factor, shares=shares, count=count)
+        ends = _mixture(seen, ends, factor=factor, shares=shares, count=count, backend=backend)
         rgb, error, valid = rgb.view(-1, count, 3).mean(1), error.view(-1, count).mean(1), valid.view(-1, count).all(1)
         # The light that passes counts the backgrounds of the rays that it passes along.
         passing = seen.ends.transmittance.view(-1, count) + torch.finfo(factor.dtype).tiny
@@ -71,7 +78,9 @@ def _scaled(ends: LightEnds, factor: Tensor) -> LightEnds:
     )
 
 
-def _mixture(seen: RaysSeen, ends: LightEnds, *, factor: Tensor, shares: tuple[float, ...], count: int) -> LightEnds:
+def _mixture(
+    seen: RaysSeen, ends: LightEnds, *, factor: Tensor, shares: tuple[float, ...], count: int, backend: Backend
+) -> LightEnds:
     """Where light ends that goes along one of `count` rays; `ends` are theirs, scaled by `factor`."""
     opacity = ends.opacity.view(-1, count)
     total = opacity.sum(1)
@@ -85,12 +94,8 @@ def _mixture(seen: RaysSeen, ends: LightEnds, *, factor: Tensor, shares: tuple[f
     largest, ray = ends.largest.view(-1, count).max(1)
     density, starts, stops, offsets = seen.intervals
     own = factor[kernels.ray_indices(offsets)]
-    quantiles = [
-        kernels.mixture_quantile(
-            density / own, starts * own, stops * own, offsets=offsets, rays_per_pixel=count, share=share
-        )
-        for share in shares
-    ]
+    along = Intervals(density / own, starts * own, stops * own, offsets)
+    quantiles = [backend.mixture_quantile(along, rays_per_pixel=count, share=share) for share in shares]
     return LightEnds(
         opacity=opacity.mean(1),
         transmittance=ends.transmittance.view(-1, count).mean(1),

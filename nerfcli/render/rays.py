@@ -19,7 +19,7 @@ CENTRES = np.array([[0.5, 0.5]])
 
 
 @dataclass(frozen=True)
-class Rays:
+class PictureRays:
     """Rays of pixels of one picture, row by row, those of a pixel side by side.
 
     Args:
@@ -37,7 +37,7 @@ class Rays:
     cones: Tensor
 
 
-def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> Rays:
+def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> PictureRays:
     """Rays of every pixel centre of a frame; geometry in float64, the result in float32."""
     pixels = np.arange(frame.camera.width * frame.camera.height)
     return pixel_rays(frame, training_from_scene, pixels=pixels, places=CENTRES, device=device)
@@ -45,7 +45,7 @@ def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.devi
 
 def pixel_rays(
     frame: Frame, training_from_scene: Similarity, *, pixels: np.ndarray, places: np.ndarray, device: torch.device
-) -> Rays:
+) -> PictureRays:
     """Rays of pixels (M,), counted row by row, at the same places (P, 2) inside [0, 1]^2 of each: N = M * P."""
     corners = np.stack([pixels % frame.camera.width, pixels // frame.camera.width], axis=-1)
     bearings, valid = frame.camera.bearings((corners[:, None] + places).reshape(-1, 2))
@@ -57,7 +57,7 @@ def pixel_rays(
     def tensor(values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-    return Rays(
+    return PictureRays(
         origin=tensor(world_from_cam[:3, 3]),
         directions=tensor(directions),
         valid=torch.as_tensor(valid, device=device),

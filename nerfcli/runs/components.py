@@ -38,12 +38,12 @@ class Components:
         cameras: what of the training photos' cameras learns with the field: "poses"; "focal", the focal length of each
             lens; "all", both and radial distortion; or nothing, "fixed". See `refinement`.
         masks: what their black means: "ignore", not to be looked at; or "empty", nothing is there, as with alpha.
-        points: weight of `point_depth.point_depth_loss`.
+        points: weight of `kernels.RaySums.off_target`.
         entropy: weight of `losses.opacity_entropy`.
-        near: whether gradients near a camera are scaled down; see `fitting.scale_gradients`.
-        distortion: weight of `losses.distortion_loss`; 0.05 is best or as good as any on real and synthetic
+        near: whether gradients near a camera are scaled down; see `reference.scale_gradients`.
+        distortion: weight of `kernels.RaySums.distortion`; 0.05 is best or as good as any on real and synthetic
             captures.
-        antialias: whether details smaller than a pixel fade out of what it sees; see `kernels.hash_encode`.
+        antialias: whether details smaller than a pixel fade out of what it sees; see `reference.hash_encode`.
         pixels: which ones are drawn: from "anywhere", or half of them where the "error" is; see `error_map`.
     """
 

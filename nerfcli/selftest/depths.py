@@ -9,10 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
-from nerfcli.kernels import depth as depth_reference
-from nerfcli.kernels import reference
-from nerfcli.kernels.depth import LightEnds
+from nerfcli.kernels import LightEnds
+from nerfcli.kernels.reference.depth import BISECTIONS
 from nerfcli.render.transmission import line_integral
 from nerfcli.selftest import exact, exact_depths, textbook
 from nerfcli.selftest.exact_depths import SHARES, quantile_name
@@ -68,7 +66,7 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
     wanted = [exact_depths.light_ends(ray) for ray in rays]
     density, starts, ends, offsets = _packed(rays, precision)
     density.requires_grad_(not precision.compiled)
-    module = kernels if precision.compiled else depth_reference
+    module = precision.parts
     start = time.perf_counter()
     seen = _columns(module.light_ends(density, starts, ends, offsets=offsets, shares=SHARES))
     slopes = _gradients(seen, density)
@@ -197,7 +195,7 @@ def _mixture_row(precision: Precision) -> Row:
     """Quantiles of the light of two rays together; no share lies where the light of one has ended and none begins."""
     rays = [_rounded(ray, precision) for pixel in _PIXELS for ray in pixel]
     density, starts, ends, offsets = _packed(rays, precision)
-    module = kernels if precision.compiled else depth_reference
+    module = precision.parts
     got, means, wanted = [], [], []
     start = time.perf_counter()
     for share in _PIXEL_SHARES:
@@ -215,7 +213,7 @@ def _mixture_row(precision: Precision) -> Row:
         precision=precision.name,
         errors=Errors(largest_error(torch.cat(got), wanted, tiny=precision.tiny)),
         no_gradient="found by bisection",
-        bounds=Errors(4 * precision.unit + 2.0**-depth_reference.BISECTIONS * _farthest(rays, wanted)),
+        bounds=Errors(4 * precision.unit + 2.0**-BISECTIONS * _farthest(rays, wanted)),
         reason="4 u, and the last bracket of the bisection over the smallest answer",
         formula="mean of the rays' quantiles",
         textbook=None if precision.compiled else Errors(largest_error(torch.cat(means), wanted, tiny=precision.tiny)),
@@ -257,7 +255,7 @@ def _before_row(precision: Precision) -> Row:
     upstream = [(k % 3 + 1) / 4 for ray in rays for k in range(len(ray.density))]
     density, lengths, offsets = _flat(rays, precision)
     density.requires_grad_(not precision.compiled)
-    module = kernels if precision.compiled else reference
+    module = precision.parts
     start = time.perf_counter()
     got = module.optical_depth_before(density, lengths, offsets)
     slope = _by_density(got, density, upstream)

@@ -9,8 +9,6 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
-from nerfcli.kernels import reference
 from nerfcli.kernels.activations import LOG_DENSITY_LIMIT, density_from_log
 from nerfcli.render.occupancy import Occupancy
 from nerfcli.render.sampling import inverse_cdf
@@ -71,7 +69,7 @@ def _through_networks(logarithms: Tensor, precision: Precision) -> Tensor:
     weights[0][0, 0], weights[0][1, 0], weights[1][0, 0], weights[1][0, 1] = 1.0, -1.0, 1.0, -1.0
     encoded = torch.nn.functional.pad(logarithms[:, None], (0, 31))
     rays = torch.zeros(len(logarithms), dtype=torch.int64)
-    return kernels.radiance(encoded, precision.tensor([[0.0] * 16]), rays, weights)[0]
+    return precision.parts.radiance(encoded, precision.tensor([[0.0] * 16]), rays, weights)[0]
 
 
 def _adam_row(precision: Precision) -> Row:
@@ -81,7 +79,7 @@ def _adam_row(precision: Precision) -> Row:
     # m / (1 - b1) = g and sqrt(v / (1 - b2)) = |g|: the step is rate g / (|g| + eps).
     wanted = [[-RATE * g / (abs(g) + EPS) for g in row] for row in gradient.double().tolist()]
     table, first, second = (torch.zeros_like(gradient) for _ in range(3))
-    module = kernels if precision.compiled else reference
+    module = precision.parts
     start = time.perf_counter()
     module.adam_rows(table, gradient.clone(), first, second, step=1, rate=RATE, betas=BETAS, eps=EPS)
     seconds = time.perf_counter() - start

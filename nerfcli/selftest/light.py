@@ -9,8 +9,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
-from nerfcli.kernels import reference
 from nerfcli.selftest import exact, textbook
 from nerfcli.selftest.exact import Composited
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
@@ -107,7 +105,7 @@ def _composite_row(group: Group, answers: list[Composited], precision: Precision
     if not chosen:
         return
     rays, wanted = [ray for ray, _ in chosen], [answer for _, answer in chosen]
-    module = kernels if precision.compiled else reference
+    module = precision.parts
     errors, seconds = _composite_errors(module.composite, rays, wanted, precision=precision)
     bounds, reason = _bounds(rays, precision)
     if bounds.value > MEANINGLESS:
@@ -174,7 +172,7 @@ def _subtraction_rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
     for precision in precisions:
         if precision.dtype == torch.bfloat16:
             continue
-        module = kernels if precision.compiled else reference
+        module = precision.parts
         density, lengths = precision.tensor(ray.density).requires_grad_(), precision.tensor(ray.lengths)
         rgb, offsets = precision.tensor([[v] * 3 for v in values]), torch.tensor([0, len(values)]).to(precision.device)
         start = time.perf_counter()
@@ -212,7 +210,7 @@ def _distortion_row(precision: Precision) -> Row:
     ends = [start + 2.0**-16 for start in starts]
     values = [(k % 7 + 1) / 256 for k in range(count)]
     wanted, wanted_gradient = exact.distortion(values, starts, ends)
-    module = kernels if precision.compiled else reference
+    module = precision.parts
     first, last, offsets = precision.tensor(starts), precision.tensor(ends), torch.tensor([0, count])
     weights = precision.tensor(values).requires_grad_()
     start = time.perf_counter()

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nerfcli import kernels
-from nerfcli.kernels import reference
+from nerfcli.kernels import PixelTable, reference
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
 ROWS, FEATURES = 512, 4
@@ -136,7 +136,7 @@ def _in_half(
 def _encode_row(case: str, points: tuple[Point, ...], precision: Precision, *, grids: _Grids) -> Row:
     points = tuple(tuple(torch.tensor(point).tolist()) for point in points)  # the numbers that float32 holds
     wanted = _exact(points, grids, times=1)
-    module = kernels if precision.compiled else reference
+    module = precision.parts
     places, table = precision.tensor(points), precision.tensor(_table(len(grids.resolutions))).requires_grad_()
     start = time.perf_counter()
     encoded = module.hash_encode(places, table, grids.resolutions)
@@ -170,7 +170,8 @@ def _half_row(half: torch.dtype, device: str) -> Row:
     table = single.tensor(_table(2)).to(half).requires_grad_()
     sink = torch.zeros_like(table, dtype=torch.float32)
     start = time.perf_counter()
-    encoded = kernels.hash_encode(points, table, grids.resolutions, sink=sink)
+    backend = kernels.backend_for(table.device, half)
+    encoded = backend.hash_encode(points, table, grids.resolutions, sink=sink)
     (encoded.view(len(points), -1, FEATURES) * single.tensor(_GAINS)).sum().backward()
     seconds = time.perf_counter() - start
     plain = _in_half(points, table, grids.resolutions, half=half)
@@ -219,21 +220,20 @@ def _pixel_row(precision: Precision) -> Row:
         [[value / 255 for value in photos[number].tolist()] for number in chosen.tolist()],
     )
     sizes = (wanted[0], [[float(sum(map(abs, terms))) for terms in rows_of] for rows_of in turned], wanted[2])
-    module = kernels if precision.compiled else reference
-    where = (first_pixel, first_bearing)
-    given = {"bearings": precision.tensor(bearings), "poses": precision.tensor(poses), "photos": photos}
+    module = precision.parts
 
     def error(answers: tuple[Tensor, ...]) -> float:
         found = zip(answers, wanted, sizes, strict=True)
         return max(largest_error(a, w, tiny=precision.tiny, scale=s) for a, w, s in found)
 
-    given["photos"], where = photos.to(precision.device), tuple(x.to(precision.device) for x in where)
+    first_pixel, first_bearing, photos = (x.to(precision.device) for x in (first_pixel, first_bearing, photos))
+    pixels = PixelTable(first_pixel, first_bearing, precision.tensor(bearings), precision.tensor(poses), photos)
     start = time.perf_counter()
-    rays = module.pixel_rays(chosen.to(precision.device), *where, **given)
+    rays = module.pixel_rays(chosen.to(precision.device), pixels)
     seconds = time.perf_counter() - start
     plain = None
     if not precision.compiled:
-        plain = Errors(error(module.pixel_rays(chosen.float().long().to(precision.device), *where, **given)))
+        plain = Errors(error(module.pixel_rays(chosen.float().long().to(precision.device), pixels)))
     return Row(
         hard_cases=(),
         case="pixels beyond number 2^24, first, last and only ones of their photos",

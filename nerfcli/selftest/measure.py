@@ -3,11 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from nerfcli.kernels import reference
 
 MET, NOT_MET, NOT_HERE = "met", "not met", "does not occur"
 
@@ -20,6 +23,15 @@ class Precision:
     dtype: torch.dtype
     device: str
     compiled: bool = False
+
+    @property
+    def parts(self) -> ModuleType:
+        """The single operations in this arithmetic."""
+        if not self.compiled:
+            return reference
+        from nerfcli.kernels import numba_cpu  # which may not work here
+
+        return numba_cpu
 
     @property
     def unit(self) -> float:

@@ -13,7 +13,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.field.contraction import uncontract
-from nerfcli.kernels import reference
+from nerfcli.kernels import HashGrid, March, Rays, reference
 from nerfcli.render.rays import frame_rays
 from nerfcli.selftest import textbook
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
@@ -133,11 +133,11 @@ def _empty_row(precision: Precision) -> Row:
     origins, directions = [[-2.0, 0.25, 0.125]] * 3, [[1.0, 0.0, 0.0]] * 3
     begin = time.perf_counter()
     starts, ends, offsets = _seen(origins, directions, precision=precision, full=False)
-    module = kernels if precision.compiled else reference
+    module = precision.parts
     density, background = torch.zeros_like(starts), precision.tensor([[0.25, 0.5, 1.0]] * 3)
     rgb = starts.new_zeros(len(starts), 3)
     colour, passing, _ = module.composite(density, rgb, ends - starts, offsets=offsets, background=background)
-    light = kernels.light_ends(density, starts, ends, offsets=offsets, shares=(0.5,))
+    light = module.light_ends(density, starts, ends, offsets=offsets, shares=(0.5,))
     seconds = time.perf_counter() - begin
     got = torch.cat([colour.flatten(), passing, light.opacity, light.mean, light.quantiles.flatten()])
     wanted = [0.25, 0.5, 1.0] * 3 + [1.0] * 3 + [0.0] * 3 + [math.nan] * 6
@@ -159,20 +159,14 @@ def _seen(
     """What is kept of rays cut into steps of 2^-7, in a bounded cube full of cells or without any."""
     side, levels = 16, 8
     make = torch.ones if full else torch.zeros
-    module = kernels if precision.compiled else reference
-    starts, ends, _, _, _, offsets = module.visible_samples(
-        precision.tensor(origins),
-        precision.tensor(directions),
-        precision.tensor([k * 2.0**-7 for k in range(5 * 2**7)]),
-        jitter=precision.tensor([0.0] * len(origins)),
-        occupied=make(side, side, side, dtype=torch.bool, device=precision.device),
-        contraction="none",
-        table=precision.tensor([[[0.0] * 4] * 16] * levels),
-        resolutions=(2,) * levels,
-        weights=tuple(precision.tensor([[0.0] * n] * m) for m, n in ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))),
-        deepest=1e9,
-    )
-    return starts, ends, offsets
+    module = precision.parts
+    table, shapes = precision.tensor([[[0.0] * 4] * 16] * levels), ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
+    layers = tuple(precision.tensor([[0.0] * n] * m) for m, n in shapes)
+    occupied = make(side, side, side, dtype=torch.bool, device=precision.device)
+    edges = precision.tensor([k * 2.0**-7 for k in range(5 * 2**7)])
+    rays = Rays(precision.tensor(origins), precision.tensor(directions), precision.tensor([0.0] * len(origins)))
+    samples = module.visible_samples(rays, March(edges, occupied, "none", 1e9), HashGrid(table, (2,) * levels, layers))
+    return samples.starts, samples.ends, samples.offsets
 
 
 def _world_rows() -> Iterator[Row]:

@@ -7,20 +7,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.field.sizes import chosen_size
+from nerfcli.kernels import March, Rays, Targets
 from nerfcli.render.model import Marching
 from nerfcli.render.occupancy import Occupancy
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.error_map import BEGINS, ErrorMap
-from nerfcli.train.losses import colour_losses, distortion_loss, opacity_entropy
+from nerfcli.train.losses import colour_losses, opacity_entropy
 from nerfcli.train.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.train.parts import Parts
 from nerfcli.train.photos import Drawn, Pool
-from nerfcli.train.point_depth import PointDepths, PointRays, fading, point_depth_loss
+from nerfcli.train.point_depth import PointRays, fading, point_depth_loss
 from nerfcli.train.watch import UNWATCHED, NonFiniteError, Watch
 
 OCCUPANCY_SIDE = 64
@@ -41,18 +41,6 @@ WARMUP_SHARE, CLOSING_SHARE = 0.1, 0.3
 # Short trainings do not come to details, and learn more from more rays: their shares are those of so many steps.
 STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
 DETAILED_STEPS = 2500
-
-
-def scale_gradients(density: Tensor, rgb: Tensor, *, distance: Tensor) -> None:
-    """Have gradients that come to these tensors multiplied by min(1, distance^2).
-
-    Space near a camera is crossed by many of its rays and by those of no other camera: without this it learns
-    faster than what all cameras see, and fog grows in front of the lenses.
-    Source: Philip and Deschaintre 2023, Floaters no more, arXiv:2305.02756, eq. 6.
-    """
-    scale = distance.square().clamp_max(1.0)
-    density.register_hook(lambda gradient: gradient * scale)
-    rgb.register_hook(lambda gradient: gradient * scale[:, None])
 
 
 @dataclass(frozen=True)
@@ -145,9 +133,6 @@ class Fitting:
         self.in_step = True
         watch.state(self.state)
         self.furthest = max(self.furthest, share)
-        # A field whose cameras begin late has its detail already.
-        late = self._cameras_from > 0.0
-        self.field.refine(self.furthest if late else self.parts.share_of_detail(self.furthest))
         of_cameras = max(0.0, share - self._cameras_from) / (1.0 - self._cameras_from)
         drawn = self.parts.with_learning_rays(self.draw(share), of_cameras)
         rays = len(drawn.origins)
@@ -201,63 +186,31 @@ class Fitting:
 
     def _loss(self, drawn: Drawn, *, edges: Tensor, share: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
         """Loss over some rays, that of the colour of each, and the number of samples it took."""
-        origins, directions = drawn.origins, drawn.directions
-        components, device = self.components, origins.device
-        jitter = torch.rand(len(origins), generator=self.generator, device=device)
-        background = self.parts.behind(len(origins), self.generator)
-        samples = self.field.visible_samples(
-            origins.detach(),
-            directions.detach(),
-            edges,
-            jitter=jitter,
-            occupied=self.occupied,
-            deepest=DEEPEST,
-            cones=self._cones(drawn),
+        count, components, device = len(drawn.origins), self.components, drawn.origins.device
+        jitter = torch.rand(count, generator=self.generator, device=device)
+        background = self.parts.behind(count, self.generator)
+        seen = self.field.backend.render_rays(
+            Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
+            self._march(edges),
+            self.field.medium(self._detail),
+            Targets(components.near, bool(components.distortion), drawn.distances),
+            background=background,
+            sink=self.optimiser.sink,
+            trace=watch.rows,
         )
-        starts, ends, offsets = samples.starts, samples.ends, samples.offsets
-        if origins.requires_grad:
-            coordinates = kernels.sample_coordinates(
-                origins,
-                directions,
-                starts,
-                ends,
-                offsets=offsets,
-                contraction=self.field.settings.contraction,
-                known=samples.coordinates,
-            )
-            samples = samples._replace(coordinates=coordinates)
-        rays = kernels.ray_indices(offsets)
-        density, rgb = self.field.radiance_of_samples(samples, directions, rays, sink=self.optimiser.sink)
-        if components.near:
-            scale_gradients(density, rgb, distance=starts)
-        rendered, transmittance, weights = kernels.composite(
-            density, rgb, ends - starts, offsets=offsets, background=background
-        )
-        losses = colour_losses(*self.parts.compared(rendered, transmittance, drawn, behind=background))
+        losses = colour_losses(*self.parts.compared(seen.rgb, seen.transmittance, drawn, behind=background))
         if self.error_map is not None:
             self.error_map.learn(drawn.numbers, losses.detach())
         loss = (losses * drawn.weights if len(drawn.weights) else losses).mean()
         if components.distortion:
-            loss = loss + components.distortion * distortion_loss(weights, starts, ends, offsets)
+            loss = loss + components.distortion * (seen.distortion.sum() / max(1, count))
         if components.entropy:
-            loss = loss + components.entropy * opacity_entropy(transmittance)
+            loss = loss + components.entropy * opacity_entropy(seen.transmittance)
         if len(drawn.distances):
-            known = PointDepths(drawn.numbers[-len(drawn.distances) :], drawn.distances, drawn.trust)
-            middles = (starts + ends) / 2
-            apart = point_depth_loss(weights, transmittance, middles, offsets=offsets, known=known)
-            loss = loss + components.points * fading(share) * apart
-        shown = {
-            "coordinates of samples": samples.coordinates,
-            "code of samples": samples.code,
-            "density of samples": density,
-            "colour of samples": rgb,
-            "weights of samples along rays": weights,
-        }
-        for name, tensor in shown.items():
-            watch.rows(name, tensor, rays)
-        watch.rows("rendered colour", rendered, torch.arange(len(rendered), device=device))
+            loss = loss + components.points * fading(share) * point_depth_loss(seen.off_target, drawn.trust)
+        watch.rows("rendered colour", seen.rgb, torch.arange(count, device=device))
         watch.values("loss", loss)
-        return loss, losses.detach(), len(starts)
+        return loss, losses.detach(), int(seen.samples)
 
     @torch.no_grad()
     def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
@@ -279,22 +232,22 @@ class Fitting:
 
     def _seen(self, drawn: Drawn, *, edges: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 3) colours of rays that step from edge to edge, on what is behind, and (N,) what passes through."""
-        origins, directions = drawn.origins, drawn.directions
-        samples = self.field.visible_samples(
-            origins,
-            directions,
-            edges,
-            jitter=torch.full_like(origins[:, 0], 0.5),
-            occupied=self.occupied,
-            deepest=DEEPEST,
-            cones=self._cones(drawn),
+        jitter = torch.full_like(drawn.origins[:, 0], 0.5)
+        seen = self.field.backend.render_rays(
+            Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
+            self._march(edges),
+            self.field.medium(self._detail),
+            background=behind,
         )
-        rays = kernels.ray_indices(samples.offsets)
-        density, rgb = self.field.radiance_of_samples(samples, directions, rays, sink=None)
-        rendered, transmittance, _ = kernels.composite(
-            density, rgb, samples.ends - samples.starts, offsets=samples.offsets, background=behind
-        )
-        return rendered, transmittance
+        return seen.rgb, seen.transmittance
+
+    @property
+    def _detail(self) -> float:
+        """The share of the budget whose details the field has: late cameras meet a field that has its detail."""
+        return self.furthest if self._cameras_from > 0.0 else self.parts.share_of_detail(self.furthest)
+
+    def _march(self, edges: Tensor) -> March:
+        return March(edges, self.occupied, self.field.settings.contraction, DEEPEST)
 
     def _cones(self, drawn: Drawn) -> Tensor | None:
         """Widths of pixels per distance, where they matter."""
@@ -307,6 +260,7 @@ class Fitting:
         turn = self.step // REFRESH_EVERY
         self.occupancy.refresh(
             self.field,
+            detail=self._detail,
             cells=slice(None) if turn == 1 else slice(turn % REFRESH_TURNS, None, REFRESH_TURNS),
             shortest_step=self.marching.shortest_step,
             growth=self.marching.growth,

@@ -3,8 +3,6 @@
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
-
 HUBER_DELTA = 0.1
 
 
@@ -19,27 +17,6 @@ def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
     """
     losses = torch.nn.functional.huber_loss(rendered, measured, delta=HUBER_DELTA, reduction="none")
     return losses.mean(-1) / HUBER_DELTA
-
-
-def distortion_loss(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
-    """Mean over rays of how far their light ends apart, in contracted distance; see `kernels.distortion`.
-
-    s(t) = t / 2 for t <= 1, else 1 - 1 / (2 t): the place on the ray, from 0 at the camera to 1 at infinity.
-
-    Args:
-        weights, starts, ends: (N,) packed samples, distances in the training frame.
-        offsets: (R + 1,).
-
-    Returns:
-        Scalar in [0, 1]. It gathers the light of each ray in one surface: less fog, sharper depth, and with it fewer
-        samples that have to be looked at. Differentiable in weights.
-    """
-    near, far = _contracted(starts), _contracted(ends)
-    return kernels.distortion(weights, near, far, offsets).sum() / max(1, len(offsets) - 1)
-
-
-def _contracted(distance: Tensor) -> Tensor:
-    return torch.where(distance <= 1.0, distance, 2.0 - 1.0 / distance.clamp_min(1.0)) / 2.0
 
 
 def opacity_entropy(transmittance: Tensor) -> Tensor:

@@ -6,7 +6,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
 from nerfcli.field.interface import Field
 from nerfcli.train.adam import BETAS, EPS, Adam
 
@@ -14,7 +13,7 @@ from nerfcli.train.adam import BETAS, EPS, Adam
 class FieldOptimiser:
     """Adam's moments for a field's rows and weights.
 
-    `sink` collects the gradient of the rows: it is made once, given to `Field.radiance_of_samples`, and empty again
+    `sink` collects the gradient of the rows: it is made once, given to `Backend.render_rays`, and empty again
     after each step. None for a field without rows.
     """
 
@@ -43,7 +42,9 @@ class FieldOptimiser:
         self._adam.step(rate)
         rows = self._field.rows()
         if rows is not None and self.sink is not None and self._first is not None and self._second is not None:
-            kernels.adam_rows(rows, self.sink, self._first, self._second, step=number, rate=rate, betas=BETAS, eps=EPS)
+            self._field.backend.adam_rows(
+                rows, self.sink, self._first, self._second, step=number, rate=rate, betas=BETAS, eps=EPS
+            )
 
     def state(self) -> dict[str, Tensor]:
         """What `restore` needs; the field's own numbers are not in it."""

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
+from nerfcli.kernels import PixelTable, backend_for
 from nerfcli.photos.loading import Photo, downscaled_camera, load_photo
 from nerfcli.train.footprint import pixel_footprint
 from nerfcli.train.room import IN_MEMORY, Room
@@ -142,6 +142,7 @@ class PixelPool:
         room: Room = IN_MEMORY,
     ):
         self.colours = torch.from_numpy(_one_after_another(photos) if colours is None else colours).to(device)
+        self._backend = backend_for(device, torch.float32)
         counts = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
         self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
         self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
@@ -205,14 +206,8 @@ class PixelPool:
 
     def rays_of(self, numbers: Tensor) -> Drawn:
         """The rays and colours of pixels (N,), counted through all photos."""
-        rays = kernels.pixel_rays(
-            numbers,
-            self.first_pixel,
-            self.first_bearing,
-            bearings=self.bearings,
-            poses=self.poses,
-            photos=self.colours,
-        )
+        pixels = PixelTable(self.first_pixel, self.first_bearing, self.bearings, self.poses, self.colours)
+        rays = self._backend.pixel_rays(numbers, pixels)
         none = torch.zeros(0, device=numbers.device)
         return Drawn(*rays, numbers, distances=none, trust=none, weights=none)
 

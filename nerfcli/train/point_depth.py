@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity, apply, inverse
 from nerfcli.train.photos import Drawn, PixelPool
 from nerfcli.train.tracks import Tracks, places_of
@@ -16,8 +15,6 @@ from nerfcli.train.triangulation import triangulate
 LAST_SHARE = 0.5
 # One keypoint is drawn for so many other pixels.
 PIXELS_PER_POINT = 8
-# Relative distance from the point from which on light counts as simply elsewhere.
-MOST_DEVIATION = 0.25
 # Miss at which a point counts half, in pixels of the training photo.
 HALF_ERROR_PX = 1.0
 
@@ -108,30 +105,14 @@ def fading(share: float) -> float:
     return max(0.0, 1.0 - share / LAST_SHARE)
 
 
-def point_depth_loss(
-    weights: Tensor, transmittance: Tensor, middles: Tensor, *, offsets: Tensor, known: PointDepths
-) -> Tensor:
-    """How far from the known points light ends, on average over its rays.
-
-    mean_r trust_r (sum_i weight_i min(1, |middle_i - distance_r| / (c distance_r)) + transmittance_r),  c = 0.25
-
-    Light that ends c of the distance away or more, or not at all, counts 1, so that a wrong point pulls no harder than
-    a right one that has been reached pulls back.
+def point_depth_loss(off_target: Tensor, trust: Tensor) -> Tensor:
+    """Mean over the rays of points of how far from them light ends, each as far as it is trusted.
 
     Args:
-        weights, middles: (N,) packed samples; middles are distances along the ray, training frame.
-        transmittance: (R,).
-        offsets: (R + 1,).
-        known: the points of the last M rays, M <= R.
+        off_target: (K,) see `reference.off_target`.
+        trust: (K,) in (0, 1].
 
     Returns:
-        Scalar in [0, 1]; 0 where all light ends at the points. Differentiable in weights and transmittance.
+        Scalar in [0, 1]. Differentiable in `off_target`.
     """
-    count = len(known.numbers)
-    first = len(transmittance) - count
-    of_points = offsets[first:] - offsets[first]
-    part = slice(int(offsets[first]), None)
-    distance = known.distances[kernels.ray_indices(of_points)]
-    deviation = ((middles[part] - distance).abs() / (MOST_DEVIATION * distance)).clamp_max(1.0)
-    elsewhere = kernels.sum_along_rays(weights[part] * deviation, of_points) + transmittance[first:]
-    return (known.trust * elsewhere).mean()
+    return (trust * off_target).mean()

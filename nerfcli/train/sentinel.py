@@ -2,9 +2,10 @@
 
 Every step looks at its loss and the gradients of its weights, which costs microseconds. The whole state is looked at
 and copied every few hundred steps. When something is not finite, the training goes back to the copy and repeats its
-steps, now looking at every number of every tensor: the steps are the same bit for bit (on a CPU), so the first tensor
-that turns bad is found, with its step and its pixels. The state before that step goes into a file, the training back
-to the copy, with half the learning rate.
+steps, now looking at every number of every tensor: where the backend is deterministic the steps are the same bit for
+bit, so the first tensor that turns bad is found, with its step and its pixels. The state before that step goes into a
+file, the training back to the copy, with half the learning rate. Where sums are added up in any order, a repeated step
+may stay finite: nothing is then known of the failure, and smaller steps are no answer to it; the training goes on.
 """
 
 import math
@@ -84,20 +85,30 @@ class Sentinel:
         """Find the failure by repeating the steps since the copy; go back, with smaller steps from there on."""
         fitting = self._fitting
         self._go_back()
+        deterministic = fitting.field.backend.deterministic
+        before = self._tensors, self._description
         done, bad, result = 0, None, None
         while bad is None and done < len(self._shares):
+            if not deterministic:  # there is no second way to this state
+                before = _copied(*fitting.state())
             result, bad = _watched_step(fitting, self._shares[done])
             done += 1
         if bad is None:
             assert result is not None
+            reason = (
+                "a fault of memory or of an overclocked processor, if it comes back"
+                if deterministic
+                else "sums on this device are added up in any order, and no two runs are the same"
+            )
             self._notify(
                 f"numbers were not finite at step {fitting.step}, but are when the step is repeated; training goes on "
-                "(a fault of memory or of an overclocked processor, if it comes back)"
+                f"({reason})"
             )
             return result
-        self._go_back()
-        for share in self._shares[: done - 1]:
-            fitting.advance(share)
+        fitting.restore(*_copied(*before))
+        if deterministic:
+            for share in self._shares[: done - 1]:
+                fitting.advance(share)
         path, told = self._keep(self._shares[done - 1], bad)
         self._go_back()
         if fitting.rollbacks == MOST_ROLLBACKS:

@@ -3,6 +3,7 @@
 import torch
 
 from nerfcli.errors import UserError
+from nerfcli.kernels.interface import HashGrid, March, PixelTable, Rays
 from nerfcli.kernels.numba_cpu import machine_code
 from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
@@ -69,13 +70,9 @@ def _run_all() -> None:
     table = torch.zeros(8, 16, 4, requires_grad=True)
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     weights = tuple(torch.zeros(shape, requires_grad=True) for shape in shapes)
-    _, _, _, encoded, points, _ = visible_samples(
-        direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, contraction="l2",
-        table=table, resolutions=(2,) * 8, weights=weights, deepest=10.0,
-    )  # fmt: skip
-    occupied_samples(
-        direction, direction, torch.tensor([0.5, 1.0, 1.5, 2.0]), jitter=jitter, occupied=occupied, contraction="l2"
-    )
+    rays, along = Rays(direction, direction, jitter), March(torch.tensor([0.5, 1.0, 1.5, 2.0]), occupied, "l2", 10.0)
+    _, _, _, encoded, points, _ = visible_samples(rays, along, HashGrid(table, (2,) * 8, weights))
+    occupied_samples(rays, along)
     spans = (starts, starts + 1)
     sample_coordinates(direction, direction, *spans, offsets=offsets, contraction="l2", known=None)
     ray = direction.clone().requires_grad_()
@@ -91,6 +88,6 @@ def _run_all() -> None:
     (colour.sum() + distortion(spread, starts, starts + 1, offsets).sum()).backward()
     pixel = torch.zeros(1, dtype=torch.int64)
     photos = torch.zeros(1, 3, dtype=torch.uint8)
-    pixel_rays(pixel, pixel, pixel, bearings=direction, poses=torch.eye(4)[None], photos=photos)
+    pixel_rays(pixel, PixelTable(pixel, pixel, direction, torch.eye(4)[None], photos))
     gradient, first, second = (torch.zeros(8, 16, 4) for _ in range(3))
     adam_rows(table, gradient, first, second, step=1, rate=0.0, betas=(0.9, 0.99), eps=1e-15)

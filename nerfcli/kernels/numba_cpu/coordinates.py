@@ -121,8 +121,12 @@ def sample_coordinates(
     *,
     offsets: Tensor,
     contraction: str,
-    known: Tensor | None,
+    known: Tensor | None = None,
 ) -> Tensor:
-    """See `kernels.sample_coordinates`; float32 on the CPU, differentiable in origins and directions."""
+    """See `reference.sample_coordinates`; float32 on the CPU, differentiable in origins and directions.
+
+    Args:
+        known: (N, 3), the answer, where it has been computed before without gradients.
+    """
     number = CONTRACTIONS.index(contraction)
     return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, known)  # type: ignore[return-value]

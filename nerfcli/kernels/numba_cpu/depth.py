@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.depth import BISECTIONS, SERIES_BELOW, VARIANCE_SERIES, VARIANCE_SERIES_BELOW, LightEnds
+from nerfcli.kernels.interface import LightEnds
 from nerfcli.kernels.numba_cpu.threads import use_threads
+from nerfcli.kernels.reference.depth import BISECTIONS, SERIES_BELOW, VARIANCE_SERIES, VARIANCE_SERIES_BELOW
 
 _SERIES = np.array(VARIANCE_SERIES)
 

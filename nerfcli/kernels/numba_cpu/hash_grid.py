@@ -266,9 +266,14 @@ def hash_encode(
     points: Tensor,
     table: Tensor,
     resolutions: tuple[int, ...],
-    sink: Tensor | None,
-    known: Tensor | None,
+    sink: Tensor | None = None,
+    known: Tensor | None = None,
     widths: Tensor | None = None,
 ) -> Tensor:
-    """See `kernels.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in points and table."""
+    """See `reference.hash_encode`; float32 on the CPU, rows of 4 features, differentiable in points and table.
+
+    Args:
+        sink: see `Backend.hash_encode`.
+        known: (N, L * F), the answer, where it has been computed before without gradients.
+    """
     return _HashEncode.apply(points, table, resolutions, sink, known, widths)  # type: ignore[return-value]

@@ -38,8 +38,7 @@ def is_there() -> bool:
 
 def sources() -> list[Path]:
     """The files that the machine code is made of."""
-    here = Path(__file__).parent
-    return [*here.glob("*.py"), *here.parent.glob("*.py")]
+    return list(Path(__file__).parent.parent.rglob("*.py"))
 
 
 def discard_outdated(made_of: Iterable[Path], compiled: Path) -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels.contraction import CONTRACTIONS
+from nerfcli.kernels.interface import March, Rays
 from nerfcli.kernels.numba_cpu.rays import CHUNK, cut, look_ahead, padded
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
@@ -52,25 +53,17 @@ def _write(
                     at += 1
 
 
-def occupied_samples(
-    origins: Tensor,
-    directions: Tensor,
-    edges: Tensor,
-    *,
-    jitter: Tensor,
-    occupied: Tensor,
-    contraction: str,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """See `marching.occupied_samples`; float32 on the CPU."""
+def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `reference.occupied_samples`; float32 on the CPU."""
     use_threads()
-    rays = (
-        origins.contiguous().numpy(), directions.contiguous().numpy(), padded(edges), jitter.contiguous().numpy(),
-        occupied.contiguous().view(-1).numpy(), occupied.shape[0],
-        CONTRACTIONS.index(contraction),
+    origins, occupied = rays.origins.contiguous(), along.occupied
+    given = (
+        origins.numpy(), rays.directions.contiguous().numpy(), padded(along.edges), rays.jitter.contiguous().numpy(),
+        occupied.contiguous().view(-1).numpy(), occupied.shape[0], CONTRACTIONS.index(along.contraction),
     )  # fmt: skip
     counts = np.zeros(len(origins), np.int64)
-    _count(*rays, counts)
+    _count(*given, counts)
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     spans, coordinates = torch.empty(2, int(offsets[-1])), torch.empty(int(offsets[-1]), 3)
-    _write(*rays, offsets, spans[0].numpy(), spans[1].numpy(), coordinates.numpy())
+    _write(*given, offsets, spans[0].numpy(), spans[1].numpy(), coordinates.numpy())
     return spans[0], spans[1], coordinates, torch.from_numpy(offsets)

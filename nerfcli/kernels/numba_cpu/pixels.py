@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.interface import PixelTable
 from nerfcli.kernels.numba_cpu.threads import use_threads
 
 
@@ -27,13 +28,10 @@ def _pixel_rays(
             colours[i, channel] = np.float32(photos[pixel, channel]) / np.float32(255)
 
 
-def pixel_rays(
-    chosen: Tensor, first_pixel: Tensor, first_bearing: Tensor, *, bearings: Tensor, poses: Tensor, photos: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def pixel_rays(chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
     """See `reference.pixel_rays`; float32 on the CPU."""
     use_threads()
     origins, directions = torch.empty(len(chosen), 3), torch.empty(len(chosen), 3)
-    colours = torch.empty(len(chosen), photos.shape[1])
-    given = (chosen, first_pixel, first_bearing, bearings, poses, photos)
-    _pixel_rays(*(x.numpy() for x in (*given, origins, directions, colours)))
+    colours = torch.empty(len(chosen), pixels.colours.shape[1])
+    _pixel_rays(*(x.numpy() for x in (chosen, *pixels, origins, directions, colours)))
     return origins, directions, colours

@@ -10,9 +10,9 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from torch import Tensor
 
 from nerfcli.kernels.contraction import CONTRACTIONS
+from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
 from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, density_range, flat_weights
 from nerfcli.kernels.numba_cpu.rays import CHUNK, cube, cut, look_ahead, padded
@@ -207,39 +207,27 @@ def _sort(
                 encoded[to, feature] = code[thread, i, feature]
 
 
-def visible_samples(
-    origins: Tensor,
-    directions: Tensor,
-    edges: Tensor,
-    *,
-    jitter: Tensor,
-    occupied: Tensor,
-    contraction: str,
-    table: Tensor,
-    resolutions: tuple[int, ...],
-    weights: tuple[Tensor, ...],
-    deepest: float,
-    cones: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
     """See `reference.visible_samples`; float32 on the CPU."""
-    threads, rays, intervals = use_threads(), len(origins), len(edges) - 2
-    cones = origins.new_empty(0) if cones is None else cones
-    borders = np.arange(threads + 1) * rays // threads
+    threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
+    cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
+    borders = np.arange(threads + 1) * count // threads
     # Room for all samples of all rays: memory that nobody writes to is never really taken.
-    room = (threads, -(-rays // threads) * intervals)
+    room = (threads, -(-count // threads) * intervals)
     owner, record = np.empty(room, np.int64), np.empty((*room, 6), np.float32)
     code = np.empty((*room, WIDTH), np.float32)
-    counts, found = np.zeros(rays, np.int64), np.zeros(threads, np.int64)
+    counts, found = np.zeros(count, np.int64), np.zeros(threads, np.int64)
     _visible(
-        origins.contiguous().numpy(), directions.contiguous().numpy(), padded(edges), jitter.numpy(),
-        occupied.contiguous().view(-1).numpy(), _occupied_blocks(occupied.numpy()), occupied.shape[0],
-        CONTRACTIONS.index(contraction), table.detach().contiguous().view(-1).numpy(), table.shape[1],
-        np.array(resolutions, dtype=np.int32), flat_weights(weights[:2]), deepest, cones.contiguous().numpy(),
-        borders, counts, owner, record, code, found,
+        rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
+        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), _occupied_blocks(along.occupied.numpy()),
+        along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
+        grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
+        np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers[:2]), along.max_optical_depth,
+        cones.contiguous().numpy(), borders, counts, owner, record, code, found,
     )  # fmt: skip
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     samples = int(offsets[-1])
     spans, coordinates, encoded = torch.empty(3, samples), torch.empty(samples, 3), torch.empty(samples, WIDTH)
     _sort(borders, offsets, owner, record, code, found, spans.numpy(), coordinates.numpy(), encoded.numpy())
     starts, ends, density = spans
-    return starts, ends, density, encoded, coordinates, torch.from_numpy(offsets)
+    return Samples(starts, ends, density, encoded, coordinates, torch.from_numpy(offsets))

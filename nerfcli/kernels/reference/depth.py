@@ -2,17 +2,22 @@
 
 For a ray with density sigma(t), transmittance T(t) and end density p(t) = T(t) sigma(t), whose integral is the opacity.
 Density is constant inside an interval, and everything here is exact for that: no midpoints. Packed samples as in
-`reference`; any dtype, differentiable; `light_ends` is the operation that has a fast version.
+`interface`; any dtype, differentiable; `light_ends` is the operation that has a fast version.
 """
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from nerfcli.kernels.activations import opacity
-from nerfcli.kernels.reference import interval_weights, optical_depth_before, ray_indices, sum_along_rays
+from nerfcli.kernels.interface import LightEnds
+from nerfcli.kernels.reference.compositing import (
+    interval_weights,
+    optical_depth_before,
+    ray_indices,
+    sum_along_rays,
+)
 
 # Below this optical depth the mean place is taken from its series, whose next term is then 5e-14.
 SERIES_BELOW = 0.25
@@ -28,18 +33,6 @@ VARIANCE_SERIES = (
 
 # Halvings of the bracket of `mixture_quantile`: to 1e-12 of the farthest sample.
 BISECTIONS = 40
-
-
-class LightEnds(NamedTuple):
-    """Where light ends along each of R rays; see `light_ends`."""
-
-    opacity: Tensor
-    transmittance: Tensor
-    mean: Tensor
-    spread: Tensor
-    heaviest: Tensor
-    largest: Tensor
-    quantiles: Tensor
 
 
 def mean_fraction(optical_depth: Tensor) -> Tensor:

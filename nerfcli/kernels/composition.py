@@ -1,0 +1,208 @@
+"""Whole operations on rays, composed of single ones on their samples: what backends of separate kernels share."""
+
+import abc
+import math
+from typing import ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.contraction import sample_widths
+from nerfcli.kernels.interface import (
+    HashGrid,
+    Intervals,
+    LightEnds,
+    March,
+    Medium,
+    PixelTable,
+    Rays,
+    RaysSeen,
+    RaySums,
+    Samples,
+    Targets,
+    Trace,
+)
+from nerfcli.kernels.reference.compositing import contracted_distance, off_target, scale_gradients, sum_along_rays
+
+# The colour of samples that are not asked for theirs; what they may miss is half of their weight.
+UNSEEN = 0.5
+# Samples whose densities are computed at a time, where marching cannot stop behind what it meets.
+CHUNK = 2**16
+
+
+class Parts(Protocol):
+    """Single operations on packed samples, as `reference` defines them."""
+
+    def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]: ...
+
+    def occupied_samples(self, rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]: ...
+
+    def ray_indices(self, offsets: Tensor) -> Tensor: ...
+
+    def optical_depth_before(self, density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor: ...
+
+    def interval_weights(self, density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]: ...
+
+    def composite(
+        self, density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]: ...
+
+    def distortion(self, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor: ...
+
+    def light_ends(
+        self, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, shares: tuple[float, ...]
+    ) -> LightEnds: ...
+
+    def mixture_quantile(
+        self, density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, share: float
+    ) -> Tensor: ...
+
+
+class ComposedBackend(abc.ABC):
+    """See `interface.Backend`. What differs is in `parts`, and in how a hash grid is sampled and asked."""
+
+    name: str
+    deterministic: bool
+    parts: ClassVar[Parts]
+
+    def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
+        return self.parts.pixel_rays(chosen, pixels)
+
+    def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, share: float) -> Tensor:
+        density, starts, ends, offsets = intervals
+        return self.parts.mixture_quantile(
+            density, starts, ends, offsets=offsets, rays_per_pixel=rays_per_pixel, share=share
+        )
+
+    def render_rays(
+        self,
+        rays: Rays,
+        march: March,
+        medium: HashGrid | Medium,
+        targets: Targets = Targets(),
+        *,
+        background: Tensor,
+        sink: Tensor | None = None,
+        trace: Trace | None = None,
+    ) -> RaySums:
+        samples = self._visible(rays.detached(), march, medium)
+        starts, ends, offsets = samples.starts, samples.ends, samples.offsets
+        index = self.parts.ray_indices(offsets)
+        if torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad):
+            samples = samples._replace(coordinates=self._coordinates(rays, samples, march.contraction))
+        if isinstance(medium, HashGrid):
+            widths = _widths(rays.detached(), samples, index, medium, contraction=march.contraction)
+            encoded = self._encoded(samples, medium, widths=widths, sink=sink)
+            density, rgb = self._networks(encoded, rays.directions, index, medium)
+        else:
+            density, rgb = medium.radiance(samples.coordinates, rays.directions, index, sink=sink)
+        if targets.near_scaling and density.requires_grad:
+            scale_gradients(density, rgb, distance=starts)
+        colour, transmittance, weights = self.parts.composite(
+            density, rgb, ends - starts, offsets=offsets, background=background
+        )
+        apart = off = transmittance[:0]
+        if targets.distortion:
+            near, far = contracted_distance(starts), contracted_distance(ends)
+            apart = self.parts.distortion(weights, near, far, offsets)
+        if targets.distances is not None and len(targets.distances):
+            middles = (starts + ends) / 2
+            off = off_target(weights, transmittance, middles, offsets=offsets, distances=targets.distances)
+        if trace is not None:
+            trace("coordinates of samples", samples.coordinates, index)
+            if samples.encoded is not None:
+                trace("code of samples", samples.encoded, index)
+            trace("density of samples", density, index)
+            trace("colour of samples", rgb, index)
+            trace("weights of samples along rays", weights, index)
+        return RaySums(colour, transmittance, apart, off, offsets[-1])
+
+    @torch.no_grad()
+    def trace_rays(
+        self,
+        rays: Rays,
+        march: March,
+        medium: HashGrid | Medium,
+        *,
+        background: Tensor,
+        shares: tuple[float, ...] = (),
+        negligible: float = 0.0,
+    ) -> RaysSeen:
+        samples = self._visible(rays.detached(), march, medium)
+        starts, ends, density, offsets = samples.starts, samples.ends, samples.density, samples.offsets
+        lengths = ends - starts
+        weights, _ = self.parts.interval_weights(density, lengths, offsets)
+        index = self.parts.ray_indices(offsets)
+        unseen = weights <= (negligible / offsets.diff().clamp_min(1).to(weights))[index]
+        seen = (~unseen).nonzero()[:, 0]
+        rgb = torch.full((len(density), 3), UNSEEN, dtype=density.dtype, device=density.device)
+        if isinstance(medium, HashGrid):
+            assert samples.encoded is not None
+            rgb[seen] = self._networks(samples.encoded[seen], rays.directions, index[seen], medium)[1]
+        else:
+            rgb[seen] = medium.radiance(samples.coordinates[seen], rays.directions, index[seen])[1]
+        colour, transmittance, _ = self.parts.composite(
+            density, rgb, lengths, offsets=offsets, background=background.expand(len(rays.origins), 3)
+        )
+        light = self.parts.light_ends(density, starts, ends, offsets=offsets, shares=shares)
+        stopped = transmittance <= math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
+        behind = torch.maximum(background, 1.0 - background).amax(-1)  # how far any colour is from the background's
+        left_out = UNSEEN * sum_along_rays(torch.where(unseen, weights, 0.0), offsets)
+        error = left_out + torch.where(stopped, transmittance * behind, 0.0)
+        return RaysSeen(colour, light, error, Intervals(density, starts, ends, offsets))
+
+    @torch.no_grad()
+    def density(self, coordinates: Tensor, medium: HashGrid | Medium) -> Tensor:
+        if not isinstance(medium, HashGrid):
+            return medium.density(coordinates)
+        return self._density_of(self.hash_encode(coordinates, medium.table, medium.resolutions), medium)
+
+    @abc.abstractmethod
+    def hash_encode(
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+    ) -> Tensor: ...
+
+    @abc.abstractmethod
+    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
+        """`reference.visible_samples`."""
+
+    @abc.abstractmethod
+    def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
+        """The coordinates of samples again, with the gradients of their rays."""
+
+    @abc.abstractmethod
+    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
+        """The codes of samples again, with gradients."""
+
+    @abc.abstractmethod
+    def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
+        """Densities of codes, without gradients."""
+
+    @abc.abstractmethod
+    def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
+        """Densities and colours of codes, seen along directions (R, 3) of rays `index` (N,)."""
+
+    def _visible(self, rays: Rays, march: March, medium: HashGrid | Medium) -> Samples:
+        if isinstance(medium, HashGrid):
+            return self._visible_in_grid(rays, march, medium)
+        with torch.no_grad():  # what stands behind surfaces is computed and left out
+            starts, ends, coordinates, offsets = self.parts.occupied_samples(rays, march)
+            density = torch.cat([medium.density(chunk) for chunk in coordinates.split(CHUNK)])
+            lit = self.parts.optical_depth_before(density, ends - starts, offsets) < march.max_optical_depth
+            kept = torch.nn.functional.pad(lit.cumsum(0), (1, 0))[offsets]
+            return Samples(starts[lit], ends[lit], density[lit], None, coordinates[lit], kept)
+
+
+def _widths(rays: Rays, samples: Samples, index: Tensor, grid: HashGrid, *, contraction: str) -> Tensor | None:
+    """Of what rays stand for at their samples (N,), where the grid fades with them."""
+    if not grid.antialias or rays.cones is None:
+        return None
+    return sample_widths(
+        rays.origins,
+        rays.directions,
+        samples.starts,
+        samples.ends,
+        rays=index,
+        cones=rays.cones,
+        contraction=contraction,
+    )

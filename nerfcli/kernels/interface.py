@@ -1,0 +1,291 @@
+"""What a backend takes and gives. Above this line of the program a ray is the smallest thing; below it, a sample is.
+
+Letters: rays R; samples N of all rays together, packed ray after ray; `offsets` (R + 1,) int64, so that ray r owns
+samples offsets[r] up to offsets[r + 1]; intervals S of a ray; cells G along a side of the occupancy grid; table levels
+L, rows per level T, features per row F.
+
+No operation makes the host wait for the device: numbers of samples stay there.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+
+class Rays(NamedTuple):
+    """R rays in the training frame.
+
+    Args:
+        origins, directions: (R, 3), unit directions.
+        jitter: (R,) in [0, 1): how far each cut moves towards the next one.
+        cones: (R,) width of what a ray stands for per distance; None for lines.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    jitter: Tensor
+    cones: Tensor | None = None
+
+    def detached(self) -> "Rays":
+        """The same rays without gradients."""
+        return self._replace(origins=self.origins.detach(), directions=self.directions.detach())
+
+
+class March(NamedTuple):
+    """Where rays are sampled.
+
+    Args:
+        edges: (S + 2,) increasing distances, shared by the rays, for S intervals: ray r is cut at
+            edges[k] + jitter[r] * (edges[k + 1] - edges[k]).
+        occupied: (G, G, G) bool over the unit cube of `grid_coordinates`, indexed [z, y, x].
+        contraction: see `grid_coordinates`; outside the cube of a bounded scene nothing is occupied.
+        max_optical_depth: > 0; each ray ends with the sample that brings its optical depth to this.
+    """
+
+    edges: Tensor
+    occupied: Tensor
+    contraction: str
+    max_optical_depth: float
+
+
+class HashGrid(NamedTuple):
+    """A radiance field of a multiresolution hash grid and two small networks, which backends compile.
+
+    Args:
+        table: (L, T, F).
+        resolutions: cells per axis of each level; 0 leaves a level out.
+        layers: of the networks: W1 (H, L * F), W2 (A, H), C1 (H, A + 16), C2 (H, H), C3 (3, H), see `radiance`.
+        view_degree: spherical harmonics of the direction that colours depend on, 0 to 3.
+        antialias: whether levels finer than a ray's cone fade out.
+    """
+
+    table: Tensor
+    resolutions: tuple[int, ...]
+    layers: tuple[Tensor, ...]
+    view_degree: int = 3
+    antialias: bool = False
+
+
+class Medium(Protocol):
+    """Any other radiance field, which says itself what it is at points."""
+
+    def density(self, coordinates: Tensor) -> Tensor:
+        """Density (N,) in 1 / training unit at coordinates (N, 3) of the unit cube."""
+        ...
+
+    def radiance(
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Density (N,) and sRGB colour (N, 3) at coordinates (N, 3), seen along `directions` (R, 3) of `rays` (N,).
+
+        Args:
+            sink: the gradient of the field's table is added to it, and autograd gets none.
+        """
+        ...
+
+
+class Targets(NamedTuple):
+    """What a training measures of rays besides their colours.
+
+    Args:
+        near_scaling: whether gradients of samples at distance t < 1 are multiplied by t^2, see `scale_gradients`.
+        distortion: whether `RaySums.distortion` is computed.
+        distances: (K,) > 0 at which the light of the last K rays should end, K <= R; None for none.
+    """
+
+    near_scaling: bool = False
+    distortion: bool = False
+    distances: Tensor | None = None
+
+
+class RaySums(NamedTuple):
+    """What R rays of a training sum up.
+
+    Args:
+        rgb: (R, 3) sRGB on the background.
+        transmittance: (R,) the light that passes.
+        distortion: (R,) in contracted distance, see `contracted_distance`; (0,) where it is no target.
+        off_target: (K,) in [0, 1], see `off_target`; (0,) without such targets.
+        samples: () int64, how many samples the rays have.
+    """
+
+    rgb: Tensor
+    transmittance: Tensor
+    distortion: Tensor
+    off_target: Tensor
+    samples: Tensor
+
+
+class LightEnds(NamedTuple):
+    """Where light ends along each of R rays; see `light_ends`."""
+
+    opacity: Tensor
+    transmittance: Tensor
+    mean: Tensor
+    spread: Tensor
+    heaviest: Tensor
+    largest: Tensor
+    quantiles: Tensor
+
+
+class Intervals(NamedTuple):
+    """The samples of R rays: distances along the ray in the training frame."""
+
+    density: Tensor
+    starts: Tensor
+    ends: Tensor
+    offsets: Tensor
+
+
+class RaysSeen(NamedTuple):
+    """What R rays of a picture saw.
+
+    Args:
+        rgb: (R, 3) sRGB on the background.
+        ends: where their light ends, distances along the ray in the training frame.
+        truncation_error: (R,) bound on what was left out of each channel of rgb.
+        intervals: the samples.
+    """
+
+    rgb: Tensor
+    ends: LightEnds
+    truncation_error: Tensor
+    intervals: Intervals
+
+
+class Samples(NamedTuple):
+    """The samples of rays that light gets to, without gradients.
+
+    Args:
+        starts, ends: (N,) distances along the ray.
+        density: (N,).
+        encoded: (N, L * F) what the hash grid gives there; None for another medium.
+        coordinates: (N, 3) in the field's unit cube.
+        offsets: (R + 1,).
+    """
+
+    starts: Tensor
+    ends: Tensor
+    density: Tensor
+    encoded: Tensor | None
+    coordinates: Tensor
+    offsets: Tensor
+
+
+class PixelTable(NamedTuple):
+    """The pixels of P photos, counted through all of them, row by row.
+
+    Args:
+        first_pixel: (P,) int64, the number of the first pixel of each photo, increasing from 0.
+        first_bearing: (P,) int64, where the bearings of a photo's camera begin.
+        bearings: (B, 3) directions of pixels in the axes of their cameras.
+        poses: (P, 4, 4) `world_from_cam`.
+        colours: (M, C) uint8 values of all pixels.
+    """
+
+    first_pixel: Tensor
+    first_bearing: Tensor
+    bearings: Tensor
+    poses: Tensor
+    colours: Tensor
+
+
+# Is shown tensors whose rows belong to samples, by name, with the ray (N,) of each row.
+Trace = Callable[[str, Tensor, Tensor], None]
+
+
+class Backend(Protocol):
+    """The hot operations on one kind of device.
+
+    `name` is what `backend_for` knows it by; `deterministic` says whether the same inputs give the same bits again.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def deterministic(self) -> bool: ...
+
+    def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
+        """Why tensors of this kind cannot be worked on; None if they can."""
+        ...
+
+    def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
+        """Origins (N, 3), directions (N, 3) and colours (N, C) in [0, 1] of chosen pixels (N,) int64."""
+        ...
+
+    def render_rays(
+        self,
+        rays: Rays,
+        march: March,
+        medium: HashGrid | Medium,
+        targets: Targets = Targets(),
+        *,
+        background: Tensor,
+        sink: Tensor | None = None,
+        trace: Trace | None = None,
+    ) -> RaySums:
+        """What a training needs of rays.
+
+        Args:
+            background: (R, 3) sRGB, without gradient.
+            sink: of the table's shape; the gradient with respect to the table is added to it, and autograd gets none: a
+                buffer of megabytes need not be made, filled and added at every step.
+            trace: is shown the tensors on the way.
+
+        Differentiable in origins, directions, the table and the layers.
+        """
+        ...
+
+    def trace_rays(
+        self,
+        rays: Rays,
+        march: March,
+        medium: HashGrid | Medium,
+        *,
+        background: Tensor,
+        shares: tuple[float, ...] = (),
+        negligible: float = 0.0,
+    ) -> RaysSeen:
+        """What a picture needs of rays, without gradients.
+
+        Args:
+            background: (R, 3) or (3,) sRGB.
+            shares: quantiles to compute, each between 0 and 1.
+            negligible: what samples of a ray together may weigh that are not asked for their colour.
+        """
+        ...
+
+    def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, share: float) -> Tensor:
+        """(R / rays_per_pixel,) the distance by which a share of all light of groups of rays has ended."""
+        ...
+
+    def density(self, coordinates: Tensor, medium: HashGrid | Medium) -> Tensor:
+        """Density (N,) at coordinates (N, 3) of the unit cube, without gradients."""
+        ...
+
+    def hash_encode(
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+    ) -> Tensor:
+        """Interpolate in tables at points (N, 3) of the unit cube: (N, L * F); for media that are made of tables.
+
+        Differentiable in the table (into the sink, if there is one) and in points.
+        """
+        ...
+
+    def adam_rows(
+        self,
+        table: Tensor,
+        gradient: Tensor,
+        first: Tensor,
+        second: Tensor,
+        *,
+        step: int,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+    ) -> None:
+        """One step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero."""
+        ...

@@ -1,0 +1,100 @@
+"""The operations on rays by the compiled kernels: float32 on the CPU.
+
+What marching has computed, places and codes of samples, goes on into the step with gradients as it is. A hash grid of
+other sizes than the compiled ones, see `can_radiance`, is sampled and asked by the reference.
+"""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from nerfcli.kernels import numba_cpu, reference
+from nerfcli.kernels.composition import ComposedBackend, Parts
+from nerfcli.kernels.harmonics import spherical_harmonics
+from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.numba_cpu.row_adam import FEATURES
+from nerfcli.kernels.reference.backend import encode_into
+
+
+class NumbaBackend(ComposedBackend):
+    """`numba_cpu`, composed. The same seed gives the same bits for the same number of threads."""
+
+    name = "numba_cpu"
+    parts: ClassVar[Parts] = numba_cpu
+    deterministic = True
+
+    def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
+        if device.type == "cpu" and dtype == torch.float32:
+            return None
+        return f"it works on float32 on the CPU, not on {str(dtype).removeprefix('torch.')} on {device.type}"
+
+    def hash_encode(
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+    ) -> Tensor:
+        return _encode(points, table, resolutions, known=None, widths=None, sink=sink)
+
+    def adam_rows(
+        self,
+        table: Tensor,
+        gradient: Tensor,
+        first: Tensor,
+        second: Tensor,
+        *,
+        step: int,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+    ) -> None:
+        module = numba_cpu if table.shape[-1] == FEATURES else reference
+        module.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
+
+    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
+        module = numba_cpu if _fits(grid) else reference
+        return module.visible_samples(rays, march, grid)
+
+    def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
+        return numba_cpu.sample_coordinates(
+            rays.origins,
+            rays.directions,
+            samples.starts,
+            samples.ends,
+            offsets=samples.offsets,
+            contraction=contraction,
+            known=samples.coordinates,
+        )
+
+    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
+        return _encode(
+            samples.coordinates, grid.table, grid.resolutions, known=samples.encoded, widths=widths, sink=sink
+        )
+
+    def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
+        module = numba_cpu if numba_cpu.can_radiance(encoded, grid.layers[:2]) else reference
+        return module.density(encoded, grid.layers)
+
+    def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
+        module = numba_cpu if numba_cpu.can_radiance(encoded, grid.layers) else reference
+        return module.radiance(encoded, spherical_harmonics(directions, grid.view_degree), index, grid.layers)
+
+
+def _encode(
+    points: Tensor,
+    table: Tensor,
+    resolutions: tuple[int, ...],
+    *,
+    known: Tensor | None,
+    widths: Tensor | None,
+    sink: Tensor | None,
+) -> Tensor:
+    if numba_cpu.can_hash_encode(points, table, resolutions):
+        return numba_cpu.hash_encode(points, table, resolutions, sink, known, widths)
+    return encode_into(points, table, resolutions, widths=widths, sink=sink)
+
+
+def _fits(grid: HashGrid) -> bool:
+    """Whether marching is compiled for these sizes."""
+    code = grid.table.new_empty(0, grid.table.shape[0] * grid.table.shape[2])
+    return numba_cpu.can_hash_encode(code, grid.table, grid.resolutions) and numba_cpu.can_radiance(
+        code, grid.layers[:2]
+    )

@@ -1,0 +1,48 @@
+"""The definition of every hot operation, in plain torch: short, any dtype, any device, never optimised.
+
+Letters and packing as in `kernels.interface`. A fast kernel in another folder agrees with these functions in value and
+gradient. `backend` composes them.
+"""
+
+from nerfcli.kernels.reference.compositing import (
+    composite,
+    contracted_distance,
+    distortion,
+    interval_weights,
+    off_target,
+    optical_depth_before,
+    ray_indices,
+    scale_gradients,
+    sum_along_rays,
+)
+from nerfcli.kernels.reference.depth import light_ends, mixture_quantile
+from nerfcli.kernels.reference.encoding import corner_rows, hash_encode
+from nerfcli.kernels.reference.marching import march, occupied_samples, sample_coordinates, visible_samples
+from nerfcli.kernels.reference.networks import density, geometry, radiance
+from nerfcli.kernels.reference.pixels import pixel_rays
+from nerfcli.kernels.reference.row_adam import adam_rows
+
+__all__ = [
+    "adam_rows",
+    "composite",
+    "contracted_distance",
+    "corner_rows",
+    "density",
+    "distortion",
+    "geometry",
+    "hash_encode",
+    "interval_weights",
+    "light_ends",
+    "march",
+    "mixture_quantile",
+    "occupied_samples",
+    "off_target",
+    "optical_depth_before",
+    "pixel_rays",
+    "radiance",
+    "ray_indices",
+    "sample_coordinates",
+    "scale_gradients",
+    "sum_along_rays",
+    "visible_samples",
+]

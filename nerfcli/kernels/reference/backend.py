@@ -1,0 +1,85 @@
+"""The operations on rays by their definitions, on any device and in any precision."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from nerfcli.kernels import reference
+from nerfcli.kernels.composition import ComposedBackend, Parts
+from nerfcli.kernels.harmonics import spherical_harmonics
+from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+
+
+class ReferenceBackend(ComposedBackend):
+    """`reference`, composed.
+
+    Args:
+        device: where it works; sums that others add to in any order do not repeat on a GPU.
+    """
+
+    name = "reference"
+    parts: ClassVar[Parts] = reference
+
+    def __init__(self, device: torch.device):
+        self.deterministic = device.type == "cpu"
+
+    def refuses(self, device: torch.device, dtype: torch.dtype) -> None:
+        return None
+
+    def hash_encode(
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+    ) -> Tensor:
+        return encode_into(points, table, resolutions, widths=None, sink=sink)
+
+    def adam_rows(
+        self,
+        table: Tensor,
+        gradient: Tensor,
+        first: Tensor,
+        second: Tensor,
+        *,
+        step: int,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+    ) -> None:
+        reference.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
+
+    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
+        return reference.visible_samples(rays, march, grid)
+
+    def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
+        return reference.sample_coordinates(
+            rays.origins,
+            rays.directions,
+            samples.starts,
+            samples.ends,
+            offsets=samples.offsets,
+            contraction=contraction,
+        )
+
+    def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
+        return encode_into(samples.coordinates, grid.table, grid.resolutions, widths=widths, sink=sink)
+
+    def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
+        return reference.density(encoded, grid.layers)
+
+    def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
+        return reference.radiance(encoded, spherical_harmonics(directions, grid.view_degree), index, grid.layers)
+
+
+def encode_into(
+    points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, widths: Tensor | None, sink: Tensor | None
+) -> Tensor:
+    """`reference.hash_encode`; the gradient with respect to the table goes into the sink, if there is one."""
+    if sink is None or not (table.requires_grad and torch.is_grad_enabled()):
+        return reference.hash_encode(points, table, resolutions, widths)
+    leaf = table.detach().to(sink.dtype).requires_grad_()  # half precision's gradients go on unrounded
+
+    def add_to_sink(given: Tensor) -> None:
+        if given.grad is not None:
+            sink.add_(given.grad)
+
+    leaf.register_post_accumulate_grad_hook(add_to_sink)
+    return reference.hash_encode(points, leaf, resolutions, widths)

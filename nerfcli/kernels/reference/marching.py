@@ -1,0 +1,82 @@
+"""Samples along rays: those in occupied cells, and those of them that light gets to. Letters as in `interface`."""
+
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.contraction import grid_coordinates, sample_widths
+from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.reference.compositing import optical_depth_before, ray_indices
+from nerfcli.kernels.reference.encoding import hash_encode
+from nerfcli.kernels.reference.networks import density
+
+
+def march(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor]:
+    """Cut rays into intervals and keep those whose midpoint lies in an occupied cell.
+
+    Ray r is cut at edges[k] + jitter[r] * (edges[k + 1] - edges[k]).
+
+    Returns:
+        starts (N,), ends (N,), offsets (R + 1,).
+    """
+    edges, occupied = along.edges, along.occupied
+    cuts = edges[:-1] + rays.jitter[:, None] * (edges[1:] - edges[:-1])  # (R, S + 1)
+    starts, ends = cuts[:, :-1], cuts[:, 1:]
+    middles = rays.origins[:, None, :] + rays.directions[:, None, :] * ((starts + ends) / 2)[..., None]  # (R, S, 3)
+    coordinates = grid_coordinates(middles, along.contraction)
+    side = occupied.shape[0]
+    inside = ((coordinates >= 0) & (coordinates <= 1)).all(-1)
+    x, y, z = (coordinates.clamp(0, 1) * side).long().clamp_max(side - 1).unbind(-1)
+    kept = inside & occupied[z, y, x]
+    offsets = torch.zeros(len(rays.origins) + 1, dtype=torch.int64, device=edges.device)
+    offsets[1:] = kept.sum(1).cumsum(0)
+    return starts[kept], ends[kept], offsets
+
+
+def sample_coordinates(
+    origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, contraction: str
+) -> Tensor:
+    """The middles of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`.
+
+    Differentiable in origins and directions.
+    """
+    rays = ray_indices(offsets)
+    points = origins[rays] + directions[rays] * ((starts + ends) / 2)[:, None]
+    return grid_coordinates(points, contraction)
+
+
+def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The samples of `march` with their places.
+
+    Returns:
+        starts (N,), ends (N,), coordinates (N, 3) in the field's unit cube, offsets (R + 1,).
+    """
+    starts, ends, offsets = march(rays, along)
+    coordinates = sample_coordinates(
+        rays.origins, rays.directions, starts, ends, offsets=offsets, contraction=along.contraction
+    )
+    return starts, ends, coordinates, offsets
+
+
+@torch.no_grad()
+def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
+    """The samples of `march` in front of which the optical depth is below a limit, with what the grid says of them.
+
+    What is left out takes at most exp(-max_optical_depth) of a ray's light. Without gradients.
+    """
+    starts, ends, coordinates, offsets = occupied_samples(rays, along)
+    widths = None
+    if grid.antialias and rays.cones is not None:
+        widths = sample_widths(
+            rays.origins,
+            rays.directions,
+            starts,
+            ends,
+            rays=ray_indices(offsets),
+            cones=rays.cones,
+            contraction=along.contraction,
+        )
+    encoded = hash_encode(coordinates, grid.table, grid.resolutions, widths)
+    thickness = density(encoded, grid.layers)
+    seen = optical_depth_before(thickness, ends - starts, offsets) < along.max_optical_depth
+    kept = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
+    return Samples(starts[seen], ends[seen], thickness[seen], encoded[seen], coordinates[seen], kept)

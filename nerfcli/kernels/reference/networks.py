@@ -1,0 +1,48 @@
+"""The two small networks behind the hash grid. Letters as in `interface`."""
+
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.activations import density_from_log
+
+
+def geometry(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+    """The density network: (N, E) to (N, G), W2 relu(W1 x); the first output is the log of the density."""
+    return torch.relu(encoded @ weights[0].t()) @ weights[1].t()
+
+
+def density(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
+    """Density of encoded positions.
+
+    density = exp((W2 relu(W1 x))_0), the exponent clipped to [-15, 15]; see `density_from_log`.
+
+    Args:
+        encoded: (N, E).
+        weights: W1 (H, E), W2 (G, H), and whatever follows.
+
+    Returns:
+        (N,).
+    """
+    return density_from_log(geometry(encoded, weights)[:, 0])
+
+
+def radiance(encoded: Tensor, harmonics: Tensor, rays: Tensor, weights: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    """Density and colour of encoded positions seen along rays.
+
+    g = W2 relu(W1 x),  density = exp(g_0),  rgb = sigmoid(C3 relu(C2 relu(C1 [g, harmonics of the ray])))
+
+    Args:
+        encoded: (N, E).
+        harmonics: (R, S) encoded direction of each ray.
+        rays: (N,) int64, the ray of each sample.
+        weights: W1 (H, E), W2 (G, H), C1 (H, G + S), C2 (H, H), C3 (3, H); no biases.
+
+    Returns:
+        density (N,), rgb (N, 3) in (0, 1).
+
+    Differentiable in encoded, harmonics and weights.
+    """
+    shape = geometry(encoded, weights)
+    hidden = torch.relu(torch.cat([shape, harmonics[rays]], dim=-1) @ weights[2].t())
+    hidden = torch.relu(hidden @ weights[3].t())
+    return density_from_log(shape[:, 0]), torch.sigmoid(hidden @ weights[4].t())

@@ -1,0 +1,283 @@
+"""Backends: whole operations on rays against the reference in float64, in every branch; and which backend is taken."""
+
+import math
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from oracles import march_through_slabs
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.errors import UserError
+from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.field.interface import Field, FieldSettings
+from nerfcli.field.kinds import fresh_field
+from nerfcli.field.voxel_field import VoxelFieldSettings
+from nerfcli.kernels import Backend, March, Rays, RaysSeen, RaySums, Targets, numba_cpu, reference
+
+CPU = torch.device("cpu")
+COMPILED = HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=16)
+MEDIA: dict[str, FieldSettings] = {
+    "compiled sizes": COMPILED,
+    "pixels of some width": replace(COMPILED, antialias=True),
+    "other sizes": replace(COMPILED, levels=3, width=16),
+    "no hash grid": VoxelFieldSettings(contraction="l2", view_degree=1, log2_vertices=9),
+}
+
+
+def field_of(name: str, dtype: torch.dtype, wanted: str) -> Field:
+    torch.manual_seed(0)
+    field = fresh_field(MEDIA[name])
+    rows = field.rows()
+    assert rows is not None
+    with torch.no_grad():
+        rows.normal_(0.0, 0.5)
+    field = field.to(dtype)
+    field.backend = kernels.backend_for(CPU, dtype, wanted=wanted)
+    return field
+
+
+def rays_and_march(count: int, dtype: torch.dtype, *, empty: bool = False) -> tuple[Rays, March]:
+    g = torch.Generator().manual_seed(count)
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=-1)
+    origins = -1.5 * directions + 0.3 * torch.randn(count, 3, generator=g)
+    jitter, cones = torch.rand(count, generator=g), 0.05 * torch.rand(count, generator=g)
+    occupied = torch.rand(8, 8, 8, generator=g) > (1.0 if empty else 0.4)
+    edges = torch.linspace(0.3, 4.0, 40).to(dtype)
+    rays = Rays(*(values.to(dtype) for values in (origins, directions, jitter, cones)))
+    return rays, March(edges, occupied, "l2", 7.0)
+
+
+def learned(
+    name: str, wanted: str, count: int, *, dtype: torch.dtype, targets: Targets, with_sink: bool
+) -> dict[str, Tensor]:
+    """What a training gets of some rays, and the gradients of a random weighting of it."""
+    field = field_of(name, dtype, wanted)
+    rays, march = rays_and_march(count, dtype)
+    rays = rays._replace(origins=rays.origins.requires_grad_(), directions=rays.directions.requires_grad_())
+    g = torch.Generator().manual_seed(9)
+    background = torch.rand(count, 3, generator=g).to(dtype)
+    rows = field.rows()
+    assert rows is not None
+    sink = torch.zeros_like(rows, requires_grad=False) if with_sink else None
+    distances = None if targets.distances is None else targets.distances[:count].to(dtype)
+    seen = field.backend.render_rays(
+        rays, march, field.medium(), targets._replace(distances=distances), background=background, sink=sink
+    )
+    total = torch.zeros((), dtype=dtype)
+    for values in seen[:4]:
+        total = total + (values * torch.randn(values.shape, generator=g).to(dtype)).sum()
+    total.backward()
+    assert (rows.grad is None) == with_sink or not len(rays.origins)
+    gradients = {f"gradient of {key}": value.grad for key, value in field.named_parameters() if value is not rows}
+    gradients |= {"gradient of origins": rays.origins.grad, "gradient of directions": rays.directions.grad}
+    gradients["gradient of rows"] = rows.grad if sink is None else sink
+    return {**seen._asdict(), **{key: value for key, value in gradients.items() if value is not None}}
+
+
+def assert_agree(fast: dict[str, Tensor], exact: dict[str, Tensor], *, relative: float) -> None:
+    assert fast.keys() == exact.keys()
+    for name, value in fast.items():
+        wanted = exact[name].double()
+        assert value.shape == wanted.shape, name
+        error = (value.double() - wanted).norm()
+        assert error <= relative * wanted.norm() + 1e-12, (name, float(error / wanted.norm()))
+
+
+BRANCHES = {
+    "colours alone": Targets(),
+    "near": Targets(near_scaling=True),
+    "distortion": Targets(distortion=True),
+    "distances": Targets(distances=torch.tensor([2.0, 1.5, 1.7])),
+    "all": Targets(True, True, torch.tensor([1.2, 1.5])),
+}
+
+
+@pytest.mark.parametrize("name", MEDIA)
+@pytest.mark.parametrize("count", [0, 1, 5, 123])
+@pytest.mark.parametrize("branch", BRANCHES)
+def test_a_training_gets_what_the_reference_gives_in_float64(name, count, branch):
+    """Sums, and gradients of rays, layers and rows: those with and without a sink in turn."""
+    with_sink = branch in ("near", "all")
+    targets = BRANCHES[branch]
+    given = {"targets": targets, "with_sink": with_sink}
+    exact = learned(name, "reference", count, dtype=torch.float64, **given)
+    for wanted in ("numba_cpu", "reference"):
+        fast = learned(name, wanted, count, dtype=torch.float32, **given)
+        assert torch.equal(fast["samples"], exact["samples"])  # none is kept by one alone for these seeds
+        # Coordinates of float32 are 1e-7 off, which cells of a 16th make 1e-6, and the log density's slope more.
+        assert_agree(fast, exact, relative=1e-3)
+
+
+@pytest.mark.parametrize("name", MEDIA)
+@pytest.mark.parametrize("count", [0, 1, 5, 123])
+def test_a_picture_is_what_the_reference_gives_in_float64(name, count):
+    def seen(wanted: str, dtype: torch.dtype) -> RaysSeen:
+        field = field_of(name, dtype, wanted)
+        rays, march = rays_and_march(count, dtype)
+        background = torch.tensor([0.25, 0.5, 1.0], dtype=dtype)
+        return field.backend.trace_rays(
+            rays, march, field.medium(), background=background, shares=(0.25, 0.5), negligible=1e-3
+        )
+
+    exact = seen("reference", torch.float64)
+    for wanted in ("numba_cpu", "reference"):
+        fast = seen(wanted, torch.float32)
+        assert torch.equal(fast.intervals.offsets, exact.intervals.offsets)
+        pairs = {"rgb": (fast.rgb, exact.rgb), "error": (fast.truncation_error, exact.truncation_error)}
+        for key in ("opacity", "transmittance", "mean", "spread", "quantiles"):
+            pairs[key] = (getattr(fast.ends, key), getattr(exact.ends, key))
+        for key, (value, expected) in pairs.items():
+            torch.testing.assert_close(
+                value.double(),
+                expected,
+                rtol=1e-3,
+                atol=2e-5,
+                equal_nan=True,
+                msg=lambda text, key=key: f"{key} {text}",
+            )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_sums_along_rays_are_those_of_a_double_loop(dtype):
+    """Of the samples that a trace is shown: colour, what passes, distortion, and how far light ends from its target."""
+    field = field_of("compiled sizes", dtype, "auto")
+    rays, march = rays_and_march(5, dtype)
+    distances, background = torch.tensor([1.2, 1.9], dtype=dtype), torch.rand(5, 3, dtype=dtype)
+    shown: dict[str, Tensor] = {}
+
+    def trace(name: str, values: Tensor, index: Tensor) -> None:
+        shown[name], shown["index"] = values.detach(), index
+
+    found = field.backend.trace_rays(rays, march, field.medium(), background=background).intervals
+    seen = field.backend.render_rays(
+        rays, march, field.medium(), Targets(distortion=True, distances=distances), background=background, trace=trace
+    )
+    assert int(seen.samples) == len(found.starts) > 20
+    density, rgb = shown["density of samples"].double(), shown["colour of samples"].double()
+    starts, ends, offsets = found.starts.double(), found.ends.double(), found.offsets
+    assert torch.equal(kernels.ray_indices(offsets), shown["index"])
+    contracted = [[t / 2 if t <= 1 else 1 - 1 / (2 * t) for t in edge.tolist()] for edge in (starts, ends)]
+    expected: list[list[object]] = [[], [], [], []]
+    for ray in range(5):
+        part = slice(int(offsets[ray]), int(offsets[ray + 1]))
+        lengths, behind = (ends - starts)[part].tolist(), background[ray].tolist()
+        weights, passing, colour = march_through_slabs(density[part].tolist(), lengths, rgb[part].tolist(), behind)
+        spans = list(zip(contracted[0][part], contracted[1][part], strict=True))
+        middles = [(near + far) / 2 for near, far in spans]
+        pairs = sum(
+            w * v * abs(m - n)
+            for w, m in zip(weights, middles, strict=True)
+            for v, n in zip(weights, middles, strict=True)
+        )
+        own = sum(w * w * (far - near) for w, (near, far) in zip(weights, spans, strict=True)) / 3
+        expected[0].append(colour.tolist())
+        expected[1].append(passing)
+        expected[2].append(pairs + own)
+        if ray >= 3:
+            target = float(distances[ray - 3])
+            places = ((starts + ends) / 2)[part].tolist()
+            misses = [min(1.0, abs(t - target) / (0.25 * target)) for t in places]
+            expected[3].append(sum(w * miss for w, miss in zip(weights, misses, strict=True)) + passing)
+    for value, wanted in zip(seen[:4], expected, strict=True):
+        exact = torch.tensor(wanted, dtype=torch.float64)
+        torch.testing.assert_close(value.detach().double(), exact, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("wanted", ["numba_cpu", "reference"])
+def test_rays_that_meet_nothing_see_the_background(wanted):
+    field = field_of("compiled sizes", torch.float32, wanted)
+    rays, march = rays_and_march(5, torch.float32, empty=True)
+    background = torch.rand(5, 3)
+    targets = Targets(True, True, torch.tensor([1.0]))
+    sums: RaySums = field.backend.render_rays(rays, march, field.medium(), targets, background=background)
+    assert torch.equal(sums.rgb, background)
+    assert sums.transmittance.tolist() == [1.0] * 5
+    assert sums.distortion.tolist() == [0.0] * 5
+    assert sums.off_target.tolist() == [1.0]
+    assert int(sums.samples) == 0
+    seen = field.backend.trace_rays(rays, march, field.medium(), background=background)
+    assert torch.equal(seen.rgb, background)
+    assert seen.truncation_error.tolist() == [0.0] * 5
+
+
+def test_what_marching_has_computed_is_not_computed_again(monkeypatch):
+    """Places and codes of samples go on into the step with gradients as they are."""
+    field = field_of("compiled sizes", torch.float32, "numba_cpu")
+    rays, march = rays_and_march(5, torch.float32)
+    rays = rays._replace(origins=rays.origins.requires_grad_())
+    handed: list[bool] = []
+    encode, place = numba_cpu.hash_encode, numba_cpu.sample_coordinates
+
+    def encoding(points: Tensor, table: Tensor, *rest: Any) -> Tensor:
+        handed.append(rest[2] is not None)
+        return encode(points, table, *rest)
+
+    def placing(*given: Tensor, **named: Tensor) -> Tensor:
+        handed.append(named["known"] is not None)
+        return place(*given, **named)
+
+    monkeypatch.setattr(numba_cpu, "hash_encode", encoding)
+    monkeypatch.setattr(numba_cpu, "sample_coordinates", placing)
+    field.backend.render_rays(rays, march, field.medium(), background=torch.zeros(5, 3))
+    assert handed == [True, True]
+
+
+@pytest.fixture
+def without_numba(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A machine on which the compiled kernels cannot be imported."""
+    kernels._numba_cpu.cache_clear()
+    monkeypatch.delattr(kernels, "numba_cpu")
+    monkeypatch.setitem(sys.modules, "nerfcli.kernels.numba_cpu", None)
+    yield
+    kernels._numba_cpu.cache_clear()
+
+
+def test_without_numba_the_reference_is_taken_with_one_warning(without_numba, recwarn):
+    names = [kernels.backend_for(CPU, torch.float32).name for _ in range(3)]
+    assert names == ["reference"] * 3
+    (warning,) = recwarn
+    assert "Numba does not work here" in str(warning.message)
+
+
+@pytest.mark.filterwarnings("ignore:Numba does not work here")
+def test_a_backend_that_is_wanted_by_name_and_does_not_work_is_an_error(without_numba):
+    with pytest.raises(UserError, match="numba_cpu cannot be used: Numba does not work here"):
+        kernels.backend_for(CPU, torch.float32, wanted="numba_cpu")
+
+
+@pytest.mark.parametrize(("device", "dtype"), [("cpu", torch.float64), ("cuda", torch.float32)])
+def test_a_backend_that_is_wanted_by_name_says_what_it_does_not_work_on(device, dtype):
+    with pytest.raises(UserError, match=rf"float32 on the CPU, not on {str(dtype)[6:]} on {device}"):
+        kernels.backend_for(torch.device(device), dtype, wanted="numba_cpu")
+    assert kernels.backend_for(torch.device(device), dtype).name == "reference"
+    with pytest.raises(ValueError, match=r"backend must be one of .*, got 'abacus'"):
+        kernels.backend_for(torch.device(device), dtype, wanted="abacus")
+
+
+def test_what_repeats_bit_for_bit_says_so():
+    def deterministic(backend: Backend) -> bool:
+        return backend.deterministic
+
+    assert deterministic(kernels.backend_for(CPU, torch.float32))
+    assert deterministic(kernels.backend_for(CPU, torch.float64))
+    assert not deterministic(kernels.backend_for(torch.device("cuda"), torch.float32))
+
+
+def test_a_field_takes_another_backend_where_it_goes():
+    field = HashField(COMPILED)
+    assert field.backend.name == "numba_cpu"
+    assert field.backend is field.backend
+    assert field.double().backend.name == "reference"
+    assert field.float().backend.name == "numba_cpu"
+    field.backend = kernels.backend_for(CPU, torch.float32, wanted="reference")
+    assert field.backend.name == "reference"
+
+
+def test_the_definition_of_contracted_distance():
+    distance = torch.tensor([0.0, 0.5, 1.0, 2.0, math.inf], dtype=torch.float64)
+    assert reference.contracted_distance(distance).tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
