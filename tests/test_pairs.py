@@ -273,3 +273,17 @@ def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_fro
     now = 25.0
     outlook.update("enlarge", 5, 5)
     assert outlook.update("match", 0, 45)[1] == pytest.approx(10.0)
+
+
+def test_another_attempt_lowers_the_share():
+    """Mapping begins again after the checks: the work is not at its end."""
+    now = 0.0
+    seconds = {"extract": 10.0, "map": 10.0, "check": 2.0}
+    outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, seconds), clock=lambda: now)
+    now = 20.0
+    outlook.update("map", 10, 10)
+    now = 22.0
+    assert outlook.update("check", 4, 4)[0] == 1.0
+    share, left = outlook.update("map", 0, 10)
+    assert left > 5.0
+    assert share == pytest.approx(22.0 / (22.0 + left))

@@ -105,6 +105,8 @@ class Outlook:
         if stage == "enlarge":
             self._plan_enlarging(total)
         ratio = (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
+        if self._begins_again(stage, ratio):
+            self._share = 0.0
         if stage != self._stage or ratio < self._began[1]:
             self._worked = (self._worked[0] + self._latest[0], self._worked[1] + self._latest[1])
             self._stage, self._began = stage, (now, ratio)
@@ -123,6 +125,12 @@ class Outlook:
         spent = now - self._start
         self._share = max(self._share, spent / (spent + left) if left > 0 else 1.0)
         return self._share, left
+
+    def _begins_again(self, stage: str, ratio: float) -> bool:
+        """Whether the work goes back, for another attempt. Stages without a plan come last."""
+        order = list(self._seconds)
+        new, old = (order.index(name) if name in order else len(order) for name in (stage, self._stage))
+        return bool(self._stage) and (new < old or (new == old and ratio < self._began[1]))
 
     def _plan_enlarging(self, photos: int) -> None:
         """Put the second search for features after the first."""
