@@ -24,8 +24,8 @@ from rich.table import Table
 from nerfcli import kernels
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.field.cost import field_bytes
+from nerfcli.fit.fitting import Fitting
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.fitting import Fitting
 from nerfcli.train.heldout import PIXELS
 
 # Where in its budget a training is looked at.

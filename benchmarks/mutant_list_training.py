@@ -4,7 +4,7 @@ from mutant_list import Group, Mutant
 
 TRAINING: tuple[Group, ...] = (
     Group(
-        "train/gauge.py",
+        "fit/gauge.py",
         ("tests/test_refinement.py",),
         "mean or similarity or place or spot",
         (),
@@ -26,7 +26,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/whitening.py",
+        "fit/whitening.py",
         ("tests/test_refinement.py",),
         "whitened",
         (),
@@ -46,7 +46,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/refinement.py",
+        "fit/refinement.py",
         ("tests/test_refinement.py",),
         "frames_are or picture_moves or mean or gradient or rates or rays or find_back or moved or cameras_of",
         (),
@@ -78,7 +78,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/lens_change.py",
+        "cameras/lens_change.py",
         ("tests/test_refinement.py",),
         "lens or bearings or nothing",
         (),
@@ -103,7 +103,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/judgement.py",
+        "search/judgement.py",
         ("tests/test_selection.py",),
         "",
         (),
@@ -130,7 +130,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/triangulation.py",
+        "multiview/triangulation.py",
         ("tests/test_triangulation.py", "tests/test_priors.py"),
         "",
         (),
@@ -153,7 +153,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/tracks.py",
+        "multiview/tracks.py",
         ("tests/test_triangulation.py", "tests/test_priors.py"),
         "",
         (),
@@ -167,7 +167,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/point_depth.py",
+        "fit/point_depth.py",
         ("tests/test_priors.py",),
         "",
         (),
@@ -182,7 +182,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/selection.py",
+        "search/selection.py",
         ("tests/test_selection.py",),
         "",
         (),
@@ -216,7 +216,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/sky.py",
+        "search/sky.py",
         ("tests/test_sky.py",),
         "",
         (),
@@ -235,7 +235,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/trials.py",
+        "search/trials.py",
         ("tests/test_trials.py",),
         "start or fork or changes",
         (),
@@ -250,7 +250,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/newton.py",
+        "fit/newton.py",
         ("tests/test_refinement.py",),
         "undamped or hardly or formula",
         (),
@@ -269,7 +269,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/refinement.py",
+        "fit/refinement.py",
         ("tests/test_refinement.py", "tests/test_priors.py"),
         "rates or rays or moved or begin or mean or held_once or whole_way or needs",
         (),
@@ -286,7 +286,7 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "train/gauge.py",
+        "fit/gauge.py",
         ("tests/test_refinement.py",),
         "mean or similarity or place or spot or right or stay",
         (),

@@ -25,8 +25,8 @@ from rich.console import Console
 from rich.table import Table
 from synthetic_captures import FISHEYE, LONG, PHONE, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
-from nerfcli.poses.examine import examine
-from nerfcli.poses.ladder import climb
+from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.judge.examine import examine
 
 BOUNDS_DEG = (1, 3, 5, 10)
 USUAL = Noise()

@@ -23,13 +23,13 @@ from rich.table import Table
 from nerfcli import kernels, scene
 from nerfcli.field.cost import optimiser_bytes, parameter_bytes, work
 from nerfcli.field.kinds import KINDS
+from nerfcli.fit.extent import choose_extent
+from nerfcli.fit.fitting import Fitting
 from nerfcli.photos.loading import load_photos
+from nerfcli.photos.pool import PixelPool
 from nerfcli.render.model import Model
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
-from nerfcli.train.extent import choose_extent
-from nerfcli.train.fitting import Fitting
 from nerfcli.train.heldout import HeldoutPixels
-from nerfcli.train.photos import PixelPool
 
 # A step of a network of megabytes takes longer than the whole budget with the samples of a hash grid's.
 NETWORK_SAMPLES = 2**13

@@ -23,8 +23,8 @@ from rich.table import Table
 from nerfcli import kernels, scene
 from nerfcli.runs.components import differences
 from nerfcli.runs.settings import TrainSettings
+from nerfcli.search.selection import SEARCH_SHARE
 from nerfcli.train.preparation import prepare
-from nerfcli.train.selection import SEARCH_SHARE
 
 # What each scene needs, beside what every model has; and what may be left out of it. Points are needed where photos
 # share any, and are told apart.

@@ -19,11 +19,11 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels, scene
+from nerfcli.fit.extent import choose_extent
+from nerfcli.fit.fitting import Fitting
 from nerfcli.photos.loading import load_photos
+from nerfcli.photos.pool import PixelPool
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
-from nerfcli.train.extent import choose_extent
-from nerfcli.train.fitting import Fitting
-from nerfcli.train.photos import PixelPool
 
 
 def trained(folder: Path, seconds: float, threads: int) -> Fitting:

@@ -12,9 +12,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from nerfcli.poses.job import CameraGroup, Job
-from nerfcli.poses.pairs import all_pairs
-from nerfcli.poses.settings import FULL_SIZE
+from nerfcli.poses.input.job import CameraGroup, Job
+from nerfcli.poses.input.pairs import all_pairs
+from nerfcli.poses.input.settings import FULL_SIZE
 
 Array = NDArray[np.float64]
 

@@ -18,13 +18,13 @@ from hypothesis import settings
 from nerfcli import scene
 from nerfcli.atomic import write_json
 from nerfcli.cameras.formats.run_cameras import write_cameras
+from nerfcli.fit.normalisation import object_frame
 from nerfcli.render.model import Model, save_model
 from nerfcli.runs.config import RunConfig
 from nerfcli.runs.files import CONFIG, FIELD
 from nerfcli.runs.log import LogEntry, append_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.train.loop import train
-from nerfcli.train.normalisation import object_frame
 
 # Relative tolerance of a chain of some dozen operations, per dtype. A looser one in a test carries its reason.
 TOLERANCE = {torch.float64: 1e-12, torch.float32: 5e-6}

@@ -5,7 +5,7 @@ import sys
 
 import torch
 
-from nerfcli.train.adam import BETAS, EPS, Adam
+from nerfcli.fit.adam import BETAS, EPS, Adam
 
 
 def test_steps_are_those_of_torch_to_the_bit_and_go_on_from_a_saved_state():
@@ -43,7 +43,7 @@ def test_what_was_never_saved_begins_anew():
 
 def test_a_step_loads_no_compiler():
     script = (
-        "import sys, torch; from nerfcli.train.adam import Adam; p = torch.ones(3, requires_grad=True); "
+        "import sys, torch; from nerfcli.fit.adam import Adam; p = torch.ones(3, requires_grad=True); "
         "a = Adam([p]); p.grad = torch.ones(3); a.step(0.1); sys.exit('torch._dynamo' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

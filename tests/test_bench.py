@@ -45,12 +45,12 @@ from nerfcli.errors import BAD_INPUT, INTERRUPTED, UserError
 from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels
+from nerfcli.fit.normalisation import object_frame
 from nerfcli.pages.page import asset
 from nerfcli.render.model import Model, load_model
 from nerfcli.runs.files import FIELD
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.normalisation import object_frame
 
 FEW = [
     RenderSetting(2),

@@ -8,11 +8,11 @@ import pytest
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.lens_change import FOCAL, changed
 from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.multiview.camera_check import FARTHEST, FEWEST_MATCHES, CameraCheck, check_cameras
+from nerfcli.multiview.matching import LONGER_SIDE_PX, Matches, chosen_pairs
 from nerfcli.photos.loading import Photo
-from nerfcli.train.camera_check import FARTHEST, FEWEST_MATCHES, CameraCheck, check_cameras
-from nerfcli.train.lens_change import FOCAL, changed
-from nerfcli.train.matching import LONGER_SIDE_PX, Matches, chosen_pairs
 
 PINHOLE = Camera.pinhole(600, 450, 550.0)
 LENSES = {

@@ -17,8 +17,8 @@ from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field
 from nerfcli.field.sizes import chosen_size
 from nerfcli.field.voxel_field import VoxelFieldSettings
+from nerfcli.fit.optimiser import FieldOptimiser
 from nerfcli.kernels import reference
-from nerfcli.train.optimiser import FieldOptimiser
 
 HASH = HashFieldSettings(contraction="none")
 SEVERAL: list[FieldSettings] = [

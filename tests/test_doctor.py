@@ -29,7 +29,7 @@ from nerfcli.doctor.sharpness import measure
 from nerfcli.doctor.subject import Subject, find_subject
 from nerfcli.errors import UserError
 from nerfcli.media.images import Exif
-from nerfcli.poses.nearest import mutual_matches
+from nerfcli.multiview.mutual_matches import mutual_matches
 from nerfcli.scene import Scene
 
 ONE = 3  # the number of the photo that is spoilt

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.fit.error_map import BLOCK_PX, GUIDED_SHARE, ErrorMap
 from nerfcli.photos.loading import Photo, load_photos
+from nerfcli.photos.pool import PixelPool
 from nerfcli.scene import Scene
-from nerfcli.train.error_map import BLOCK_PX, GUIDED_SHARE, ErrorMap
-from nerfcli.train.photos import PixelPool
 
 SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 

@@ -16,16 +16,16 @@ from nerfcli.evaluate.protocol import HeldOut, evaluate_model
 from nerfcli.field.background import SphereBackground, colours_behind
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
+from nerfcli.fit.parts import Parts
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.loading import Photo
+from nerfcli.photos.pool import Drawn, PixelPool
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import render_picture
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.loop import Progress, train
-from nerfcli.train.parts import Parts
-from nerfcli.train.photos import Drawn, PixelPool
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 LEARNED = Components(background="sphere", exposure="learned")

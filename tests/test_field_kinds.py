@@ -20,9 +20,9 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import KINDS, fresh_field, settings_from_json
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.fit.optimiser import FieldOptimiser
 from nerfcli.kernels import March, Rays, numba_cpu, reference, spherical_harmonics
 from nerfcli.render.model import Marching, Model, load_model, save_model
-from nerfcli.train.optimiser import FieldOptimiser
 
 SMALL: dict[str, FieldSettings] = {
     "hash": HashFieldSettings(contraction="none", log2_rows=8, coarsest=4, finest=32),

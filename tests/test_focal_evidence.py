@@ -9,9 +9,9 @@ from test_photos import NO_EXIF, photo
 
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import Exif, read_exif
-from nerfcli.poses.cameras import group_photos
-from nerfcli.poses.database import camera_of_group
-from nerfcli.poses.photos import Photos, camera_groups
+from nerfcli.poses.engine.database import camera_of_group
+from nerfcli.poses.input.photos import Photos, camera_groups
+from nerfcli.poses.model.cameras import group_photos
 
 # A full-frame camera with a lens of 50 mm, by its own numbers: 50 / 36 * 5472 = 7600 pixels.
 CAMERA = replace(

@@ -23,7 +23,8 @@ from nerfcli.runs.files import FIELD
 from nerfcli.runs.log import read_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train import loop, preparation, selection, waypoints
+from nerfcli.search import selection
+from nerfcli.train import loop, preparation, waypoints
 from nerfcli.train.loop import train
 
 HELD_OUT = "test"  # the folder of these photos in the capture

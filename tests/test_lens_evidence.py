@@ -7,10 +7,10 @@ import synthetic_captures as synthetic
 from synthetic_captures import Lens
 from test_pose_lenses import camera_of, ring_model, started_from
 
-from nerfcli.poses import held_out
-from nerfcli.poses.determined import determine, uncertainty
-from nerfcli.poses.intrinsics import choose_lenses
-from nerfcli.poses.lens_evidence import NAMES, UndeterminedError, lens_evidence
+from nerfcli.poses.model import held_out
+from nerfcli.poses.model.determined import determine, uncertainty
+from nerfcli.poses.model.intrinsics import choose_lenses
+from nerfcli.poses.model.lens_evidence import NAMES, UndeterminedError, lens_evidence
 
 FOCAL_PX = 1400.0
 

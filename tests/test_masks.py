@@ -1,4 +1,4 @@
-"""nerfcli.media.masks and poses.masks: found by name, turned like the photo, obeyed by feature extraction."""
+"""nerfcli.media.masks and poses.input.masks: found by name, turned like the photo, obeyed by feature extraction."""
 
 import json
 from dataclasses import replace
@@ -12,10 +12,10 @@ from PIL import Image
 from nerfcli.errors import UserError
 from nerfcli.media.images import read_image, write_png
 from nerfcli.media.masks import find_mask, read_mask
-from nerfcli.poses.features import extract, feature_keys
-from nerfcli.poses.job import CameraGroup, Job, LaidOutMask, read_job, write_job
-from nerfcli.poses.masks import lay_out_masks
-from nerfcli.poses.photos import Photo, Photos, find_photos
+from nerfcli.poses.engine.features import extract, feature_keys
+from nerfcli.poses.input.job import CameraGroup, Job, LaidOutMask, read_job, write_job
+from nerfcli.poses.input.masks import lay_out_masks
+from nerfcli.poses.input.photos import Photo, Photos, find_photos
 
 WIDTH, HEIGHT = 120, 80
 

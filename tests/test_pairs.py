@@ -9,12 +9,12 @@ import pytest
 from test_photos import NO_EXIF
 
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.poses.pairs import EXHAUSTIVE_UP_TO, Pairing, capture_order, choose_pairs
-from nerfcli.poses.pairs_file import read_pairs
-from nerfcli.poses.photos import Photo, Photos
-from nerfcli.poses.plan import Outlook, Plan, make_plan
-from nerfcli.poses.retrieval import alike, likeness
-from nerfcli.poses.settings import PoseSettings
+from nerfcli.poses.engine.retrieval import alike, likeness
+from nerfcli.poses.input.pairs import EXHAUSTIVE_UP_TO, Pairing, capture_order, choose_pairs
+from nerfcli.poses.input.pairs_file import read_pairs
+from nerfcli.poses.input.photos import Photo, Photos
+from nerfcli.poses.input.plan import Outlook, Plan, make_plan
+from nerfcli.poses.input.settings import PoseSettings
 
 
 def named(*names: str) -> list[Photo]:

@@ -9,8 +9,8 @@ from PIL import Image
 
 from nerfcli.errors import BAD_INPUT, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.images import Exif
-from nerfcli.poses.photos import Photo, camera_groups, find_photos
-from nerfcli.poses.reasons import Evidence, dominant, reason
+from nerfcli.poses.input.photos import Photo, camera_groups, find_photos
+from nerfcli.poses.model.reasons import Evidence, dominant, reason
 
 NO_EXIF = Exif(
     make=None,

@@ -25,14 +25,15 @@ from synthetic_captures import LONG, WIDE, Noise
 from nerfcli import scene as scenes
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.finite import finite
-from nerfcli.poses import acceptance, examine, worker
-from nerfcli.poses.checks import UNDERWAY, Checks
-from nerfcli.poses.components import describe_components
-from nerfcli.poses.job import Job
-from nerfcli.poses.ladder import climb
-from nerfcli.poses.mapped import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine import worker
+from nerfcli.poses.engine.components import describe_components
+from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.input.job import Job
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.judge import acceptance, examine
+from nerfcli.poses.judge.checks import UNDERWAY, Checks
 from nerfcli.poses.report import PosesReport, closing_notes
-from nerfcli.poses.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
 
 ONE_THREAD = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
@@ -200,7 +201,8 @@ def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path,
     """The worker aborts in the covariance, as C++ may; the scene is there, and says which check it lacks."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(
-        "import os\nfrom nerfcli.poses import uncertainty\nuncertainty.pose_blur_px = lambda *a, **o: os.abort()\n"
+        "import os\nfrom nerfcli.poses.judge import uncertainty\n"
+        "uncertainty.pose_blur_px = lambda *a, **o: os.abort()\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
     stages: list[str] = []
@@ -220,7 +222,7 @@ def refusing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder for PYTHONPATH with which every model is refused."""
     site = tmp_path_factory.mktemp("site")
     (site / "sitecustomize.py").write_text(
-        "from nerfcli.poses import acceptance\n"
+        "from nerfcli.poses.judge import acceptance\n"
         "judge = acceptance.judge\n"
         "def refuse(*a, **o):\n"
         "    failure = acceptance.Failure('it is wrong', 'so', 'do better')\n"

@@ -26,9 +26,9 @@ from nerfcli.cameras.frame import Capture
 from nerfcli.convert.formats import format_named
 from nerfcli.convert.intrinsics import read_calibration
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.poses.cameras import GivenIntrinsics
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.model.cameras import GivenIntrinsics
 from nerfcli.poses.report import PosesReport
-from nerfcli.poses.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
 
 ONE_THREAD = PoseSettings(max_features=300, threads=1)

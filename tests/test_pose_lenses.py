@@ -6,9 +6,9 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import Lens
 
-from nerfcli.poses import held_out
-from nerfcli.poses.intrinsics import choose_lenses, converted
-from nerfcli.poses.uncertainty import pose_blur_px
+from nerfcli.poses.judge.uncertainty import pose_blur_px
+from nerfcli.poses.model import held_out
+from nerfcli.poses.model.intrinsics import choose_lenses, converted
 
 
 def ring_model(name: str, params: tuple[float, ...], *, seed: int = 0) -> pycolmap.Reconstruction:

@@ -13,9 +13,9 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import WIDE, View, looking_at
 
-from nerfcli.poses.contradictions import leave_out_contradicting
-from nerfcli.poses.job import Job
-from nerfcli.poses.localise import Attempt, left_out, localise, shared_pairs
+from nerfcli.poses.input.job import Job
+from nerfcli.poses.judge.contradictions import leave_out_contradicting
+from nerfcli.poses.model.localise import Attempt, left_out, localise, shared_pairs
 
 POINTS = synthetic.boulder(700, seed=0)
 VIEWS = synthetic.ring(7, [WIDE], seed=0, turn_deg=180)

@@ -25,9 +25,9 @@ import nerfcli
 from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
 from nerfcli.memory import default_memory_limit, resident_bytes
 from nerfcli.poses import structure_from_motion
+from nerfcli.poses.input.settings import Limits, PoseSettings
+from nerfcli.poses.input.stages import read_stage, write_stage
 from nerfcli.poses.report import PosesReport
-from nerfcli.poses.settings import Limits, PoseSettings
-from nerfcli.poses.stages import read_stage, write_stage
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene, plan_poses
 from nerfcli.poses.workspace import database_bytes, drop_database, workspace
 

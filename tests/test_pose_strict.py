@@ -11,10 +11,10 @@ from test_poses import FAST, similarity
 
 from nerfcli import scene
 from nerfcli.evaluate.ledger import leak_ledger
-from nerfcli.poses.job import CameraGroup, Job
+from nerfcli.poses.engine.strict import fingerprint, held_out_last, training_part
+from nerfcli.poses.input.job import CameraGroup, Job
+from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
-from nerfcli.poses.settings import PoseSettings
-from nerfcli.poses.strict import fingerprint, held_out_last, training_part
 from nerfcli.poses.structure_from_motion import estimate_poses, is_same_scene
 from nerfcli.runs.config import RunConfig
 

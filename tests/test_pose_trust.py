@@ -15,22 +15,22 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
-from nerfcli.poses import merging
-from nerfcli.poses import second_chance as chances
-from nerfcli.poses.acceptance import judge
-from nerfcli.poses.checks import Checks
-from nerfcli.poses.contradictions import leave_out_contradicting
-from nerfcli.poses.database import register_photos
-from nerfcli.poses.examine import Examined, examine
-from nerfcli.poses.features import match
-from nerfcli.poses.job import Job
-from nerfcli.poses.ladder import climb
-from nerfcli.poses.lens_family import as_fisheye
-from nerfcli.poses.mapped import Mapped
-from nerfcli.poses.parallax import best_turn
-from nerfcli.poses.second_chance import is_contradicted, second_chance
-from nerfcli.poses.two_views import read_verified_pairs, rotation_errors
-from nerfcli.poses.view_graph import Bottlenecks, consistent_groups, parts
+from nerfcli.poses.engine import second_chance as chances
+from nerfcli.poses.engine.database import register_photos
+from nerfcli.poses.engine.features import match
+from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.mapped import Mapped
+from nerfcli.poses.engine.second_chance import is_contradicted, second_chance
+from nerfcli.poses.input.job import Job
+from nerfcli.poses.judge.acceptance import judge
+from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.contradictions import leave_out_contradicting
+from nerfcli.poses.judge.examine import Examined, examine
+from nerfcli.poses.judge.parallax import best_turn
+from nerfcli.poses.model import merging
+from nerfcli.poses.model.lens_family import as_fisheye
+from nerfcli.poses.model.two_views import read_verified_pairs, rotation_errors
+from nerfcli.poses.model.view_graph import Bottlenecks, consistent_groups, parts
 
 pytestmark = pytest.mark.usefixtures("_quiet")
 

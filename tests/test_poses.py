@@ -15,9 +15,9 @@ from PIL import Image
 from nerfcli import scene
 from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY, TOO_FEW_PHOTOS, UserError
 from nerfcli.media.images import read_image
-from nerfcli.poses import supervise
+from nerfcli.poses.engine import supervise
+from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.report import PosesReport
-from nerfcli.poses.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
 
 FAST = PoseSettings(max_features=1000, threads=2)

@@ -10,8 +10,8 @@ from test_cli import USAGE, write_photos
 
 from nerfcli.cli.options import bytes_from_text
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.poses import supervise
-from nerfcli.poses.settings import QUALITIES, PoseSettings
+from nerfcli.poses.engine import supervise
+from nerfcli.poses.input.settings import QUALITIES, PoseSettings
 from nerfcli.workflows import poses as poses_workflow
 from nerfcli.workflows.poses import _STAGES
 

@@ -15,22 +15,22 @@ from nerfcli.cameras.formats.colmap_write import write_colmap_binary
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
+from nerfcli.fit.losses import opacity_entropy
+from nerfcli.fit.point_depth import LAST_SHARE, PointRays, fading, point_depth_loss, point_depths
 from nerfcli.kernels import reference
+from nerfcli.multiview.camera_check import CameraCheck
+from nerfcli.multiview.correspondences import Shared
+from nerfcli.multiview.matching import chosen_pairs
+from nerfcli.multiview.tracks import Tracks, tracks_of_model
+from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import load_photos
+from nerfcli.photos.pool import PixelPool
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.camera_check import CameraCheck
+from nerfcli.search.selection import Facts
 from nerfcli.train.loop import train
-from nerfcli.train.losses import opacity_entropy
-from nerfcli.train.matching import chosen_pairs
-from nerfcli.train.photos import PixelPool
-from nerfcli.train.point_depth import LAST_SHARE, PointRays, fading, point_depth_loss, point_depths
 from nerfcli.train.preparation import prepare
-from nerfcli.train.selection import Facts
-from nerfcli.train.shared import Shared
-from nerfcli.train.tracks import Tracks, tracks_of_model
-from nerfcli.train.triangulation import triangulate
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 # Seen by both cameras, the first with an error of half a pixel in the second.
@@ -230,7 +230,9 @@ def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
 
 @pytest.mark.parametrize("limit", [{"budget_seconds": None, "steps": 10}, {"budget_seconds": 1.0}])
 def test_a_short_training_does_not_wait_for_photos_to_be_compared(capture, tmp_path, monkeypatch, limit):
-    monkeypatch.setattr("nerfcli.train.shared.match", lambda *photos, **threads: pytest.fail("photos were compared"))
+    monkeypatch.setattr(
+        "nerfcli.multiview.correspondences.match", lambda *photos, **threads: pytest.fail("photos were compared")
+    )
     without_model = replace(capture, root=tmp_path / "elsewhere")
     settings = TrainSettings(**limit, model="auto")
     prepared = prepare(without_model, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)

@@ -13,6 +13,7 @@ from lenses import HEIGHT, MODELS, WIDTH, random_camera
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.run_cameras import find_run, parse_run, read_cameras, read_given_cameras
+from nerfcli.cameras.lens_change import bearings_by_change, changeable, changed
 from nerfcli.cameras.rigid import (
     Similarity,
     apply,
@@ -24,21 +25,20 @@ from nerfcli.cameras.rigid import (
     vector_from_rotation,
 )
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.fit.extent import Extent
+from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.gauge import mean_similarity, without_mean
+from nerfcli.fit.newton import NewtonSteps
+from nerfcli.fit.refinement import LAST_SHARE, LENS_RATE, PoseRefinement, Refinement, rate_at
+from nerfcli.fit.whitening import BETAS, DAMPING, EPS, WhitenedAdam, whitening
 from nerfcli.photos.loading import load_photos
+from nerfcli.photos.pool import PixelPool
 from nerfcli.runs.camera_moves import camera_moves
 from nerfcli.runs.components import Components
 from nerfcli.runs.files import STATE
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.extent import Extent
-from nerfcli.train.fitting import Fitting
-from nerfcli.train.gauge import mean_similarity, without_mean
-from nerfcli.train.lens_change import bearings_by_change, changeable, changed
 from nerfcli.train.loop import train
-from nerfcli.train.newton import NewtonSteps
-from nerfcli.train.photos import PixelPool
-from nerfcli.train.refinement import LAST_SHARE, LENS_RATE, PoseRefinement, Refinement, rate_at
-from nerfcli.train.whitening import BETAS, DAMPING, EPS, WhitenedAdam, whitening
 
 seeds = st.integers(0, 2**32 - 1)
 FEW = TrainSettings(budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)

@@ -10,10 +10,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Decision, Selection
-from nerfcli.train.camera_check import CameraCheck
-from nerfcli.train.judgement import (
+from nerfcli.search.diagnostics import Signs
+from nerfcli.search.judgement import (
     CLEAR_ERRORS,
     FLOOR,
     LEAST_GAIN_DB,
@@ -23,8 +24,8 @@ from nerfcli.train.judgement import (
     judge_removal,
     judge_supported,
 )
-from nerfcli.train.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_SHARE, Purse
-from nerfcli.train.selection import (
+from nerfcli.search.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_SHARE, Purse
+from nerfcli.search.selection import (
     MOST_START_STEPS,
     Facts,
     is_worth_a_search,
@@ -34,8 +35,7 @@ from nerfcli.train.selection import (
     tells_points,
     with_known_cameras,
 )
-from nerfcli.train.signs import Signs
-from nerfcli.train.trials import Start, Trial
+from nerfcli.search.trials import Start, Trial
 
 PHOTOS = 20
 FITTED = Facts("hash", has_alpha=False, has_exif=False, cameras_known="they are exact")

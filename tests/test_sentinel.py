@@ -10,6 +10,8 @@ import torch
 
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.watch import FirstBad, is_finite
 from nerfcli.kernels import numba_cpu
 from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 from nerfcli.render.model import load_model, save_model
@@ -18,10 +20,8 @@ from nerfcli.runs.log import read_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import sentinel
-from nerfcli.train.fitting import Fitting
 from nerfcli.train.loop import train
 from nerfcli.train.sentinel import replay
-from nerfcli.train.watch import FirstBad, is_finite
 
 FEW = TrainSettings(budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
 

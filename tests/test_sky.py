@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.field.background import SphereBackground
-from nerfcli.train.sky import explained_by_direction, paint
+from nerfcli.search.sky import explained_by_direction, paint
 
 PHOTOS = 12
 PIXELS = 150

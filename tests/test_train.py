@@ -31,6 +31,7 @@ from nerfcli.field.checkpoint import load_tensors
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image, write_png
 from nerfcli.photos.loading import load_photos
+from nerfcli.photos.pool import Drawn, PixelPool
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import DepthRequest, render_picture
 from nerfcli.runs.components import Components
@@ -41,7 +42,6 @@ from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
 from nerfcli.train import loop
 from nerfcli.train.loop import Progress, train
-from nerfcli.train.photos import Drawn, PixelPool
 
 # A step of a few rays is enough where bits are compared, not pictures.
 FEW = TrainSettings(budget_seconds=None, steps=24, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)

@@ -13,15 +13,15 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
 from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.fit.losses import colour_losses, over_background
+from nerfcli.fit.normalisation import box_frame, contracted_frame, object_frame
 from nerfcli.media.images import downscale, write_png
 from nerfcli.memory import resident_bytes
 from nerfcli.photos.loading import Photo, downscaled_camera, load_photos
+from nerfcli.photos.pool import Album, PixelPool, load_album
+from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, Room, room_for
 from nerfcli.render.rays import frame_rays
 from nerfcli.scene import Scene
-from nerfcli.train.losses import colour_losses, over_background
-from nerfcli.train.normalisation import box_frame, contracted_frame, object_frame
-from nerfcli.train.photos import Album, PixelPool, load_album
-from nerfcli.train.room import IN_MEMORY, InFiles, Needs, Room, room_for
 
 CPU = torch.device("cpu")
 CAMERA = Camera.pinhole(40, 30, 50.0)

@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from nerfcli.field.exposure import exposed
+from nerfcli.fit.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
+from nerfcli.fit.fitting import DETAILED_STEPS, Fitting
+from nerfcli.photos.pool import load_album
+from nerfcli.photos.storage import IN_MEMORY
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
-from nerfcli.train.fitting import DETAILED_STEPS, Fitting
-from nerfcli.train.photos import load_album
-from nerfcli.train.room import IN_MEMORY
-from nerfcli.train.signs import signs_of
-from nerfcli.train.trials import Start, Trials
+from nerfcli.search.diagnostics import signs_of
+from nerfcli.search.trials import Start, Trials
 
 SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
 
@@ -34,8 +34,8 @@ def trials(spheres) -> Trials:
 def start(trials) -> Iterator[Start]:
     """Early in a schedule: cells that close within a few dozen steps would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nerfcli.train.trials.FORK_SHARE", 0.02)
-        patch.setattr("nerfcli.train.fitting.CLOSING_SHARE", 1e9)
+        patch.setattr("nerfcli.search.trials.FORK_SHARE", 0.02)
+        patch.setattr("nerfcli.fit.fitting.CLOSING_SHARE", 1e9)
         yield trials.begin(Components(view=0), steps=20)
 
 

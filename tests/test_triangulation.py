@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
+from nerfcli.multiview.matching import MOST_PHOTOS, Matches, chosen_pairs, match
+from nerfcli.multiview.tracks import Tracks, places_of, tracks_of_matches
+from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import Photo
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.extent import Extent, choose_extent, lacks_depth
-from nerfcli.train.matching import MOST_PHOTOS, Matches, chosen_pairs, match
-from nerfcli.train.tracks import Tracks, places_of, tracks_of_matches
-from nerfcli.train.triangulation import triangulate
 
 CAMERA = Camera.pinhole(320, 240, 300.0)
 WALL_Z = 3.0

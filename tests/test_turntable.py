@@ -17,11 +17,11 @@ from nerfcli.doctor.examination import Diagnosis, examine
 from nerfcli.doctor.findings import LOOK
 from nerfcli.doctor.subject import find_subject
 from nerfcli.errors import UserError
-from nerfcli.poses import background as still
-from nerfcli.poses.settings import PoseSettings
-from nerfcli.poses.stationary import Motions, Stationary, motions, still_px, together
+from nerfcli.multiview.stationary import Motions, Stationary, motions, still_px, together
+from nerfcli.poses.engine.turntable import advised, sentence
+from nerfcli.poses.input import background as still
+from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
-from nerfcli.poses.turntable import advised, sentence
 from nerfcli.scale.alignment import align
 
 SIZE = (WIDE.width, WIDE.height)

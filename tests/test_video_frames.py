@@ -1,4 +1,4 @@
-"""nerfcli.poses.frame_choice and video_frames: the sharpest frame of each stretch, nothing twice, nothing lost."""
+"""poses.input.frame_choice and video_frames: the sharpest frame of each stretch, nothing twice, nothing lost."""
 
 import json
 from pathlib import Path
@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
-from nerfcli.poses.frame_choice import MOVED_SHARE, FrameMeasure, FrameMeter, MotionPicture, choose_frames
-from nerfcli.poses.pairs import capture_order
-from nerfcli.poses.video_frames import FRAMES_FILE, extract_frames, frames_folder
+from nerfcli.poses.input.frame_choice import MOVED_SHARE, FrameMeasure, FrameMeter, MotionPicture, choose_frames
+from nerfcli.poses.input.pairs import capture_order
+from nerfcli.poses.input.video_frames import FRAMES_FILE, extract_frames, frames_folder
 
 # One frame in five is sharp; each moves by 2 pixels of 160.
 SHARP = [3, 5, 13, 19, 20, 26, 34, 36]

@@ -109,8 +109,8 @@ def poses(
       ls -d captures/*/ | nerfcli poses - -o scenes/
     """
     from nerfcli.holdout import DEFAULT_HOLDOUT
-    from nerfcli.poses.pairs import PAIRINGS
-    from nerfcli.poses.settings import CAMERA_MODELS, Limits, PoseSettings
+    from nerfcli.poses.input.pairs import PAIRINGS
+    from nerfcli.poses.input.settings import CAMERA_MODELS, Limits, PoseSettings
     from nerfcli.workflows.poses import (
         estimate_poses,
         folder_of_photos,
@@ -192,7 +192,7 @@ def sizes_of(quality: str) -> tuple[int, int]:
     Raises:
         typer.BadParameter: there is none of that name.
     """
-    from nerfcli.poses.settings import QUALITIES
+    from nerfcli.poses.input.settings import QUALITIES
 
     return QUALITIES[one_of(quality, QUALITIES, "--quality")]
 
@@ -203,7 +203,7 @@ def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
     Raises:
         typer.BadParameter: not a way to use them, or there are none.
     """
-    from nerfcli.poses.cameras import USES
+    from nerfcli.poses.model.cameras import USES
 
     one_of(intrinsics_as, USES, "--intrinsics-as")
     if intrinsics_as is not None and intrinsics is None:

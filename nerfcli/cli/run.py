@@ -79,7 +79,7 @@ def run(
     from nerfcli.export.settings import OUTPUTS, ExportSettings, VideoSettings
     from nerfcli.holdout import DEFAULT_HOLDOUT
     from nerfcli.memory import default_memory_limit
-    from nerfcli.poses.settings import Limits, PoseSettings
+    from nerfcli.poses.input.settings import Limits, PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.runs.components import Components, choose
     from nerfcli.runs.settings import TrainSettings

@@ -12,7 +12,7 @@ from nerfcli.doctor.findings import Finding, as_json, worst
 from nerfcli.doctor.matching import Pair, compare, focal_px
 from nerfcli.doctor.photos import MOST_FEATURES, PhotoFacts, read_all
 from nerfcli.doctor.subject import Subject
-from nerfcli.poses.checks import Checks
+from nerfcli.poses.judge.checks import Checks
 
 # Measured on one core of a 2-core server; within a factor of two on other CPUs.
 _SECONDS_PER_PHOTO = 0.45

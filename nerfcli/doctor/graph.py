@@ -9,7 +9,7 @@ from nerfcli.doctor.consensus import connected
 from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, worst
 from nerfcli.doctor.matching import Pair
 from nerfcli.doctor.photos import PhotoFacts
-from nerfcli.poses.retrieval import alike, likeness
+from nerfcli.poses.engine.retrieval import alike, likeness
 
 # Up to here every photo is compared with every other one.
 EXHAUSTIVE_UP_TO = 60

@@ -13,8 +13,8 @@ from nerfcli.doctor.moving import Patch, moving_patches
 from nerfcli.doctor.photos import Features, PhotoFacts
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import Exif
-from nerfcli.poses.nearest import mutual_matches
-from nerfcli.poses.stationary import Motions, in_place, motions
+from nerfcli.multiview.mutual_matches import mutual_matches
+from nerfcli.multiview.stationary import Motions, in_place, motions
 
 # Of each photo so many features are compared at first; all of them where these link it to nothing.
 QUICK_FEATURES = 1000

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from nerfcli.doctor.findings import LOOK, Finding
 from nerfcli.doctor.matching import Pair
-from nerfcli.poses.stationary import LEAST_SHARE, together
+from nerfcli.multiview.stationary import LEAST_SHARE, together
 
 
 def turning_object(pairs: Sequence[Pair]) -> Finding | None:

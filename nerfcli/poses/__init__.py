@@ -1,8 +1,8 @@
 """Where the photos were taken from: structure from motion with pycolmap, in a process of its own.
 
-`structure_from_motion` is the entrance. `photos` judges the folder and `pairs` says which photos to compare.
-`supervise` runs the child process `worker` on a `job`, through `features` and `mapping`; `reasons` says why a photo
-found no place.
+`structure_from_motion` is the entrance. `input` holds what it starts from: photos, masks, pairs, and the job of the
+worker, a child process. `engine` supervises that process, finds features and maps; `model` knows lenses, pairs and
+further photos; `judge` says whether a model may be believed.
 """
 
 # pycolmap brings a zlib of its own. If that is loaded first, Pillow and OpenCV mix it with theirs, and writing a PNG

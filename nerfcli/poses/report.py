@@ -8,9 +8,9 @@ from typing import Any
 
 import nerfcli
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
-from nerfcli.poses.photos import MIN_PHOTOS, Photos
-from nerfcli.poses.reasons import Evidence, dominant, reason
-from nerfcli.poses.settings import PoseSettings
+from nerfcli.poses.input.photos import MIN_PHOTOS, Photos
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.model.reasons import Evidence, dominant, reason
 
 # Photos in other parts than the largest, as a share of all, from which on that is what is wrong with the capture.
 _MUCH_APART = 0.3

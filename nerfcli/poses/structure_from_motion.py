@@ -18,21 +18,21 @@ from nerfcli.atomic import write_json
 from nerfcli.errors import UserError
 from nerfcli.holdout import names_held_out
 from nerfcli.media.images import list_images
-from nerfcli.poses.cameras import GivenIntrinsics, Grouped, group_by_given, group_photos
-from nerfcli.poses.checks import UNDERWAY
-from nerfcli.poses.job import Job, write_job
-from nerfcli.poses.layout import lay_out
-from nerfcli.poses.masks import lay_out_masks
-from nerfcli.poses.pairs import Pairing, choose_pairs
-from nerfcli.poses.pairs_file import read_pairs
-from nerfcli.poses.photos import Photos, find_photos
-from nerfcli.poses.plan import Plan, make_plan
+from nerfcli.poses.engine.strict import held_out_last
+from nerfcli.poses.engine.supervise import WorkerDiedError, run_worker
+from nerfcli.poses.engine.turntable import MASKS, advised
+from nerfcli.poses.input.job import Job, write_job
+from nerfcli.poses.input.masks import lay_out_masks
+from nerfcli.poses.input.pairs import Pairing, choose_pairs
+from nerfcli.poses.input.pairs_file import read_pairs
+from nerfcli.poses.input.photos import Photos, find_photos
+from nerfcli.poses.input.plan import Plan, make_plan
+from nerfcli.poses.input.settings import Limits, PoseSettings, check_settings
+from nerfcli.poses.input.stages import file_key
+from nerfcli.poses.input.work_photos import lay_out
+from nerfcli.poses.judge.checks import UNDERWAY
+from nerfcli.poses.model.cameras import GivenIntrinsics, Grouped, group_by_given, group_photos
 from nerfcli.poses.report import PosesReport, closing_notes, make_report, refusal
-from nerfcli.poses.settings import Limits, PoseSettings, check_settings
-from nerfcli.poses.stages import file_key
-from nerfcli.poses.strict import held_out_last
-from nerfcli.poses.supervise import WorkerDiedError, run_worker
-from nerfcli.poses.turntable import MASKS, advised
 from nerfcli.poses.workspace import POINTS_FILE, is_in_the_making, keep_refused, publish, workspace
 
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from nerfcli.atomic import atomic_folder, clear_leftovers
 from nerfcli.exclusive import exclusive
-from nerfcli.poses.job import database_path
-from nerfcli.poses.mapped import FIRST
+from nerfcli.poses.engine.mapped import FIRST
+from nerfcli.poses.input.job import database_path
 from nerfcli.scene import SCENE_FILE
 
 _LOCK = "poses.lock"

@@ -55,9 +55,9 @@ class Model:
         unit: unit of length of the scene's own frame, "arbitrary" or "metre".
         unit_source: how a metre is known; None where nobody wrote it down.
         log_exposure: the mean of the training photos by EXIF, if the model knows photos of different exposures; see
-            `train.exif_exposure`.
+            `photos.exif_exposure`.
         exposures: of held-out photos by name, logarithms of their gains (3,) as training tells them where EXIF
-            does not; see `train.held_out_exposure`.
+            does not; see `photos.held_out_exposure`.
         sha256: of the file that it was read from.
     """
 

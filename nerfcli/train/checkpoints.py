@@ -12,16 +12,16 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import refuse_non_finite, save_tensors
 from nerfcli.field.kinds import settings_from_json
+from nerfcli.fit.extent import Extent
+from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.watch import that_must_be_finite
 from nerfcli.photos.held_out_exposure import gains_between
 from nerfcli.render.model import Model, save_model
 from nerfcli.runs.config import read_config
 from nerfcli.runs.files import FIELD, STATE
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
-from nerfcli.train.extent import Extent
-from nerfcli.train.fitting import Fitting
 from nerfcli.train.preparation import Begun, Prepared
-from nerfcli.train.watch import that_must_be_finite
 
 STATE_FORMAT = "nerfcli training 2"
 # Photos without alpha fill the frame; what the field lets through is black, and little does.

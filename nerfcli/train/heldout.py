@@ -9,12 +9,12 @@ import torch
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.background import colours_behind
 from nerfcli.field.exposure import exposed
+from nerfcli.fit.losses import over_background
 from nerfcli.photos.loading import Photo
+from nerfcli.photos.pool import PixelPool
+from nerfcli.photos.storage import IN_MEMORY, Room
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import render_rays
-from nerfcli.train.losses import over_background
-from nerfcli.train.photos import PixelPool
-from nerfcli.train.room import IN_MEMORY, Room
 
 PIXELS = 4096
 SEED = 1

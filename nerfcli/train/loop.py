@@ -13,6 +13,7 @@ from nerfcli import kernels
 from nerfcli.atomic import cannot_write
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
+from nerfcli.fit.fitting import Fitting
 from nerfcli.interrupts import held_back
 from nerfcli.runs.config import RunConfig, read_config, write_config
 from nerfcli.runs.files import FIELD, LOG, STATE
@@ -20,7 +21,6 @@ from nerfcli.runs.log import LogEntry, append_log, cut_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
-from nerfcli.train.fitting import Fitting
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.waypoints import SHARES, forget_waypoints, keep_waypoint, measure_waypoints

@@ -13,19 +13,21 @@ import torch
 from torch import Tensor
 
 from nerfcli.errors import UserError, reason_of
+from nerfcli.fit.error_map import ErrorMap
+from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
+from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.point_depth import PointDepths, PointRays, point_depths
+from nerfcli.multiview.camera_check import CameraCheck, check_cameras
+from nerfcli.multiview.correspondences import Shared
+from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
+from nerfcli.photos.pool import Album, PixelPool, load_album
+from nerfcli.photos.storage import Room, needs_of, room_for
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
-from nerfcli.train.camera_check import CameraCheck, check_cameras
-from nerfcli.train.error_map import ErrorMap
-from nerfcli.train.extent import Extent, choose_extent, lacks_depth
-from nerfcli.train.fitting import Fitting
-from nerfcli.train.photos import Album, PixelPool, load_album
-from nerfcli.train.point_depth import PointDepths, PointRays, point_depths
-from nerfcli.train.room import Room, needs_of, room_for
-from nerfcli.train.selection import (
+from nerfcli.search.selection import (
     LEARN_FOCAL,
     SEARCH_SHARE,
     Facts,
@@ -35,9 +37,7 @@ from nerfcli.train.selection import (
     with_known_cameras,
     with_points,
 )
-from nerfcli.train.shared import Shared
-from nerfcli.train.trials import Trials
-from nerfcli.train.triangulation import triangulate
+from nerfcli.search.trials import Trials
 
 # A search that has no time left has this.
 LEAST_SECONDS = 1e-3

@@ -21,11 +21,11 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
 from nerfcli.field.kinds import settings_from_json
+from nerfcli.fit.fitting import Fitting, StepResult
+from nerfcli.fit.watch import BadTensor, FirstBad, NonFiniteError, is_finite, that_must_be_finite
+from nerfcli.photos.pool import Drawn, PixelPool
 from nerfcli.render.model import Marching
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.fitting import Fitting, StepResult
-from nerfcli.train.photos import Drawn, PixelPool
-from nerfcli.train.watch import BadTensor, FirstBad, NonFiniteError, is_finite, that_must_be_finite
 
 FAILURE_FORMAT = "nerfcli failure 1"
 FAILURES = "failure-*.safetensors"

@@ -6,10 +6,10 @@ from typing import Any
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.comparison import described_cost, others_of_equal_storage
 from nerfcli.field.cost import field_bytes
+from nerfcli.photos.footprint import pixel_footprint
 from nerfcli.render.model import Model
 from nerfcli.runs.camera_moves import camera_moves
 from nerfcli.runs.run import Run
-from nerfcli.train.footprint import pixel_footprint
 from nerfcli.train.sentinel import FAILURE_FORMAT, replay
 
 

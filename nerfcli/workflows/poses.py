@@ -5,11 +5,11 @@ from pathlib import Path
 from nerfcli.convert.intrinsics import read_calibration
 from nerfcli.errors import UserError
 from nerfcli.poses import structure_from_motion
-from nerfcli.poses.cameras import USES, GivenIntrinsics
-from nerfcli.poses.plan import Outlook, Plan, duration
-from nerfcli.poses.settings import Limits, PoseSettings
+from nerfcli.poses.input.plan import Outlook, Plan, duration
+from nerfcli.poses.input.settings import Limits, PoseSettings
+from nerfcli.poses.input.video_frames import extract_frames, frames_folder
+from nerfcli.poses.model.cameras import USES, GivenIntrinsics
 from nerfcli.poses.structure_from_motion import is_same_scene, plan_poses
-from nerfcli.poses.video_frames import extract_frames, frames_folder
 from nerfcli.scene import SCENE_FILE
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 

@@ -1,0 +1,1 @@
+"""The step of a training, and its parts: losses, optimiser, cameras that learn, space, known depth."""

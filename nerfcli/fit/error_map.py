@@ -1,0 +1,89 @@
+"""Where photos are explained worst, block by block, so that more of their pixels are drawn."""
+
+import torch
+from torch import Tensor
+
+from nerfcli.photos.pool import Drawn, PixelPool
+
+BLOCK_PX = 16
+# This part of a step's pixels is drawn in proportion to the error of their block, the others anywhere.
+GUIDED_SHARE = 0.5
+# What is left of a block's error when some of its pixels are seen again.
+KEPT = 0.8
+# From this share of the budget on; before, photos are explained badly everywhere.
+BEGINS = 0.2
+UNKNOWN = -1.0
+
+
+class ErrorMap:
+    """The error of each block of the photos, as far as it has been seen, and pixels drawn by it.
+
+    A pixel p is drawn with density q(p) = (1 - g) / N + g error(p) / sum of errors, instead of 1 / N. In the loss it
+    counts 1 / (N q): the mean of the loss stays what it is, only its noise differs.
+
+    Args:
+        pool: the photos. Pixels that are not usable are replaced by any others.
+    """
+
+    def __init__(self, pool: PixelPool):
+        device = pool.sizes.device
+        self._pool = pool
+        self._rows, self._columns = (-(-pool.sizes // BLOCK_PX)).unbind(-1)
+        counts = self._rows * self._columns
+        self._first = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+        self.errors = torch.full((int(self._first[-1]),), UNKNOWN, device=device)
+        blocks = torch.arange(len(self.errors), device=device)
+        self._photo = torch.searchsorted(self._first, blocks, right=True) - 1
+        place, columns = blocks - self._first[self._photo], self._columns[self._photo]
+        self._corner = torch.stack([place // columns, place % columns], dim=-1) * BLOCK_PX  # (blocks, 2) row, column
+        self._extent = (pool.sizes[self._photo] - self._corner).clamp_max(BLOCK_PX)
+
+    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+        """`count` pixels, with what each counts in the loss."""
+        pool, device = self._pool, self.errors.device
+        guided = round(GUIDED_SHARE * count)
+        mass = self._known_errors() * self._extent.prod(-1)
+        sums = mass.double().cumsum(0)
+        uniform = torch.rand(guided, generator=generator, device=device, dtype=torch.float64)
+        blocks = torch.searchsorted(sums, uniform * sums[-1], right=True).clamp_max(len(sums) - 1)
+        inside = torch.rand(guided, 2, generator=generator, device=device)
+        row, column = (self._corner[blocks] + (inside * self._extent[blocks]).long()).unbind(-1)
+        photos = self._photo[blocks]
+        numbers = pool.first_pixel[photos] + row * pool.sizes[photos, 1] + column
+        anywhere = pool.numbers(count, generator)
+        if pool.usable is None:
+            replaced, numbers = 0.0, torch.cat([numbers, anywhere[guided:]])
+        else:
+            usable = _contains(pool.usable, numbers)
+            replaced = float((~usable).double().mean()) if guided else 0.0
+            numbers = torch.cat([torch.where(usable, numbers, anywhere[:guided]), anywhere[guided:]])
+        relative = self._known_errors()[self._blocks_of(numbers)] / sums[-1].float() * pool.usable_count
+        density = 1.0 - GUIDED_SHARE + GUIDED_SHARE * (relative + replaced)
+        return pool.rays_of(numbers)._replace(weights=1.0 / density)
+
+    def learn(self, numbers: Tensor, errors: Tensor) -> None:
+        """Take note of the errors (N,) of pixels."""
+        if self.errors[0] == UNKNOWN:
+            self.errors.fill_(errors.mean())
+        blocks = self._blocks_of(numbers)
+        sums, counts = (torch.zeros_like(self.errors) for _ in range(2))
+        sums.index_add_(0, blocks, errors)
+        counts.index_add_(0, blocks, torch.ones_like(errors))
+        seen = counts > 0
+        self.errors[seen] = KEPT * self.errors[seen] + (1.0 - KEPT) * sums[seen] / counts[seen]
+
+    def _known_errors(self) -> Tensor:
+        """The same everywhere as long as nothing is known, and never 0."""
+        return torch.where(self.errors == UNKNOWN, 1.0, self.errors.clamp_min(1e-9))
+
+    def _blocks_of(self, numbers: Tensor) -> Tensor:
+        photos = self._pool.photo_of(numbers)
+        place, width = numbers - self._pool.first_pixel[photos], self._pool.sizes[photos, 1]
+        row, column = place // width // BLOCK_PX, place % width // BLOCK_PX
+        return self._first[photos] + row * self._columns[photos] + column
+
+
+def _contains(numbers: Tensor, wanted: Tensor) -> Tensor:
+    """Which of some numbers are among others that increase."""
+    places = torch.searchsorted(numbers, wanted).clamp_max(len(numbers) - 1)
+    return numbers[places] == wanted

@@ -1,0 +1,102 @@
+"""What of space a field covers, and how: chosen for a scene before anything is learned."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.fit.normalisation import box_frame, contracted_frame, object_frame
+from nerfcli.render.model import Marching
+from nerfcli.runs.components import LEARNED_BACKGROUNDS
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene
+
+# What is infinitely far begins behind so many radii of the unit ball: what is nearer moves from photo to photo.
+BALLS_BEFORE_BACKGROUND = 1.5
+
+_IN_WORDS = {"none": "bounded scene", "l2": "unbounded scene", "linf": "unbounded scene (linf)"}
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Where a field lives.
+
+    Args:
+        contraction: one of `kernels.CONTRACTIONS`.
+        training_from_scene: the similarity to the training frame.
+        marching: the steps along rays there.
+        reach: the distance at which the last ray has left the ball that a background surrounds; None where the field
+            ends by itself.
+    """
+
+    contraction: str
+    training_from_scene: Similarity
+    marching: Marching
+    reach: float | None = None
+
+    def __str__(self) -> str:
+        return _IN_WORDS[self.contraction]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; floats survive a round trip exactly."""
+        return {
+            "contraction": self.contraction,
+            "training_from_scene": self.training_from_scene.to_json(),
+            "marching": vars(self.marching),
+            "reach": self.reach,
+        }
+
+    @staticmethod
+    def from_json(content: dict[str, Any]) -> "Extent":
+        """The extent that `to_json` described."""
+        similarity = Similarity.from_json(content["training_from_scene"])
+        return Extent(content["contraction"], similarity, Marching(**content["marching"]), content.get("reach"))
+
+    def before(self, background: str) -> "Extent":
+        """The extent with a kind of background, see `Components`: the field ends where a learned one begins.
+
+        The fog of the start would hide it for good: the field would have to paint what is infinitely far.
+        """
+        if background not in LEARNED_BACKGROUNDS or self.reach is None:
+            return self
+        return replace(self, marching=replace(self.marching, far=min(self.marching.far, self.reach)))
+
+
+def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> bool:
+    """Whether nothing tells how far away surfaces are, and a field with these settings has to know: then points have to
+    be found first.
+
+    Args:
+        scene: cameras, and points or depth bounds where it has them.
+        settings: of the training.
+        fills_frame: whether there is more in the photos than an object cut out by alpha.
+    """
+    contraction = _contraction(settings, fills_frame)
+    is_object = contraction == "none" and not fills_frame
+    return not is_object and len(scene.points) == 0 and (scene.depth_bounds is None or contraction == "none")
+
+
+def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> Extent:
+    """The extent that the settings ask for.
+
+    Args:
+        scene: cameras, and points or depth bounds; see `lacks_depth`.
+        settings: of the training.
+        fills_frame: whether there is more in the photos than an object cut out by alpha.
+
+    Raises:
+        UserError: no contraction is asked for, and there are too few points to see where the scene ends.
+    """
+    contraction = _contraction(settings, fills_frame)
+    if contraction == "none" and not fills_frame:
+        return Extent(contraction, *object_frame(scene))
+    if contraction == "none":
+        return Extent(contraction, *box_frame(scene))
+    similarity, marching = contracted_frame(scene)
+    farthest = max(float(np.linalg.norm(similarity.apply(frame.centre))) for frame in scene.frames)
+    return Extent(contraction, similarity, marching, farthest + BALLS_BEFORE_BACKGROUND)
+
+
+def _contraction(settings: TrainSettings, fills_frame: bool) -> str:
+    return settings.contraction or ("l2" if fills_frame else "none")

@@ -1,0 +1,329 @@
+"""One training: the field, its occupancy and its optimiser, advanced step by step."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerfcli.field.hash_field import HashFieldSettings
+from nerfcli.field.interface import FieldSettings
+from nerfcli.field.kinds import fresh_field
+from nerfcli.field.sizes import chosen_size
+from nerfcli.fit.error_map import BEGINS, ErrorMap
+from nerfcli.fit.losses import colour_losses, opacity_entropy
+from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
+from nerfcli.fit.parts import Parts
+from nerfcli.fit.point_depth import PointRays, fading, point_depth_loss
+from nerfcli.fit.watch import UNWATCHED, NonFiniteError, Watch
+from nerfcli.kernels import March, Rays, Targets
+from nerfcli.photos.pool import Drawn, Pool
+from nerfcli.render.model import Marching
+from nerfcli.render.occupancy import Occupancy
+from nerfcli.runs.settings import TrainSettings
+
+OCCUPANCY_SIDE = 64
+REFRESH_EVERY = 8
+REFRESH_TURNS = 8
+MOST_RAYS = 2**14
+# Steps until a step is twice as large. What many steps have gone over is learned by larger ones, which cost less for a
+# sample; a training that has few steps in all learns more from many small ones.
+DOUBLING_STEPS, MOST_DOUBLINGS = 600, 16
+# Rays of the training end where less than a thousandth of the light is left.
+DEEPEST = 7.0
+# Rays pass over cells where a step takes away less light than this: hardly any at first, when all of space is thin fog
+# and nothing tells yet where the surfaces are; then ever more, so that surfaces have to become compact.
+FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
+# Both beginnings are over at these shares of the budget at the latest, however few the steps.
+WARMUP_SHARE, CLOSING_SHARE = 0.1, 0.3
+# Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
+# Short trainings do not come to details, and learn more from more rays: their shares are those of so many steps.
+STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
+DETAILED_STEPS = 2500
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one step did: its loss, and how many samples and rays it took."""
+
+    loss: float
+    samples: int
+    rays: int
+
+
+class Fitting:
+    """The state of a training. Same seed, threads and device give the same numbers, step for step.
+
+    Args:
+        pool: the training photos.
+        marching: the steps along rays.
+        contraction: of the field.
+        settings: of the training.
+        log_gains: (photos, 3) logarithms of their exposures to start from.
+        log_focal: logarithm of the factor of focal lengths to start from, where these learn.
+        cameras_from: the share of the budget from which on cameras learn.
+        points: pixels whose distance is known.
+        error_map: where the error is, if pixels are drawn by it.
+        size: of the field; else `sizes.chosen_size` gives one for the settings and the pool.
+    """
+
+    def __init__(
+        self,
+        pool: Pool,
+        marching: Marching,
+        *,
+        contraction: str,
+        settings: TrainSettings,
+        log_gains: Tensor | None = None,
+        log_focal: float = 0.0,
+        cameras_from: float = 0.0,
+        points: PointRays | None = None,
+        error_map: ErrorMap | None = None,
+        size: FieldSettings | None = None,
+    ):
+        device = pool.colours.device
+        torch.manual_seed(settings.seed)
+        self.pool = pool
+        self.marching = marching
+        self.settings = settings
+        self.step = 0
+        # The largest share of a budget so far: a training that goes on to a larger one has used less of that.
+        self.furthest = 0.0
+        self.components = settings.components
+        if size is None:
+            size = chosen_size(
+                settings.field,
+                hash_grid=HashFieldSettings(
+                    contraction=contraction,
+                    levels=settings.levels,
+                    log2_rows=settings.log2_rows,
+                    width=settings.width,
+                    view_degree=self.components.view,
+                    antialias=self.components.antialias,
+                ),
+                footprint=pool.footprint,
+                memory_bytes=settings.field_memory_bytes,
+            )
+        self.field = fresh_field(size).to(device)
+        gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
+        self.points, self.error_map = points, error_map
+        self.parts = Parts(self.components, pool, log_gains=gains, log_focal=log_focal)
+        self._cameras_from = cameras_from
+        self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
+        self.occupied = self._open_cells()
+        self.edges = marching.edges().to(device, torch.float32)
+        self.generator = torch.Generator(device=device).manual_seed(settings.seed)
+        self.optimiser = FieldOptimiser(self.field)
+        self.parts_optimiser = PartsOptimiser(self.parts.groups())
+        self.samples_per_ray = float(len(self.edges) - 2)
+        self.rate_factor, self.rollbacks = 1.0, 0
+        self.in_step = False
+
+    def advance(self, share: float, watch: Watch = UNWATCHED) -> StepResult:
+        """One optimiser step.
+
+        Args:
+            share: how much of the budget is used, in [0, 1]; it drives the learning rate.
+            watch: is shown every tensor of the step, before and after it.
+
+        Raises:
+            NonFiniteError: the loss or a gradient of the weights is not finite. The state is then that of no step.
+        """
+        self.in_step = True
+        watch.state(self.state)
+        self.furthest = max(self.furthest, share)
+        of_cameras = max(0.0, share - self._cameras_from) / (1.0 - self._cameras_from)
+        drawn = self.parts.with_learning_rays(self.draw(share), of_cameras)
+        rays = len(drawn.origins)
+        edges = self.edges[:: self._stride(share)].contiguous()
+        loss, losses, samples = self._loss(drawn, edges=edges, share=share, watch=watch)
+        self.optimiser.zero_grad()
+        self.parts_optimiser.zero_grad()
+        if samples > 0:
+            loss.backward()
+        self._check_finite(loss, drawn, watch)
+        rate = self.learning_rate(share)
+        self.step += 1
+        self.optimiser.step(self.step, rate)
+        self.parts_optimiser.step(rate)
+        self.parts.step_cameras(drawn, losses, of_cameras, factor=self.rate_factor)
+        self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
+        watch.state(self.state)
+        self.in_step = False
+        return StepResult(loss=loss.item(), samples=samples, rays=rays)
+
+    def draw(self, share: float) -> Drawn:
+        """The pixels of the next step, after looking at what fills space if it is time."""
+        settings = self.settings
+        if self.step % REFRESH_EVERY == 0:
+            self._refresh_occupancy()
+        growth = 2.0 ** min(self.step / DOUBLING_STEPS, MOST_DOUBLINGS)
+        wanted = min(settings.samples_per_step, growth * settings.first_samples_per_step)
+        rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
+        source = self.pool if self.error_map is None or self.furthest < BEGINS else self.error_map
+        drawn = source.draw(rays, self.generator)
+        if self.points is None or fading(share) == 0.0:
+            return drawn
+        return self.points.added_to(drawn, self.generator)
+
+    def _stride(self, share: float) -> int:
+        """How many of the shortest steps along rays are taken as one."""
+        share = min(share, self.step / DETAILED_STEPS)
+        return next(stride for until, stride in STRIDES if share <= until)
+
+    def smaller_steps(self) -> None:
+        """Halve the learning rate from here on, as numbers became non-finite."""
+        self.rate_factor /= 2
+        self.rollbacks += 1
+
+    def learning_rate(self, share: float) -> float:
+        """Linear warm-up, then an exponential from the first to the final rate over the budget."""
+        settings = self.settings
+        decay = math.log(settings.final_learning_rate / settings.learning_rate)
+        warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, share / WARMUP_SHARE))
+        return self.rate_factor * settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
+
+    def _loss(self, drawn: Drawn, *, edges: Tensor, share: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
+        """Loss over some rays, that of the colour of each, and the number of samples it took."""
+        count, components, device = len(drawn.origins), self.components, drawn.origins.device
+        jitter = torch.rand(count, generator=self.generator, device=device)
+        background = self.parts.behind(count, self.generator)
+        seen = self.field.backend.render_rays(
+            Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
+            self._march(edges),
+            self.field.medium(self._detail),
+            Targets(components.near, bool(components.distortion), drawn.distances),
+            background=background,
+            sink=self.optimiser.sink,
+            trace=watch.rows,
+        )
+        losses = colour_losses(*self.parts.compared(seen.rgb, seen.transmittance, drawn, behind=background))
+        if self.error_map is not None:
+            self.error_map.learn(drawn.numbers, losses.detach())
+        loss = (losses * drawn.weights if len(drawn.weights) else losses).mean()
+        if components.distortion:
+            loss = loss + components.distortion * (seen.distortion.sum() / max(1, count))
+        if components.entropy:
+            loss = loss + components.entropy * opacity_entropy(seen.transmittance)
+        if len(drawn.distances):
+            loss = loss + components.points * fading(share) * point_depth_loss(seen.off_target, drawn.trust)
+        watch.rows("rendered colour", seen.rgb, torch.arange(count, device=device))
+        watch.values("loss", loss)
+        return loss, losses.detach(), int(seen.samples)
+
+    @torch.no_grad()
+    def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
+        """What the model says of pixels now, in steps as it learns in, and what the photos say; both (N, 3) sRGB, alpha
+        on white."""
+        drawn = self.parts.refined(drawn)
+        behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)
+        edges = self.edges[:: self._stride(self.furthest)].contiguous()
+        rendered, transmittance = self._seen(drawn, edges=edges, behind=behind)
+        return self.parts.compared(rendered, transmittance, drawn, behind=behind)
+
+    @torch.no_grad()
+    def light_from_beyond(self, drawn: Drawn, *, distance: float) -> Tensor:
+        """(N,) the shares of the light of pixels that come from farther away than a distance, as the field is now."""
+        drawn = self.parts.refined(drawn)
+        edges = self.edges[:: self._stride(self.furthest)].contiguous()
+        near = edges[: max(2, int(torch.searchsorted(edges, distance, right=True)))]
+        return self._seen(drawn, edges=near, behind=torch.zeros_like(drawn.origins))[1]
+
+    def _seen(self, drawn: Drawn, *, edges: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3) colours of rays that step from edge to edge, on what is behind, and (N,) what passes through."""
+        jitter = torch.full_like(drawn.origins[:, 0], 0.5)
+        seen = self.field.backend.render_rays(
+            Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
+            self._march(edges),
+            self.field.medium(self._detail),
+            background=behind,
+        )
+        return seen.rgb, seen.transmittance
+
+    @property
+    def _detail(self) -> float:
+        """The share of the budget whose details the field has: late cameras meet a field that has its detail."""
+        return self.furthest if self._cameras_from > 0.0 else self.parts.share_of_detail(self.furthest)
+
+    def _march(self, edges: Tensor) -> March:
+        return March(edges, self.occupied, self.field.settings.contraction, DEEPEST)
+
+    def _cones(self, drawn: Drawn) -> Tensor | None:
+        """Widths of pixels per distance, where they matter."""
+        return self.pool.cones[self.pool.photo_of(drawn.numbers)] if self.components.antialias else None
+
+    def _refresh_occupancy(self) -> None:
+        # The whole grid once, after a warm-up in which everything is open; then a share at a time.
+        if self.step == 0:
+            return
+        turn = self.step // REFRESH_EVERY
+        self.occupancy.refresh(
+            self.field,
+            detail=self._detail,
+            cells=slice(None) if turn == 1 else slice(turn % REFRESH_TURNS, None, REFRESH_TURNS),
+            shortest_step=self.marching.shortest_step,
+            growth=self.marching.growth,
+            generator=self.generator,
+        )
+        self.occupied = self._open_cells()
+
+    def _open_cells(self) -> Tensor:
+        """The cells that rays look into: those that take away more light than the threshold of this step."""
+        closed = min(1.0, max(self.step / self.field.closing_steps, self.furthest / CLOSING_SHARE))
+        threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
+        return self.occupancy.above(threshold)
+
+    def _check_finite(self, loss: Tensor, drawn: Drawn, watch: Watch) -> None:
+        total = loss.detach()
+        rays = {"origins of rays": drawn.origins.grad, "directions of rays": drawn.directions.grad}
+        of_rays = {name: gradient for name, gradient in rays.items() if gradient is not None}
+        for name, gradient in {**self.optimiser.gradients(), **self.parts.gradients(), **of_rays}.items():
+            watch.values(f"gradient of {name}", gradient)
+            total = total + gradient.sum()  # which is non-finite if any term is
+        if self.optimiser.sink is not None:
+            watch.values("gradient of rows", self.optimiser.sink)
+        if not math.isfinite(total.item()):
+            raise NonFiniteError
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything that `restore` needs to go on bit for bit."""
+        tensors = {
+            **{f"field.{name}": tensor for name, tensor in self.field.state_dict().items()},
+            "generator": self.generator.get_state(),
+            **self.occupancy.state(),
+            "occupied": self.occupied,
+            **self.optimiser.state(),
+        }
+        tensors.update({f"parts.{name}": value for name, value in self.parts.state_dict().items()})
+        tensors.update(self.parts_optimiser.state())
+        if self.error_map is not None:
+            tensors["error_map"] = self.error_map.errors
+        return tensors, {
+            "field": self.field.settings.to_json(),
+            "step": self.step,
+            "samples_per_ray": self.samples_per_ray,
+            "rate_factor": self.rate_factor,
+            "rollbacks": self.rollbacks,
+            "furthest": self.furthest,
+        }
+
+    def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
+        """Take up what `state` gave."""
+        self.field.load_state_dict(
+            {name.removeprefix("field."): value for name, value in tensors.items() if name.startswith("field.")}
+        )
+        self.generator.set_state(tensors["generator"].cpu())
+        self.occupancy.restore(tensors)
+        self.optimiser.restore(tensors)
+        self.parts.load_state_dict({name: tensors[f"parts.{name}"] for name in self.parts.state_dict()})
+        self.parts_optimiser.restore(tensors)
+        if self.error_map is not None:
+            self.error_map.errors = tensors["error_map"]
+        self.step = description["step"]
+        self.samples_per_ray = description["samples_per_ray"]
+        self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]
+        self.furthest = description.get("furthest", 1.0)  # all details used to learn from the start
+        self.in_step = False
+        # Not opened anew: the threshold moves between two refreshes, the open cells do not.
+        self.occupied = tensors["occupied"]

@@ -1,0 +1,95 @@
+"""Adam for a field: on all parameters that take part in every sample, and on the rows that a step has touched."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nerfcli.field.interface import Field
+from nerfcli.fit.adam import BETAS, EPS, Adam
+
+
+class FieldOptimiser:
+    """Adam's moments for a field's rows and weights.
+
+    `sink` collects the gradient of the rows: it is made once, given to `Backend.render_rays`, and empty again
+    after each step. None for a field without rows.
+    """
+
+    def __init__(self, field: Field):
+        self._field = field
+        rows = field.rows()
+        self._weights = {name: parameter for name, parameter in field.named_parameters() if parameter is not rows}
+        self._adam = Adam(self._weights.values())
+        self.sink = self._first = self._second = None
+        if rows is not None:
+            self.sink, self._first, self._second = (torch.zeros_like(rows, requires_grad=False) for _ in range(3))
+
+    def zero_grad(self) -> None:
+        """Forget the gradients of the weights; those of the rows went with the step that used them."""
+        self._adam.zero_grad()
+
+    def gradients(self) -> dict[str, Tensor]:
+        """By name, those through which everything comes that could be non-finite: the rows' only without weights."""
+        if not self._weights and self.sink is not None:
+            return {"rows": self.sink}
+        return {name: weight.grad for name, weight in self._weights.items() if weight.grad is not None}
+
+    def step(self, number: int, rate: float) -> None:
+        """Step `number`, from 1, at a learning rate."""
+        rate = rate * self._field.rate_factor
+        self._adam.step(rate)
+        rows = self._field.rows()
+        if rows is not None and self.sink is not None and self._first is not None and self._second is not None:
+            self._field.backend.adam_rows(
+                rows, self.sink, self._first, self._second, step=number, rate=rate, betas=BETAS, eps=EPS
+            )
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs; the field's own numbers are not in it."""
+        tensors: dict[str, Tensor] = {}
+        if self._first is not None and self._second is not None:
+            tensors |= {"table_first": self._first, "table_second": self._second}
+        return tensors | self._adam.state("adam")
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take up what `state` gave; other tensors may stand beside it."""
+        if self._first is not None:
+            self._first, self._second = tensors["table_first"], tensors["table_second"]
+        if self.sink is not None:
+            self.sink.zero_()  # a step may have ended before it was used
+        self._adam.restore(tensors, "adam")
+
+
+class PartsOptimiser:
+    """Adam for what is learned besides the field.
+
+    Args:
+        groups: "params" and, as "multiple", their learning rate as a multiple of the field's.
+    """
+
+    def __init__(self, groups: Sequence[dict[str, Any]]):
+        self._groups = [(Adam(group["params"]), group["multiple"]) for group in groups]
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for adam, _ in self._groups:
+            adam.zero_grad()
+
+    def step(self, rate: float) -> None:
+        """One step at multiples of a learning rate."""
+        for adam, multiple in self._groups:
+            adam.step(rate * multiple)
+
+    def state(self) -> dict[str, Tensor]:
+        """What `restore` needs; the parts' own numbers are not in it."""
+        tensors: dict[str, Tensor] = {}
+        for number, (adam, _) in enumerate(self._groups):
+            tensors |= adam.state(f"parts_adam.{number}")
+        return tensors
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Take up what `state` gave; other tensors may stand beside it."""
+        for number, (adam, _) in enumerate(self._groups):
+            adam.restore(tensors, f"parts_adam.{number}")

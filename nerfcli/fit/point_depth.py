@@ -1,0 +1,118 @@
+"""Depth that is known before training: points that several photos saw, in each of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.cameras.rigid import Similarity, apply, inverse
+from nerfcli.multiview.tracks import Tracks, places_of
+from nerfcli.multiview.triangulation import triangulate
+from nerfcli.photos.pool import Drawn, PixelPool
+
+# Until this share of the budget the points count less and less; photos tell more than points once there are surfaces.
+LAST_SHARE = 0.5
+# One keypoint is drawn for so many other pixels.
+PIXELS_PER_POINT = 8
+# Miss at which a point counts half, in pixels of the training photo.
+HALF_ERROR_PX = 1.0
+
+
+@dataclass(frozen=True)
+class PointDepths:
+    """Pixels whose surface is known: M of them.
+
+    Args:
+        numbers: (M,) int64, pixels of the pool.
+        distances: (M,) along their rays, training frame.
+        trust: (M,) in (0, 1].
+    """
+
+    numbers: Tensor
+    distances: Tensor
+    trust: Tensor
+
+    def among(self, pool: PixelPool) -> "PointDepths":
+        """Those at usable pixels of a pool."""
+        usable = pool.is_usable(self.numbers)
+        return PointDepths(self.numbers[usable], self.distances[usable], self.trust[usable])
+
+    def draw(self, count: int, generator: torch.Generator) -> "PointDepths":
+        """`count` of them at random, with replacement."""
+        chosen = torch.randint(len(self.numbers), (count,), generator=generator, device=self.numbers.device)
+        return PointDepths(self.numbers[chosen], self.distances[chosen], self.trust[chosen])
+
+
+class PointRays:
+    """Known pixels among those that a step draws.
+
+    Args:
+        known: the pixels.
+        pool: what they are pixels of.
+    """
+
+    def __init__(self, known: PointDepths, pool: PixelPool):
+        self.known = known
+        self._pool = pool
+
+    def added_to(self, drawn: Drawn, generator: torch.Generator) -> Drawn:
+        """The pixels drawn, and known ones behind them. Their colours count like all others."""
+        chosen = self.known.draw(max(1, len(drawn.numbers) // PIXELS_PER_POINT), generator)
+        both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
+        weights = drawn.weights
+        if len(weights):
+            weights = torch.cat([weights, torch.ones_like(chosen.distances)])
+        return both._replace(distances=chosen.distances, trust=chosen.trust, weights=weights)
+
+
+def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
+    """Where points that photos agree on are seen, at usable pixels; none where nothing is known.
+
+    trust = 1 / (1 + (miss / 1 px)^2), in pixels of the training photos
+
+    Args:
+        tracks: what the pool's photos saw.
+        pool: the training photos.
+        training_from_scene: the normalisation.
+    """
+    surface = triangulate(pool.frames, tracks)
+    kept = np.flatnonzero(np.isfinite(surface.misses_px))
+    numbers = np.full(len(kept), -1)
+    by_photo = places_of(tracks.photos[kept], len(pool.frames))
+    for photo, (frame, own) in enumerate(zip(pool.frames, by_photo, strict=True)):
+        points = surface.points[tracks.points[kept[own]]]
+        pixels, valid = frame.camera.project(apply(inverse(frame.world_from_cam), points))
+        width, height = frame.camera.width, frame.camera.height
+        shown = valid & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
+        column, row = np.floor(pixels[shown]).astype(np.int64).T
+        numbers[own[shown]] = int(pool.first_pixel[photo]) + row * width + column
+    inside = numbers >= 0
+    kept = kept[inside]
+    centres = np.array([frame.centre for frame in pool.frames])[tracks.photos[kept]]
+    distances = np.linalg.norm(surface.points[tracks.points[kept]] - centres, axis=1) * training_from_scene.scale
+    trust = 1.0 / (1.0 + (surface.misses_px[kept] / HALF_ERROR_PX) ** 2)
+    device = pool.colours.device
+    return PointDepths(
+        torch.from_numpy(numbers[inside]).to(device),
+        torch.from_numpy(distances).to(device, torch.float32),
+        torch.from_numpy(trust).to(device, torch.float32),
+    ).among(pool)
+
+
+def fading(share: float) -> float:
+    """How much the points count at a share of the budget: 1 at the start, 0 from `LAST_SHARE` on, a line between."""
+    return max(0.0, 1.0 - share / LAST_SHARE)
+
+
+def point_depth_loss(off_target: Tensor, trust: Tensor) -> Tensor:
+    """Mean over the rays of points of how far from them light ends, each as far as it is trusted.
+
+    Args:
+        off_target: (K,) see `reference.off_target`.
+        trust: (K,) in (0, 1].
+
+    Returns:
+        Scalar in [0, 1]. Differentiable in `off_target`.
+    """
+    return (trust * off_target).mean()

@@ -1,0 +1,322 @@
+"""Cameras that learn with the field: the poses of the training photos, and the lenses that took them.
+
+The loss says how it would change with the origins and directions of a step's rays; from there it is a closed form to
+the turns and moves of the photos and to the lenses.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.lens_change import FOCAL, bearings_by_change, changeable, changed, pixels_by_change
+from nerfcli.cameras.rigid import from_parts, transform_from_twist, vector_from_rotation
+from nerfcli.fit.gauge import relative_motions, without_mean
+from nerfcli.fit.newton import NewtonSteps
+from nerfcli.fit.whitening import WhitenedAdam, whitening
+from nerfcli.photos.pool import Drawn, Pool
+
+# Points that stand for what a camera sees: so many pixels along each side, at these multiples of the distance to the
+# middle of the training frame.
+_PIXELS_A_SIDE = 6
+_DISTANCES = (2 / 3, 1.0, 2.0)
+# A camera in the middle sees what is at least so far away.
+_LEAST_DISTANCE = 0.2
+# Radians that a whitened step of a lens moves the picture by, at most.
+LENS_RATE = 3e-4
+# Radians that a step of a pose moves the picture by, at most.
+_FARTHEST_STEP = 2e-3
+# Until the first share of the budget there is fog, from which cameras learn nothing; the rate rises up to the second.
+# From the third on it falls, down to a last rate, so that the steps' noise averages out and the field can settle.
+FIRST_SHARE, FULL_SHARE, FALLING_SHARE, LAST_SHARE, LAST_RATE = 0.1, 0.15, 0.5, 0.98, 0.03
+# A turn and a move look much alike, and a young field tells them apart wrongly: what a photo is not sure of is damped
+# at first, and less from share to share.
+DAMPING_SHARES, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
+# Then cameras are held, see `NewtonSteps.change`; not before it is known what was wrong with them.
+HOLDING_SHARES, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
+
+
+def rate_at(share: float) -> float:
+    """The rate of cameras at a share of the budget, in [0, 1]: a line up, then level, then an exponential down."""
+    if not FIRST_SHARE < share < LAST_SHARE:
+        return 0.0
+    if share < FULL_SHARE:
+        return (share - FIRST_SHARE) / (FULL_SHARE - FIRST_SHARE)
+    return _between(share, (FALLING_SHARE, LAST_SHARE), (1.0, LAST_RATE))
+
+
+def _between(share: float, shares: tuple[float, float], values: tuple[float, float]) -> float:
+    """The first value up to the first share, the second from the second on, and an exponential in between."""
+    return float(np.exp(np.interp(share, shares, np.log(values))))
+
+
+class PoseRefinement(nn.Module):
+    """The poses of P photos: `motions` (P, 4, 4) is `given_from_refined`, in the axes of each camera; a small twist x
+    (6,) moves what a camera sees by sqrt(x^T `picture` x) radians, root mean square.
+
+    Args:
+        poses: (P, 4, 4) `world_from_cam` as given, training frame.
+        cameras: of the photos.
+    """
+
+    def __init__(self, poses: np.ndarray, cameras: Sequence[Camera]):
+        super().__init__()
+        self._given = poses
+        self.motions: Tensor
+        self.register_buffer("motions", torch.eye(4, dtype=torch.float64).repeat(len(poses), 1, 1))
+        at_one = {camera: _picture_by_twist(camera) for camera in dict.fromkeys(cameras)}
+        distances = np.linalg.norm(poses[:, :3, 3], axis=1).clip(_LEAST_DISTANCE)
+        # What a move changes becomes less with the distance, what a turn changes does not.
+        jacobians = [
+            at_one[camera] * np.array([1 / distance] * 3 + [1.0] * 3)
+            for camera, distance in zip(cameras, distances, strict=True)
+        ]
+        squares = np.array([jacobian.T @ jacobian for jacobian in jacobians])
+        self.picture = torch.from_numpy(squares)
+        focal = np.array([camera.focal_px for camera in cameras])
+        picture_px = focal[:, None] ** 2 * np.diagonal(squares, axis1=1, axis2=2)
+        self.newton = NewtonSteps(len(poses), torch.from_numpy(picture_px))
+
+    def poses(self) -> np.ndarray:
+        """(P, 4, 4) `world_from_cam` now."""
+        return self._given @ self.motions.numpy()
+
+    def moved(self, origins: Tensor, directions: Tensor, photos: Tensor) -> tuple[Tensor, Tensor]:
+        """Rays (R, 3) of the poses as given, as they are now; `photos` (R,) are theirs."""
+        now = self.poses()
+        turns = now[:, :3, :3] @ np.swapaxes(self._given[:, :3, :3], -1, -2)
+        turn = torch.from_numpy(turns).to(directions)[photos]
+        # A photo that has not moved keeps its rays to the last bit.
+        shift = torch.from_numpy(now[:, :3, 3] - self._given[:, :3, 3]).to(origins)[photos]
+        return origins + shift, (turn * directions[:, None, :]).sum(-1)
+
+    def gradients(self, directions: Tensor, photos: Tensor, *, by_origin: Tensor, by_direction: Tensor) -> Tensor:
+        """(R, 6) by twists of the rays' cameras in their own axes, from gradients (R, 3) by rays as they are now, all
+        float64.
+
+        A camera that moves by u and turns by w in its axes moves its rays by R u, and turns them by R w.
+        """
+        torque = torch.linalg.cross(directions, by_direction)
+        cam_from_world = torch.from_numpy(self.poses()[:, :3, :3]).transpose(-1, -2)[photos]
+        return (cam_from_world @ torch.stack([by_origin, torque], dim=-1)).transpose(-1, -2).flatten(-2)
+
+    def step(self, gradients: Tensor, losses: Tensor, photos: Tensor, share: float, *, rate: float) -> None:
+        """A step against gradients (R, 6) of losses (R,) of rays; afterwards the mean similarity of all moves is taken
+        out.
+
+        Args:
+            gradients, losses: of each ray by itself.
+            photos: (R,) whose rays they are.
+            share: of the budget.
+            rate: in [0, 1], of the step that would be the whole way.
+        """
+        so_far = self.motions.numpy()
+        so_far = np.concatenate([so_far[:, :3, 3], vector_from_rotation(so_far[:, :3, :3])], axis=1)
+        twists = rate * self.newton.change(
+            self.newton.learn(gradients, losses, photos),
+            torch.from_numpy(so_far),
+            damping=_between(share, DAMPING_SHARES, DAMPINGS),
+            holding=_between(share, HOLDING_SHARES, HOLDINGS) if share > HOLDING_SHARES[0] else 0.0,
+        )
+        seen = (twists[:, None] @ self.picture @ twists[..., None])[..., 0].sqrt()  # (P, 1) radians
+        twists = (twists * (_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP))).numpy()
+        moved = without_mean(self._given, self.poses() @ transform_from_twist(twists))
+        self.motions.copy_(torch.from_numpy(relative_motions(self._given, moved)))
+
+
+class LensRefinement(nn.Module):
+    """The lenses of some cameras: `values` (C, K) are changes by `names` (K,); what a camera has not stays 0.
+
+    Args:
+        pool: the photos, with their cameras as given.
+        names: what may change, of `lens_change.changeable`.
+        log_focal: what "focal" starts from.
+    """
+
+    def __init__(self, pool: Pool, names: tuple[str, ...], log_focal: float):
+        super().__init__()
+        self._cameras = tuple(dict.fromkeys(pool.cameras))
+        number = {camera: index for index, camera in enumerate(self._cameras)}
+        self._camera_of = torch.tensor([number[camera] for camera in pool.cameras])
+        self._widths = torch.tensor([camera.width for camera in pool.cameras])
+        self._first_pixel = pool.first_pixel.cpu()
+        self._turns = pool.poses[:, :3, :3].double().cpu()
+        self._names = names
+        self._own = [tuple(name for name in names if name in changeable(camera)) for camera in self._cameras]
+        self.values: Tensor
+        self.register_buffer("values", torch.zeros(len(self._cameras), len(names), dtype=torch.float64))
+        for index, own in enumerate(self._own):
+            if FOCAL in own:
+                self.values[index, names.index(FOCAL)] = log_focal
+        self.adam = WhitenedAdam(np.array([self._whitening(index) for index in range(len(self._cameras))]))
+
+    def changed(self, camera: Camera, photo: int) -> Camera:
+        """The camera of a photo as it is now; the picture of `camera` may be of another size."""
+        return self._changed(camera, int(self._camera_of[photo]))
+
+    def _now(self, index: int) -> Camera:
+        return self._changed(self._cameras[index], index)
+
+    def _changed(self, camera: Camera, index: int) -> Camera:
+        own = [self._names.index(name) for name in self._own[index]]
+        return changed(camera, self._own[index], self.values[index, own].numpy())
+
+    def directions(self, drawn: Drawn, photos: Tensor) -> Tensor:
+        """(R, 3) those of the poses as given, through the lenses as they are now."""
+        numbers, photos = drawn.numbers.cpu(), photos.cpu()
+        directions = drawn.directions.cpu().clone()
+        for index, rays, pixels in self._by_camera(numbers, photos):
+            bearings, valid = self._now(index).bearings(pixels)
+            there = rays[torch.from_numpy(valid)]  # elsewhere the lens as given is better than none
+            turned = self._turns[photos[there]] @ torch.from_numpy(bearings[valid])[..., None]
+            directions[there] = turned[..., 0].to(directions.dtype)
+        return directions.to(drawn.directions.device)
+
+    def gradient(self, numbers: Tensor, photos: Tensor, *, turns: Tensor, by_direction: Tensor) -> Tensor:
+        """(C, K) by the changes, from gradients (R, 3) by directions; `turns` (P, 3, 3) are the photos' rotations."""
+        gradient = torch.zeros_like(self.values)
+        for index, rays, pixels in self._by_camera(numbers, photos):
+            names = self._own[index]
+            by_change = torch.from_numpy(bearings_by_change(self._now(index), names, pixels))
+            by_bearing = turns[photos[rays]].transpose(-1, -2) @ by_direction[rays][..., None]
+            gradient[index, [self._names.index(name) for name in names]] = (by_change * by_bearing).sum((0, 1))
+        return gradient
+
+    def step(self, gradient: Tensor, rate: float) -> None:
+        """One step against a gradient (C, K)."""
+        self.values += self.adam.change(gradient, rate)
+
+    def _by_camera(self, numbers: Tensor, photos: Tensor) -> list[tuple[int, Tensor, np.ndarray]]:
+        """The cameras among the photos (R,) that can change: number, rays (N,) and their pixels (N, 2)."""
+        of = self._camera_of[photos]
+        found = []
+        for index in of.unique().tolist():
+            if not self._own[index]:
+                continue
+            rays = (of == index).nonzero()[:, 0]
+            place = numbers[rays] - self._first_pixel[photos[rays]]
+            width = self._widths[photos[rays]]
+            pixels = torch.stack([place % width, place // width], dim=-1).double() + 0.5
+            found.append((index, rays, pixels.numpy()))
+        return found
+
+    def _whitening(self, index: int) -> np.ndarray:
+        matrix = np.eye(len(self._names))
+        if own := [self._names.index(name) for name in self._own[index]]:
+            camera = self._cameras[index]
+            _, by_parameters, _ = camera.project_jacobian(_points(camera))
+            by_change = pixels_by_change(camera, self._own[index], by_parameters)
+            matrix[np.ix_(own, own)] = whitening(_per_point(by_change, camera))
+        return matrix
+
+
+class Refinement(nn.Module):
+    """The cameras of the training photos as they are now.
+
+    Args:
+        kind: "poses", "focal", or "all": poses, focal lengths and distortion.
+        pool: the training photos.
+        log_focal: logarithm of the factor of focal lengths to start from, where these learn.
+    """
+
+    def __init__(self, kind: str, pool: Pool, log_focal: float = 0.0):
+        super().__init__()
+        self._pool = pool
+        self._given = pool.poses.double().cpu().numpy()
+        self.poses = PoseRefinement(self._given, pool.cameras) if kind in ("poses", "all") else None
+        names = [(FOCAL,)] if kind == "focal" else [changeable(camera) for camera in pool.cameras if kind == "all"]
+        listed = tuple(dict.fromkeys(name for own in names for name in own))
+        self.lenses = LensRefinement(pool, listed, log_focal) if listed else None
+
+    @torch.no_grad()
+    def refined(self, drawn: Drawn) -> Drawn:
+        """The same pixels, with the rays of the cameras as they are now."""
+        photos = self._pool.photo_of(drawn.numbers)
+        origins, directions = drawn.origins, drawn.directions
+        if self.lenses is not None:
+            directions = self.lenses.directions(drawn, photos)
+        if self.poses is not None:
+            origins, directions = self.poses.moved(origins, directions, photos)
+        return drawn._replace(origins=origins, directions=directions)
+
+    @torch.no_grad()
+    def step(self, drawn: Drawn, losses: Tensor, share: float, *, factor: float) -> None:
+        """One step against the gradients of the mean loss of `drawn`, which `refined` gave.
+
+        Args:
+            drawn: rays that have gradients.
+            losses: (R,) of each.
+            share: of the budget, for `rate_at`.
+            factor: of the rate.
+        """
+        by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * rate_at(share)
+        if rate == 0.0 or by_origin is None or by_direction is None:
+            return
+        photos, numbers = self._pool.photo_of(drawn.numbers).cpu(), drawn.numbers.cpu()
+        directions, by_origin, by_direction = (t.double().cpu() for t in (drawn.directions, by_origin, by_direction))
+        given = self._given if self.poses is None else self.poses.poses()
+        turns = torch.from_numpy(given[:, :3, :3])
+        # Both gradients first: they are of the rays as they were.
+        by_lens = None
+        if self.lenses is not None:
+            by_lens = self.lenses.gradient(numbers, photos, turns=turns, by_direction=by_direction)
+        if self.poses is not None:
+            by_pose = self.poses.gradients(directions, photos, by_origin=by_origin, by_direction=by_direction)
+            self.poses.step(len(by_pose) * by_pose, losses.double().cpu(), photos, share, rate=rate)
+        if self.lenses is not None and by_lens is not None:
+            self.lenses.step(by_lens, LENS_RATE * rate)
+
+    def frames(
+        self, training: Sequence[Frame], held_out: Sequence[Frame], *, scale: float
+    ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+        """Both sets, refined: the poses of training photos, and the lenses of all photos that were taken with them.
+
+        Nothing of a held-out photo enters: it has the pose that it had, and a lens that training photos have told.
+
+        Args:
+            training: of the photos of the pool, in its order; their pictures may be of another size.
+            held_out: others, of the same size as `training`.
+            scale: of the training frame, in units of it per scene unit.
+        """
+        lens_of = {frame.camera: self._lens(index, frame.camera) for index, frame in enumerate(training)}
+
+        def refined(frame: Frame, pose: np.ndarray) -> Frame:
+            return replace(frame, camera=lens_of.get(frame.camera, frame.camera), world_from_cam=pose)
+
+        poses = [frame.world_from_cam for frame in training]
+        if self.poses is not None:
+            motions = self.poses.motions.numpy()
+            motions = from_parts(motions[:, :3, :3], motions[:, :3, 3] / scale)
+            poses = [pose @ motion for pose, motion in zip(poses, motions, strict=True)]
+        return (
+            tuple(refined(frame, pose) for frame, pose in zip(training, poses, strict=True)),
+            tuple(refined(frame, frame.world_from_cam) for frame in held_out),
+        )
+
+    def _lens(self, photo: int, camera: Camera) -> Camera:
+        return camera if self.lenses is None else self.lenses.changed(camera, photo)
+
+
+def _picture_by_twist(camera: Camera) -> np.ndarray:
+    """(2 M, 6) how points at the usual distances move in a camera that moves by a twist, in radians, per point."""
+    points = _points(camera)
+    by_point, _, _ = camera.project_jacobian(points)
+    # In the camera, a point x moves by -u - w x x, and a . (x x w) = w . (a x x).
+    by_turn = np.cross(by_point, points[:, None, :])
+    return _per_point(np.concatenate([-by_point, by_turn], axis=-1), camera)
+
+
+def _points(camera: Camera) -> np.ndarray:
+    """(M, 3) in the camera's axes, where it has a direction."""
+    x, y = ((np.arange(_PIXELS_A_SIDE) + 0.5) / _PIXELS_A_SIDE * side for side in (camera.width, camera.height))
+    bearings, valid = camera.bearings(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    return np.concatenate([bearings[valid] * distance for distance in _DISTANCES])
+
+
+def _per_point(by_parameters: np.ndarray, camera: Camera) -> np.ndarray:
+    """(2 M, K) radians per root of the number of points, from (M, 2, K) pixels."""
+    return by_parameters.reshape(-1, by_parameters.shape[-1]) / (camera.focal_px * np.sqrt(len(by_parameters)))

@@ -1,0 +1,129 @@
+"""Whether the cameras that a scene gives fit its photos, by what two photos have in common.
+
+A field that learns the world through a lens of the wrong length learns a world that is bent to fit, and its residuals
+tell little of it. Matched features do: the ray of one photo lies in the plane that the ray of the other spans with the
+line between both cameras, whatever the depth.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras.lens_change import FOCAL, changeable, changed
+from nerfcli.multiview.matching import Matches, radians_per_pixel
+from nerfcli.photos.loading import Photo
+
+# Logarithms of factors of the focal length that are looked at: a wrong unit or crop is off by more, and every photo
+# shows it.
+FARTHEST, COARSE, FINE = 0.1, 0.01, 0.001
+# A miss of so many pixels counts half of what it would: larger ones are wrong matches more and more.
+MISS_PX = 1.0
+# Fewer matches, or pairs of photos, tell nothing.
+FEWEST_MATCHES, FEWEST_PAIRS = 60, 10
+MOST_MATCHES = 4000
+# The jackknife leaves out one of so many parts of the photos at a time.
+PARTS = 10
+# Factors for which rays are computed; between them they are interpolated, to 1e-6 rad.
+NODES = FARTHEST * np.cos(np.pi * (np.arange(6) + 0.5) / 6)
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """What matches say of the cameras.
+
+    Args:
+        log_focal: all focal lengths should be exp of this times as long.
+        error: its standard error; infinite where no length within reach is best.
+        misses_px: median distances of features from their lines, as given and with the factor.
+        matches: how many there are.
+    """
+
+    log_focal: float
+    error: float
+    misses_px: tuple[float, float]
+    matches: int
+
+
+def check_cameras(photos: Sequence[Photo], matched: Sequence[Matches]) -> CameraCheck | None:
+    """What matches say of the cameras; None where there are too few.
+
+    The factor has the least sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
+    photos: a wrong pose moves all matches of a photo alike.
+
+    Args:
+        photos: to train on.
+        matched: what they have in common; some of it may be wrong.
+    """
+    usable = [
+        matches
+        for matches in matched
+        if all(FOCAL in changeable(photos[index].frame.camera) for index in matches.photos)
+    ]
+    count = sum(len(matches.pixels[0]) for matches in usable)
+    if count < FEWEST_MATCHES or len(usable) < FEWEST_PAIRS:
+        return None
+    every = -(-count // MOST_MATCHES)
+    pairs = [_Pair(photos, matches, every) for matches in usable]
+
+    def costs(places: np.ndarray) -> np.ndarray:
+        """(places, pairs)"""
+        return np.array([[np.log1p(np.square(pair.misses(place))).sum() for pair in pairs] for place in places])
+
+    coarse = np.arange(-FARTHEST, FARTHEST + COARSE / 2, COARSE)
+    lowest = int(costs(coarse).sum(1).argmin())
+    if lowest in (0, len(coarse) - 1):
+        miss = _median_miss(pairs, 0.0)
+        return CameraCheck(0.0, math.inf, (miss, miss), count)
+    fine = coarse[lowest] + np.arange(-COARSE, COARSE + FINE / 2, FINE)
+    by_pair = costs(fine)
+    part = np.array([matches.photos for matches in usable]) % PARTS
+    without = np.array([_lowest(fine, by_pair[:, (part != left).all(1)].sum(1)) for left in range(PARTS)])
+    error = float(np.sqrt((PARTS - 1) / PARTS * np.square(without - without.mean()).sum()))
+    best = _lowest(fine, by_pair.sum(1))
+    return CameraCheck(best, error, (_median_miss(pairs, 0.0), _median_miss(pairs, best)), count)
+
+
+class _Pair:
+    """Every n-th match of two photos; its rays for any focal length."""
+
+    def __init__(self, photos: Sequence[Photo], matches: Matches, every: int):
+        one, other = (photos[index].frame for index in matches.photos)
+        self._baseline = other.centre - one.centre
+        self._unit = MISS_PX * max(radians_per_pixel(frame.camera) for frame in (one, other))
+        rays = []
+        for frame, pixels in zip((one, other), matches.pixels, strict=True):
+            at_nodes = [changed(frame.camera, (FOCAL,), np.array([node])).bearings(pixels[::every]) for node in NODES]
+            bearings = np.array([np.where(valid[:, None], bearings, np.nan) for bearings, valid in at_nodes])
+            rays.append(bearings @ frame.world_from_cam[:3, :3].T)
+        known = np.isfinite(rays[0]).all((0, 2)) & np.isfinite(rays[1]).all((0, 2))
+        self._rays = [ray[:, known] for ray in rays]
+
+    def misses(self, log_focal: float) -> np.ndarray:
+        """(N,) angles between rays and the planes they should lie in, in units of MISS_PX."""
+        # Lagrange's polynomials of the nodes.
+        apart = NODES[:, None] - NODES[None, :] + np.eye(len(NODES))
+        shares = np.prod(np.where(np.eye(len(NODES), dtype=bool), 1.0, (log_focal - NODES[None, :]) / apart), axis=1)
+        one, other = (np.tensordot(shares, ray, axes=1) for ray in self._rays)
+        away = []
+        for ray, partner in ((one, other), (other, one)):
+            normal = np.cross(self._baseline, partner)
+            length = np.linalg.norm(normal, axis=1)
+            # A ray along the line between the cameras spans no plane: it misses nothing.
+            away.append(np.abs(np.einsum("ni,ni->n", ray, normal)) / np.maximum(length, 1e-300))
+        return np.maximum(*away) / self._unit
+
+
+def _median_miss(pairs: Sequence[_Pair], log_focal: float) -> float:
+    """In pixels."""
+    return MISS_PX * float(np.median(np.concatenate([pair.misses(log_focal) for pair in pairs])))
+
+
+def _lowest(places: np.ndarray, costs: np.ndarray) -> float:
+    """Where a parabola through the lowest cost and its neighbours has its bottom."""
+    i = int(np.clip(costs.argmin(), 1, len(costs) - 2))
+    before, at, after = costs[i - 1 : i + 2]
+    bend = before - 2 * at + after
+    offset = 0.5 * (before - after) / bend if bend > 0 else 0.0
+    return float(places[i] + np.clip(offset, -1.0, 1.0) * (places[1] - places[0]))

@@ -1,0 +1,81 @@
+"""Which training photos saw which points of the surface: by structure from motion, or by features of their own.
+
+Held-out photos take no part: of what structure from motion saw, only the sightings in training photos are read, and
+neither the other ones nor the places that points have got from them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras.formats.colmap import parse_colmap
+from nerfcli.multiview.matching import Matches
+from nerfcli.photos.loading import Photo
+from nerfcli.scene import Scene, model_folder
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Sightings of points.
+
+    Args:
+        photos: (O,) int64, the number of the photo of each sighting.
+        points: (O,) int64, that of its point, from 0 on.
+        rays: (O, 3) unit directions from the photo's camera, in the scene's frame; NaN where a lens has none.
+    """
+
+    photos: np.ndarray
+    points: np.ndarray
+    rays: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Of points."""
+        return int(self.points.max(initial=-1)) + 1
+
+
+def tracks_of_model(scene: Scene, photos: Sequence[Photo]) -> Tracks:
+    """What the scene's COLMAP model says that these photos saw; nothing where there is no such model."""
+    folder = model_folder(scene.root)
+    capture = parse_colmap(folder) if folder is not None else None
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
+    if capture is not None and capture.observations is not None:
+        seen = capture.observations
+        index_of = {frame.name: index for index, frame in enumerate(capture.frames)}
+        of_frame = places_of(np.where(seen.point_index >= 0, seen.frame_index, -1), len(capture.frames))
+        for number, photo in enumerate(photos):
+            index = index_of.get(photo.frame.name)
+            if index is None:
+                continue
+            own = of_frame[index]
+            # The photo may be smaller or turned: the model's own camera knows what its pixels mean.
+            rays = _rays(capture.frames[index].camera.bearings(seen.pixels[own]), capture.frames[index].world_from_cam)
+            parts.append((np.full(len(own), number), seen.point_index[own], rays))
+    return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def tracks_of_matches(photos: Sequence[Photo], matched: Sequence[Matches]) -> Tracks:
+    """Matches of two photos each, as points that both saw; some are wrong."""
+    parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
+    first = 0
+    for matches in matched:
+        points = first + np.arange(len(matches.pixels[0]))
+        first += len(points)
+        for number, pixels in zip(matches.photos, matches.pixels, strict=True):
+            frame = photos[number].frame
+            parts.append(
+                (np.full(len(points), number), points, _rays(frame.camera.bearings(pixels), frame.world_from_cam))
+            )
+    return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def places_of(numbers: np.ndarray, count: int) -> list[np.ndarray]:
+    """For each number from 0 to count - 1, where it stands, in rising order; others are left out."""
+    order = np.argsort(numbers, kind="stable")
+    return np.split(order, np.searchsorted(numbers[order], np.arange(count + 1)))[1:-1]
+
+
+def _rays(bearings: tuple[np.ndarray, np.ndarray], world_from_cam: np.ndarray) -> np.ndarray:
+    """(N, 3) in the scene's frame of bearings (N, 3) and whether each is one."""
+    return np.where(bearings[1][:, None], bearings[0], np.nan) @ world_from_cam[:3, :3].T

@@ -1,0 +1,86 @@
+"""Where points of the surface are, by the training photos that saw them and the poses that the scene gives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.multiview.tracks import Tracks
+
+# How far a sighting may be from its point, in pixels of the training photo; poses and lenses of captures are often off
+# by one or two.
+WITHIN_PX = 3.0
+# Two rays that meet at a smaller angle do not tell the distance: half a pixel would change it by a tenth and more.
+LEAST_ANGLE_RAD = np.radians(1.0)
+# After the first round, points are found without the sightings that were far off.
+ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points that photos agree on.
+
+    Args:
+        points: (P, 3) in the scene's frame, float64; NaN where photos do not agree.
+        misses_px: (O,) how far each sighting is from its point, in pixels of the training photo at its middle; NaN
+            where it is too far, or there is no point.
+    """
+
+    points: np.ndarray
+    misses_px: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """(N, 3): the points that there are."""
+        return self.points[np.isfinite(self.points).all(axis=1)]
+
+
+def triangulate(frames: Sequence[Frame], tracks: Tracks) -> Surface:
+    """The point that all rays of a track pass nearest to, for each track that two photos at least agree on.
+
+    x = (sum_i I - d_i d_i^T)^-1 sum_i (I - d_i d_i^T) o_i,  d_i unit rays, o_i camera centres
+
+    Two rays at the angle a make the least eigenvalue of the matrix 1 - cos a: below that of `LEAST_ANGLE_RAD` the
+    distance is not known. Accuracy: a few per cent of the distance at worst, and a few wrong ones may be among them.
+
+    Args:
+        frames: of the photos.
+        tracks: what they saw.
+    """
+    centres = np.array([frame.centre for frame in frames])
+    middle = centres.mean(axis=0)  # far from the origin of GPS coordinates, rounding would cost digits
+    origins = (centres - middle)[tracks.photos]
+    px = np.array([1.0 / frame.camera.focal_px for frame in frames])[tracks.photos]
+    misses = np.where(np.isfinite(tracks.rays).all(axis=1), 0.0, np.nan)
+    points = np.full((tracks.count, 3), np.nan)
+    for _ in range(ROUNDS):
+        points = _nearest(origins, tracks, np.isfinite(misses))
+        away = points[tracks.points] - origins
+        across = np.linalg.norm(np.cross(tracks.rays, away), axis=1)
+        misses = np.arctan2(across, np.einsum("oi,oi->o", tracks.rays, away)) / px
+        misses[~(misses < WITHIN_PX)] = np.nan
+    agreed = np.bincount(tracks.points[np.isfinite(misses)], minlength=tracks.count) >= 2
+    points[~agreed] = np.nan
+    misses[~agreed[tracks.points]] = np.nan
+    return Surface(points + middle, misses)
+
+
+def _nearest(origins: np.ndarray, tracks: Tracks, used: np.ndarray) -> np.ndarray:
+    """(P, 3) the point nearest to the used rays of each track; NaN where they do not tell one."""
+    of, rays, origins = tracks.points[used], tracks.rays[used], origins[used]
+
+    def summed(values: np.ndarray) -> np.ndarray:
+        return np.bincount(of, values, tracks.count)
+
+    # Sum by sum, as a matrix for each sighting would be as large as the photos of a large capture.
+    products = [[summed(rays[:, i] * rays[:, j]) for j in range(3)] for i in range(3)]
+    matrices = np.eye(3) * np.bincount(of, minlength=tracks.count)[:, None, None] - np.array(products).transpose(
+        2, 0, 1
+    )
+    along = np.einsum("oi,oi->o", rays, origins)
+    sums = np.stack([summed(origins[:, i] - rays[:, i] * along) for i in range(3)], axis=-1)
+    told = np.linalg.eigvalsh(matrices)[:, 0] > 1.0 - np.cos(LEAST_ANGLE_RAD)
+    points = np.full((tracks.count, 3), np.nan)
+    points[told] = np.linalg.solve(matrices[told], sums[told][:, :, None])[..., 0]
+    return points

@@ -1,0 +1,248 @@
+"""The photos in memory, and random pixels with their rays."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.errors import UserError
+from nerfcli.kernels import PixelTable, backend_for
+from nerfcli.photos.footprint import pixel_footprint
+from nerfcli.photos.loading import Photo, downscaled_camera, load_photo
+from nerfcli.photos.storage import IN_MEMORY, Room
+
+# In float64, the bearings of a large photo would take more than the photo.
+PIXELS_AT_A_TIME = 2**18
+
+
+@dataclass(frozen=True)
+class Album:
+    """Photos one after another.
+
+    Args:
+        photos: their pixels are views of `colours`; photos without alpha are opaque where others have alpha.
+        colours: (pixels of all photos, 3 or 4) uint8.
+        fills_frame: whether a photo has no alpha of its own.
+    """
+
+    photos: tuple[Photo, ...]
+    colours: np.ndarray
+    fills_frame: bool
+
+
+def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room, masks: str = "ignore") -> Album:
+    """`load_photos` into one array, which stands where there is room.
+
+    Raises:
+        UserError: a photo cannot be read, or has another size than its camera.
+    """
+    cameras = [downscaled_camera(frame.camera, factor) for frame in frames]
+    begins = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
+    # Nobody knows before decoding whether a photo has alpha; the first one that has decides anew.
+    for channels in (3, 4):
+        colours = room.array((int(begins[-1]), channels), np.uint8)
+        fills: list[bool] = []
+
+        def place(index: int, colours: np.ndarray = colours) -> tuple[Photo, bool] | None:
+            photo = load_photo(frames[index], factor, masks)
+            has_alpha = photo.pixels.shape[-1] == 4
+            if has_alpha and colours.shape[-1] == 3:
+                return None
+            part = colours[begins[index] : begins[index + 1]].reshape(*photo.pixels.shape[:2], -1)
+            part[...] = photo.pixels if has_alpha or colours.shape[-1] == 3 else _with_alpha(photo.pixels)
+            room.relieve()
+            return replace(photo, pixels=part), not has_alpha
+
+        photos: list[Photo] = []
+        with ThreadPoolExecutor(max(1, threads)) as pool:
+            for placed in pool.map(place, range(len(frames))):
+                if placed is None:
+                    pool.shutdown(cancel_futures=True)
+                    break
+                photos.append(placed[0])
+                fills.append(placed[1])
+        if len(photos) == len(frames):
+            return Album(tuple(photos), colours, any(fills))
+    raise AssertionError("four channels hold every photo")
+
+
+class Drawn(NamedTuple):
+    """Pixels with their rays.
+
+    Args:
+        origins, directions: (N, 3) training frame, unit directions.
+        colours: (N, 3 or 4) float32 in [0, 1].
+        numbers: (N,) int64, counted through all photos.
+        distances, trust: (K,) of the last K of them, those whose surface is known; see `point_depth.PointDepths`.
+        weights: (N,) what each counts in the loss; none where all count alike.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    colours: Tensor
+    numbers: Tensor
+    distances: Tensor
+    trust: Tensor
+    weights: Tensor
+
+
+class Pool(Protocol):
+    """Where a training takes its pixels from: photos with poses (P, 4, 4), training frame, and cameras."""
+
+    colours: Tensor
+    first_pixel: Tensor
+    footprint: float
+    cones: Tensor
+    poses: Tensor
+    cameras: tuple[Camera, ...]
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the colours have four channels."""
+        ...
+
+    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+        """`count` random pixels, with replacement."""
+        ...
+
+    def photo_of(self, numbers: Tensor) -> Tensor:
+        """Which photo each pixel (N,) is of."""
+        ...
+
+
+class PixelPool:
+    """All usable pixels of some photos, and the ray of each, in the training frame; `frames` are those of the photos.
+
+    Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
+    pixels that the lens model has no direction for, which are left out; `footprint` is that of `pixel_footprint`;
+    `cones` (P,) are the widths of a pixel of each photo per distance, `sizes` (P, 2) heights and widths of the photos.
+
+    Args:
+        photos: one at least.
+        training_from_scene: the normalisation.
+        device: where the pixels are drawn.
+        colours: those of all photos, where they stand one after another already.
+        room: where arrays of the size of the photos go.
+    """
+
+    def __init__(
+        self,
+        photos: Sequence[Photo],
+        training_from_scene: Similarity,
+        device: torch.device,
+        *,
+        colours: np.ndarray | None = None,
+        room: Room = IN_MEMORY,
+    ):
+        self.colours = torch.from_numpy(_one_after_another(photos) if colours is None else colours).to(device)
+        self._backend = backend_for(device, torch.float32)
+        counts = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
+        self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
+        self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
+        self.sizes = torch.tensor([photo.pixels.shape[:2] for photo in photos], device=device)
+        self.frames = tuple(photo.frame for photo in photos)
+        self.cameras = tuple(photo.frame.camera for photo in photos)
+        poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
+        self.poses = torch.tensor(np.array(poses), dtype=torch.float32, device=device)
+
+        widths = [1.0 / photo.frame.camera.focal_px for photo in photos]
+        self.cones = torch.tensor(widths, dtype=torch.float32, device=device)
+        self.footprint = pixel_footprint([photo.frame for photo in photos], training_from_scene)
+
+        cameras = dict.fromkeys(photo.frame.camera for photo in photos)
+        sizes = [camera.width * camera.height for camera in cameras]
+        first_bearing = dict(zip(cameras, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
+        bearings = room.array((sum(sizes), 3), np.float32)
+        good_rays: dict[Camera, np.ndarray] = {}
+        for camera, first in first_bearing.items():
+            good_rays[camera] = _fill_bearings(camera, bearings[first : first + camera.width * camera.height], room)
+        self.bearings = torch.from_numpy(bearings).to(device)
+        self.first_bearing = torch.tensor([first_bearing[photo.frame.camera] for photo in photos], device=device)
+        self.without_ray = sum(int((~good_rays[photo.frame.camera]).sum()) for photo in photos)
+
+        def usable(photo: Photo) -> np.ndarray:
+            good = good_rays[photo.frame.camera]
+            return good if photo.used is None else good & photo.used.ravel()
+
+        usable_counts = [int(usable(photo).sum()) for photo in photos]
+        self.usable_count = sum(usable_counts)
+        if self.usable_count == 0:
+            raise UserError("no pixel is left to train on", "check that the masks are white where pixels count")
+        self.usable: Tensor | None = None
+        if self.usable_count < len(self.colours):  # a list of all pixels would be larger than the photos
+            numbers = room.array((self.usable_count,), np.int64)
+            ends = np.cumsum(usable_counts)
+            for photo, first, count, end in zip(photos, self.first_pixel.tolist(), usable_counts, ends, strict=True):
+                numbers[end - count : end] = first + np.flatnonzero(usable(photo))
+                room.relieve()
+            self.usable = torch.from_numpy(numbers).to(device)
+
+    @property
+    def has_alpha(self) -> bool:
+        return self.colours.shape[-1] == 4
+
+    def draw(self, count: int, generator: torch.Generator) -> Drawn:
+        """`count` random pixels, with replacement."""
+        return self.rays_of(self.numbers(count, generator))
+
+    def numbers(self, count: int, generator: torch.Generator) -> Tensor:
+        """Those of `count` random pixels, with replacement."""
+        chosen = torch.randint(self.usable_count, (count,), generator=generator, device=self.colours.device)
+        return chosen if self.usable is None else self.usable[chosen]
+
+    def is_usable(self, numbers: Tensor) -> Tensor:
+        """(N,) whether pixels (N,), counted through all photos, may be trained on."""
+        if self.usable is None:
+            return torch.ones_like(numbers, dtype=torch.bool)
+        places = torch.searchsorted(self.usable, numbers).clamp_max(self.usable_count - 1)
+        return self.usable[places] == numbers
+
+    def rays_of(self, numbers: Tensor) -> Drawn:
+        """The rays and colours of pixels (N,), counted through all photos."""
+        pixels = PixelTable(self.first_pixel, self.first_bearing, self.bearings, self.poses, self.colours)
+        rays = self._backend.pixel_rays(numbers, pixels)
+        none = torch.zeros(0, device=numbers.device)
+        return Drawn(*rays, numbers, distances=none, trust=none, weights=none)
+
+    def photo_of(self, numbers: Tensor) -> Tensor:
+        """Which photo each pixel (N,) is of."""
+        return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
+
+    def place(self, number: int) -> tuple[str, int, int]:
+        """The photo's name, column and row of the pixel with a number."""
+        photo = int(self.photo_of(torch.tensor(number, device=self.first_pixel.device)))
+        name, width = self.names_and_widths[photo]
+        row, column = divmod(number - int(self.first_pixel[photo]), width)
+        return name, column, row
+
+
+def _fill_bearings(camera: Camera, bearings: np.ndarray, room: Room) -> np.ndarray:
+    """Write the camera's bearings, a part at a time, and return which pixels (N,) have one."""
+    valid = np.empty(len(bearings), dtype=bool)
+    for begin in range(0, len(bearings), PIXELS_AT_A_TIME):
+        part = slice(begin, min(begin + PIXELS_AT_A_TIME, len(bearings)))
+        numbers = np.arange(part.start, part.stop)
+        centres = np.stack([numbers % camera.width, numbers // camera.width], axis=-1) + 0.5
+        bearings[part], valid[part] = camera.bearings(centres)
+        room.relieve()
+    return valid
+
+
+def _one_after_another(photos: Sequence[Photo]) -> np.ndarray:
+    any_alpha = any(photo.pixels.shape[-1] == 4 for photo in photos)
+    pixels = [_with_alpha(photo.pixels) if any_alpha else photo.pixels for photo in photos]
+    return np.concatenate([part.reshape(-1, part.shape[-1]) for part in pixels])
+
+
+def _with_alpha(pixels: np.ndarray) -> np.ndarray:
+    """RGBA: opaque where the photo has no alpha."""
+    if pixels.shape[-1] == 4:
+        return pixels
+    return np.concatenate([pixels, np.full_like(pixels[..., :1], 255)], axis=-1)

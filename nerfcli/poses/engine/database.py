@@ -1,0 +1,175 @@
+"""pycolmap's database: photos under fixed ids, and what is taken out of it because it no longer holds.
+
+pycolmap writes features photo by photo and matches block by block, each in a transaction, and passes over what is
+there. So a database that was left at any moment is whole, and going on is calling pycolmap again. What is left to do
+here is to take out what depends on something that has changed.
+
+pycolmap has its own SQLite library. Two of them must not have a file open in one process: the one that closes it drops
+the locks of the other. So Python's is used only while pycolmap has the database closed.
+"""
+
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from nerfcli.poses.input.job import CameraGroup, Job
+
+# In pycolmap a pair's id is this times the smaller image id, plus the larger one.
+_PAIR_FACTOR = 2147483647
+
+
+def register_photos(job: Job) -> None:
+    """Have the job's photos and no others in the database, with the ids and cameras that the job gives them.
+
+    Features stay. Verified matches of photos whose camera has changed go, as do all traces of photos that the job does
+    not have.
+    """
+    job.database.parent.mkdir(parents=True, exist_ok=True)
+    cameras = {number: camera_of_group(group) for number, group in enumerate(job.groups, start=1)}
+    camera_ids = {photo: number for number, group in enumerate(job.groups, start=1) for photo in group.photos}
+    wanted = {
+        image_id: (file, camera_ids[number], _described(cameras[camera_ids[number]]))
+        for number, (image_id, file) in enumerate(zip(job.image_ids, job.files, strict=True))
+    }
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        described = {camera.camera_id: _described(camera) for camera in database.read_all_cameras()}
+        there = {
+            image.image_id: (image.name, image.camera_id, described[image.camera_id])
+            for image in database.read_all_images()
+        }
+    if there == wanted:
+        return
+    forget_features(job, there.keys() - wanted.keys())
+    forget_geometries(
+        job, [image_id for image_id in there.keys() & wanted.keys() if there[image_id][2] != wanted[image_id][2]]
+    )
+    with _edited(job) as database:
+        for table in ("frame_data", "frames", "rig_sensors", "rigs", "images", "cameras", "pose_priors"):
+            database.execute(f"DELETE FROM {table}")
+    with closing(pycolmap.Database.open(str(job.database))) as database, pycolmap.DatabaseTransaction(database):
+        for number, camera in cameras.items():
+            camera.camera_id = number
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig()
+            rig.rig_id = number
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+        for image_id, (file, camera_id, _) in sorted(wanted.items()):
+            image = pycolmap.Image(name=file, camera_id=camera_id, image_id=image_id)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame()
+            frame.frame_id, frame.rig_id = image_id, camera_id
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+
+
+def camera_of_group(group: CameraGroup) -> pycolmap.Camera:
+    """Camera model of a group, and its intrinsics if they are given, or the focal length if EXIF tells it."""
+    if group.params is not None:
+        camera = pycolmap.Camera.create_from_model_name(1, group.model, 1.0, group.width, group.height)
+        camera.params = list(group.params)
+        camera.has_prior_focal_length = True
+        return camera
+    focal_px = 1.2 * max(group.width, group.height) if group.focal_px is None else group.focal_px
+    camera = pycolmap.Camera.create_from_model_name(1, group.model, focal_px, group.width, group.height)
+    camera.has_prior_focal_length = group.focal_is_prior
+    return camera
+
+
+def forget_features(job: Job, image_ids: Iterable[int]) -> None:
+    """Take out the features of some photos and all matches with them. pycolmap's own functions take out all or none."""
+    with _edited(job) as database:
+        for image_id in image_ids:
+            for table in ("keypoints", "descriptors"):
+                database.execute(f"DELETE FROM {table} WHERE image_id = ?", (image_id,))
+            _forget_pairs(database, image_id, ("matches", "two_view_geometries"))
+
+
+def forget_geometries(job: Job, image_ids: Iterable[int]) -> None:
+    """Take out the verified matches of some photos; the matches themselves stay, and are soon verified again."""
+    with _edited(job) as database:
+        for image_id in image_ids:
+            _forget_pairs(database, image_id, ("two_view_geometries",))
+
+
+def keep_geometries(job: Job, pairs: Iterable[tuple[int, int]]) -> None:
+    """Take out the verified matches of all pairs of photo numbers but these: the mapper uses whatever it finds."""
+    ids = job.image_ids
+    wanted = {pycolmap.image_pair_to_pair_id(ids[i], ids[j]) for i, j in pairs}
+    with _edited(job) as database:
+        there = [pair_id for (pair_id,) in database.execute("SELECT pair_id FROM two_view_geometries")]
+        others = [(pair_id,) for pair_id in there if pair_id not in wanted]
+        database.executemany("DELETE FROM two_view_geometries WHERE pair_id = ?", others)
+
+
+def clear_matches(job: Job, *tables: str) -> None:
+    """Empty "two_view_geometries", "matches", or both."""
+    with _edited(job) as database:
+        for table in tables:
+            database.execute(f"DELETE FROM {table}")
+
+
+def discard_if_damaged(path: Path) -> None:
+    """Delete a database that cannot be read from beginning to end; its content will be found again.
+
+    A killed process leaves a whole one, thanks to SQLite's journal. A machine that lost its power may not, for pycolmap
+    does not wait for the disk.
+    """
+    if not path.exists():
+        return
+    try:
+        with closing(sqlite3.connect(path)) as database:
+            whole = database.execute("PRAGMA quick_check").fetchone() == ("ok",)
+    except sqlite3.DatabaseError:
+        whole = False
+    if not whole:
+        for part in path.parent.glob(path.name + "*"):
+            part.unlink()
+
+
+def name_images(job: Job) -> None:
+    """Give the images the photos' own names, so that COLMAP finds them in the user's folder."""
+    names = zip(job.names, job.image_ids, strict=True)
+    with _edited(job) as database:
+        # In two steps, for a photo's name may be the number of another one.
+        database.execute("UPDATE images SET name = '/' || image_id")
+        database.executemany("UPDATE images SET name = ? WHERE image_id = ?", list(names))
+
+
+def evidence(job: Job) -> list[dict[str, Any]]:
+    """Per photo: features found, and the photo that it shares most verified matches with."""
+    numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        features = {number: database.num_keypoints_for_image(image_id) for image_id, number in numbers.items()}
+        pair_ids, inliers = database.read_two_view_geometry_num_inliers()
+    best: dict[int, tuple[int, str | None]] = dict.fromkeys(features, (0, None))
+    for pair_id, count in zip(pair_ids, inliers, strict=True):
+        i, j = (numbers[image_id] for image_id in pycolmap.pair_id_to_image_pair(pair_id))
+        for one, other in ((i, j), (j, i)):
+            if count > best[one][0]:
+                best[one] = (count, job.names[other])
+    return [
+        {"features": features[number], "best_matches": best[number][0], "best_partner": best[number][1]}
+        for number in sorted(features)
+    ]
+
+
+def _described(camera: pycolmap.Camera) -> tuple[Any, ...]:
+    return (camera.model.name, camera.width, camera.height, *camera.params.tolist(), camera.has_prior_focal_length)
+
+
+def _forget_pairs(database: sqlite3.Connection, image_id: int, tables: Iterable[str]) -> None:
+    for table in tables:
+        condition = f"pair_id / {_PAIR_FACTOR} = ? OR pair_id % {_PAIR_FACTOR} = ?"
+        database.execute(f"DELETE FROM {table} WHERE {condition}", (image_id, image_id))
+
+
+@contextmanager
+def _edited(job: Job) -> Iterator[sqlite3.Connection]:
+    """The database in Python's SQLite, for one transaction."""
+    with closing(sqlite3.connect(job.database)) as database, database:
+        yield database

@@ -1,0 +1,183 @@
+"""Features and matches: what pycolmap writes into its database, going on from what is there."""
+
+import math
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from itertools import repeat
+from pathlib import Path
+
+import pycolmap
+
+from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
+from nerfcli.poses.input.job import Job, LaidOutMask, Report
+from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
+
+# A photo with this share of the features that were asked for is rich enough; measured poses are no better with more.
+_RICH_SHARE = 0.5
+# A mask that leaves less than an eighth of a picture gets no more: fine features at noise level help nobody.
+_MOST_FEATURES_FOR_MASK = 8
+# Matches are written, and so progress is seen and kept, after each block.
+_PAIRS_PER_BLOCK = 128
+# To be changed with anything here that changes the features of the same photo, or the matches of the same features.
+_FEATURES_VERSION = "octaves 0, then -1 below half"
+_MATCHES_VERSION = "ratio 0.8, cross-checked"
+
+
+def feature_keys(job: Job) -> dict[str, str]:
+    """Per photo (by image id, as JSON wants its keys), a hash of all that its features depend on."""
+    settings = (_FEATURES_VERSION, job.max_image_size, job.max_features, pycolmap.__version__)
+    contents = [(key, mask.key) for key, mask in zip(job.keys, job.masks or repeat(LaidOutMask()), strict=False)]
+    return {str(i): stage_key(*content, *settings) for i, content in zip(job.image_ids, contents, strict=True)}
+
+
+def extract(job: Job, report: Report) -> None:
+    """SIFT features of every photo that has none yet, one camera per group.
+
+    Seeking them in the enlarged picture too (SIFT's octave -1, pycolmap's default) takes three times as long. Rich
+    pictures gain nothing, for pycolmap keeps the coarsest features; so only the poor ones get it, in a second pass.
+    """
+    register_photos(job)
+    keys, known = feature_keys(job), _stage_file(job, "features")
+    there = read_stage(known, _FEATURES_VERSION) or {}
+    forget_features(job, [int(image_id) for image_id, key in keys.items() if there.get(image_id) != key])
+    # From here on, what features the database holds are those of `keys`.
+    write_stage(known, _FEATURES_VERSION, keys)
+    passes = _stage_file(job, "enlarged")
+    enlarged = {i: key for i, key in (read_stage(passes, _FEATURES_VERSION) or {}).items() if keys.get(i) == key}
+    first = [number for number, image_id in enumerate(job.image_ids) if str(image_id) not in enlarged]
+    _extract_octaves(job, first, watched=range(len(job.image_ids)), first_octave=0, report=report)
+    counts = feature_counts(job)
+    poor = [number for number in first if counts[number] < _RICH_SHARE * job.max_features]
+    # First they go and then it is written that they are due: one that has features and is due has had its second pass.
+    forget_features(job, [job.image_ids[number] for number in poor])
+    enlarged |= {str(job.image_ids[number]): keys[str(job.image_ids[number])] for number in poor}
+    write_stage(passes, _FEATURES_VERSION, enlarged)
+    due = [number for number, image_id in enumerate(job.image_ids) if str(image_id) in enlarged]
+    if due:
+        _extract_octaves(job, due, watched=due, first_octave=-1, report=report)
+
+
+def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
+    """Take out the matches of other settings, and hide those of other pairs from the mapper."""
+    matched, verified = _stage_file(job, "matches"), _stage_file(job, "geometries")
+    matches_key = stage_key(_MATCHES_VERSION, pycolmap.__version__)
+    verified_key = stage_key(matches_key, job.seed)
+    if read_stage(matched, matches_key) is None:
+        clear_matches(job, "matches", "two_view_geometries")
+        write_stage(matched, matches_key, {})
+    if read_stage(verified, verified_key) is None:
+        clear_matches(job, "two_view_geometries")
+        write_stage(verified, verified_key, {})
+    keep_geometries(job, pairs)
+
+
+def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
+    """Descriptor matches of the pairs that have none yet, verified by two-view geometry.
+
+    Each pair's random numbers start from the seed, so its result does not depend on what was done before.
+    """
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = job.threads
+    options.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = job.seed
+    pair_list = Path(job.folder) / "pairs.txt"
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(pair_list)
+    pairing.block_size = _PAIRS_PER_BLOCK
+    pair_list.write_text("\n".join(f"{job.files[i]} {job.files[j]}" for i, j in pairs), encoding="utf-8")
+    ids = job.image_ids
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pending = {(ids[i], ids[j]) for i, j in pairs}
+
+        def done() -> int:
+            pending.difference_update([pair for pair in pending if database.exists_two_view_geometry(*pair)])
+            return len(pairs) - len(pending)
+
+        with _watched("match", done, len(pairs), report):
+            pycolmap.match_image_pairs(
+                str(job.database),
+                matching_options=options,
+                pairing_options=pairing,
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
+
+
+def feature_counts(job: Job) -> list[int]:
+    """Features in the database, per photo."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        return [database.num_keypoints_for_image(image_id) for image_id in job.image_ids]
+
+
+def _extract_octaves(
+    job: Job, numbers: Iterable[int], *, watched: Sequence[int], first_octave: int, report: Report
+) -> None:
+    """Seek features in photos that have none; of the photos `watched` it is reported how many have some."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = job.max_image_size
+    options.num_threads = job.threads
+    options.use_gpu = False
+    options.sift.first_octave = first_octave
+    reader = pycolmap.ImageReaderOptions()
+    reader.mask_path = str(job.mask_folder) if job.masks else ""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pending = {job.image_ids[number] for number in watched}
+
+        def done() -> int:
+            pending.difference_update([image_id for image_id in pending if database.exists_descriptors(image_id)])
+            return len(watched) - len(pending)
+
+        with _watched("extract" if first_octave == 0 else "enlarge", done, len(watched), report):
+            for limit, members in _by_limit(job, numbers).items():
+                options.sift.max_num_features = limit
+                pycolmap.extract_features(
+                    str(job.database),
+                    str(job.photos),
+                    image_names=members,
+                    reader_options=reader,
+                    extraction_options=options,
+                    device=pycolmap.Device.cpu,
+                )
+
+
+def _by_limit(job: Job, numbers: Iterable[int]) -> dict[int, list[str]]:
+    """Files of photos by how many features to seek in the whole picture, so that what a mask leaves has enough.
+
+    pycolmap chooses features before it looks at the mask. The limit doubles each time the share of the
+    picture that is used halves.
+    """
+    limits: dict[int, list[str]] = {}
+    for number in numbers:
+        share = job.masks[number].used_share if job.masks else 1.0
+        factor = min(_MOST_FEATURES_FOR_MASK, 2 ** int(math.log2(1 / share))) if share > 0 else 1
+        limits.setdefault(job.max_features * factor, []).append(job.files[number])
+    return limits
+
+
+def _stage_file(job: Job, stage: str) -> Path:
+    return Path(job.folder) / f"{job.rung}{'-' if job.rung else ''}{stage}.json"
+
+
+@contextmanager
+def _watched(stage: str, done: Callable[[], int], total: int, report: Report) -> Iterator[None]:
+    """Report `done()` once a second while pycolmap works, at the beginning and at the end.
+
+    pycolmap has no callbacks for these stages, so the database is asked, through pycolmap: see `database`.
+    """
+    finished = threading.Event()
+
+    def watch() -> None:
+        while not finished.wait(1.0):
+            report(stage, done(), total)
+
+    report(stage, done(), total)
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    try:
+        yield
+    finally:
+        finished.set()
+        watcher.join()
+    report(stage, total, total)

@@ -1,0 +1,264 @@
+"""One attempt after the other, each costlier than the one before, until enough photos are placed.
+
+Every attempt is written down with its result. The first ones ask the same matches in another way; the last ones look
+for more matches and more features.
+"""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from nerfcli.poses.engine.database import evidence, register_photos
+from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
+from nerfcli.poses.engine.mapped import Mapped
+from nerfcli.poses.engine.mapping import Start, map_photos
+from nerfcli.poses.input.job import Job, Report, Tell
+from nerfcli.poses.input.pairs import all_pairs
+from nerfcli.poses.input.settings import FULL_SIZE
+from nerfcli.poses.model.intrinsics import field_of_view_deg
+from nerfcli.poses.model.lens_family import as_fisheye
+from nerfcli.poses.model.localise import left_out, localise
+from nerfcli.poses.model.merging import merge_models
+from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
+from nerfcli.poses.model.view_graph import parts
+
+# Registered shares below which the mapper gets another chance; a photo or two missing is often the photo's own fault.
+_GOOD_SHARE = 0.9
+# Below this, it is worth several times the work that was done so far.
+_FEW_SHARE = 0.75
+# Below this, what is believed of the lens beforehand is doubted.
+_LITTLE_SHARE = 0.5
+# Beyond this, comparing every pair, or searching full-size photos, takes longer than taking better photos.
+_MOST_PAIRS = 12_000
+_MOST_FULL_SIZE = 150
+_MORE_FEATURES = 8192
+# A perspective lens from here on may be a fisheye.
+_WIDE_DEG = 100.0
+# Each takes some seconds; where more are missing, it is not single photos that are.
+_MOST_SINGLE_PHOTOS = 60
+
+SMALLER_BASELINE = Start(init_min_tri_angle=8.0, init_min_num_inliers=50)
+LOW_ANGLES = Start(
+    init_min_tri_angle=3.0, init_min_num_inliers=30, filter_min_tri_angle=0.5, init_max_forward_motion=1.0
+)
+
+
+class _Ladder:
+    def __init__(self, job: Job, report: Report, tell: Tell) -> None:
+        self.best = Mapped([], job, [])
+        self.rungs: list[dict[str, Any]] = []
+        self._report = report
+        self._tell = tell
+        self._photos = len(job.files)
+        self._told = 0
+        self._announced = ""
+
+    def announce(self, what: str) -> None:
+        """Tell what the rungs so far gave, and once what comes next."""
+        self.tell_results()
+        if what != self._announced:
+            self._tell(f"next: {what}")
+        self._announced = what
+
+    def tell_results(self) -> None:
+        """Tell what each rung gave that has not been told yet."""
+        for rung in self.rungs[self._told :]:
+            largest, *others = rung["models"] or ["none"]
+            also = f" (and {len(others)} smaller models)" if len(others) > 1 else f" + {others[0]}" if others else ""
+            self._tell(f"{rung['what']}: {largest}{also} of {self._photos} photos placed")
+        self._told = len(self.rungs)
+
+    def attempt(self, what: str, job: Job, start: Start) -> None:
+        """Map once; the result counts if it places more photos than the best so far."""
+        if self.rungs:
+            self.announce(what)
+        number = len(self.rungs)
+        models = map_photos(job, self._report, attempt=number, start=start)
+        self._take(what, models, job)
+        if len(models) > 1:
+            output = Path(job.folder) / f"merged_{number}"
+            merged = merge_models(
+                models, job.database, output=output, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras
+            )
+            if _placed(merged) > _placed(models):
+                self._take("sub-models merged", merged, job)
+
+    def attempt_instead(self, what: str, job: Job, start: Start) -> None:
+        """Map once; the result counts if it places as many photos as the best so far, which rests on something else."""
+        best = self.best
+        self.best = Mapped([], job, [])
+        self.attempt(what, job, start)
+        if _placed(self.best.models) < _placed(best.models):
+            self.best = best
+
+    def is_wide(self) -> bool:
+        """Whether a camera of the best model sees so much that it may be a fisheye."""
+        if not self.best.models:
+            return False
+        model = self.best.models[0]
+        cameras = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+        return any(field_of_view_deg(model.camera(camera_id)) > _WIDE_DEG for camera_id in cameras)
+
+    def go_on(self, what: str, start: Start) -> None:
+        """Try to place the rest from the best model as it is."""
+        models, job = self.best.models, self.best.job
+        if not models:
+            return
+        self.announce(what)
+        grown = map_photos(job, self._report, attempt=len(self.rungs), start=start, base=models[0])
+        if grown:
+            self._take(what, [grown[0], *models[1:]], job)
+
+    def find_left_out(self, what: str) -> None:
+        """Place, one by one, photos of which no pair is strong enough, by what the best model knows."""
+        models, job = self.best.models, self.best.job
+        if not models:
+            return
+        left = left_out(models[0], job)
+        if not 0 < len(left) <= _MOST_SINGLE_PHOTOS:
+            return
+        self.announce(what)
+        grown, attempts = localise(models[0], job, image_ids=left)
+        placed = tuple(attempt.image_id for attempt in attempts if not attempt.refused)
+        names = dict(zip(job.image_ids, job.names, strict=True))
+        found = [{"name": names[one.image_id], **asdict(one)} for one in attempts]
+        rest = [model for model in models[1:] if not set(model.reg_image_ids()) <= set(grown.reg_image_ids())]
+        self._take(what, [grown, *rest], job)
+        self.rungs[-1]["photos"] = found
+        if placed:
+            self.best = replace(self.best, localised=placed)
+
+    def _take(self, what: str, models: list[pycolmap.Reconstruction], job: Job) -> None:
+        self.rungs.append({"what": what, "models": [model.num_reg_images() for model in models]})
+        if _placed(models) > _placed(self.best.models):
+            self.best = Mapped(models, job, self.rungs)
+
+    def share(self, candidates: int) -> float:
+        """Of the photos that can be placed, the share that the best model places."""
+        return _placed(self.best.models) / max(candidates, 1)
+
+
+def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
+    """Map a job's photos, with as many attempts as it takes.
+
+    The first attempt has pycolmap's own thresholds. If it places less than half of the photos with a focal length from
+    EXIF, the next one starts without it. If its lens came out wide or it leaves out many photos, the next
+    one starts from a fisheye, where pairs of photos say that it was one. If photos that match some other one well are
+    still left out, the next ones start from a pair with a smaller baseline, from the strongest pair that was left out,
+    and with low angles. Then all pairs are compared that were not, and more features are sought in the photos' full
+    size. Last, single photos are placed by the points that they show (see `localise`). If the first attempt is not the
+    last, `tell` is told each attempt and its result.
+    """
+    ladder = _Ladder(job, report, tell)
+    ladder.attempt("default thresholds", job, Start())
+    featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
+    job = _without_exif(ladder, job, report, share=ladder.share(featured))
+    job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
+    _other_starts(ladder, job)
+    compared = set(job.pairs)
+    rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
+    if rest and len(rest) <= _MOST_PAIRS and ladder.share(featured) < _GOOD_SHARE:
+        job = replace(job, pairs=(*job.pairs, *rest))
+        match(job, rest, report)
+        ladder.attempt("every pair compared", job, SMALLER_BASELINE)
+    if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE:
+        ladder.announce("more features, full size")
+        full = replace(
+            job,
+            rung="full-size",
+            max_image_size=FULL_SIZE,
+            max_features=_MORE_FEATURES,
+            pairs=all_pairs(len(job.files)),
+        )
+        extract(full, report)
+        start_matching(full, full.pairs)
+        match(full, full.pairs, report)
+        ladder.attempt("more features, full size", full, Start())
+        _other_starts(ladder, full)
+    ladder.find_left_out("single photos, by the points that they show")
+    if len(ladder.rungs) > 1:
+        ladder.tell_results()
+    return replace(ladder.best, attempts=ladder.rungs)
+
+
+def _other_starts(ladder: _Ladder, job: Job) -> None:
+    """Other ways to begin, until nearly all photos are placed that matches hold together."""
+    candidates = len(parts(job.image_ids, [(one, other) for _, one, other in _strong_pairs(job)])[0])
+    steps: list[Callable[[], None]] = [
+        lambda: ladder.attempt("start from a smaller baseline", job, SMALLER_BASELINE),
+        lambda: _from_left_out(ladder, job),
+        lambda: ladder.go_on("lower angles", LOW_ANGLES),
+        lambda: ladder.attempt("start from low angles", job, LOW_ANGLES),
+    ]
+    for step in steps:
+        if ladder.share(candidates) >= _GOOD_SHARE:
+            return
+        step()
+
+
+def _without_exif(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:
+    """Start without EXIF's focal lengths, if little is placed with them; the job of the better result."""
+    bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
+    if share >= _LITTLE_SHARE or bare.groups == job.groups:
+        return job
+    what = "without the focal length of EXIF"
+    ladder.announce(what)
+    register_photos(bare)  # which takes out what was verified with the other focal length
+    match(bare, bare.pairs, report)
+    ladder.attempt(what, bare, Start())
+    if ladder.best.job is bare:
+        return bare
+    register_photos(job)
+    match(job, job.pairs, report)
+    return job
+
+
+def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:
+    """Start from a fisheye, if the result asks for it and pairs of photos say so; the job of the better result."""
+    if share >= _GOOD_SHARE and not ladder.is_wide():
+        return job
+    fisheye = as_fisheye(job)
+    if fisheye is None:
+        return job
+    ladder.announce("start from a fisheye lens")
+    register_photos(fisheye)  # which takes out what was verified with another lens
+    match(fisheye, fisheye.pairs, report)
+    ladder.attempt_instead("start from a fisheye lens", fisheye, Start())
+    if ladder.best.job is fisheye:
+        return fisheye
+    register_photos(job)
+    match(job, job.pairs, report)
+    return job
+
+
+def _from_left_out(ladder: _Ladder, job: Job) -> None:
+    """Start from the strongest pair of which the best model lacks a photo."""
+    placed = set(ladder.best.models[0].reg_image_ids()) if ladder.best.models else set()
+    left = [pair for pair in _strong_pairs(job) if not {pair[1], pair[2]} <= placed]
+    if left:
+        _, one, other = max(left, key=lambda pair: (pair[0], -pair[1], -pair[2]))
+        start = replace(SMALLER_BASELINE, init_pair=(one, other))
+        ladder.attempt("start from the strongest pair that was left out", job, start)
+
+
+def _strong_pairs(job: Job) -> list[tuple[int, int, int]]:
+    """(verified matches, image id, image id) of the pairs that can hold a photo."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pair_ids, counts = database.read_two_view_geometry_num_inliers()
+    pairs = [(count, *pycolmap.pair_id_to_image_pair(pair_id)) for pair_id, count in zip(pair_ids, counts, strict=True)]
+    return [pair for pair in pairs if pair[0] >= FEW_MATCHES]
+
+
+def _can_have_more_features(job: Job) -> bool:
+    """Whether larger pictures or a higher limit would give any photo more features than it has."""
+    larger = any(max(group.width, group.height) > job.max_image_size for group in job.groups)
+    limited = job.max_features < _MORE_FEATURES and max(feature_counts(job), default=0) >= job.max_features
+    return (larger or limited) and len(job.files) <= _MOST_FULL_SIZE
+
+
+def _placed(models: list[pycolmap.Reconstruction]) -> int:
+    return models[0].num_reg_images() if models else 0

@@ -1,0 +1,108 @@
+"""Keep what the mapper found: models on disk before any check, read back by the checks and by every later call.
+
+    WORK/NAME/0, 1, ...   the models, largest first, with the photos' numbers as names
+    WORK/NAME.json        the stage: what was tried, and a hash of each file of the models
+
+The checks always read the models from disk, also in the call that wrote them: so a call that was killed during the
+checks ends with the same bits as one that was not. Photos without a pose are not on disk, and reach no check.
+"""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+import nerfcli
+from nerfcli.poses.input.job import Job, job_from_json
+from nerfcli.poses.input.stages import file_key, read_stage, stage_key, write_stage
+
+# Of the attempts that the ladder makes.
+FIRST = "mapped"
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """The models that were mapped, largest first, and the job whose features and matches they are of.
+
+    attempts: what was tried, in order: {"what", "models": sizes, largest first}; the one that looks for single photos
+    has "photos" too: what was found for each. localised: ids of images that are placed by the model's points, without
+    a pair that holds them. seconds: that mapping took.
+    """
+
+    models: list[pycolmap.Reconstruction]
+    job: Job
+    attempts: list[dict[str, Any]]
+    localised: tuple[int, ...] = ()
+    seconds: float = 0.0
+
+
+def write_mapped(mapped: Mapped, key: str, *, name: str = FIRST) -> None:
+    """Write models and stage into the work folder, in place of earlier ones of this name."""
+    content = {"job": asdict(mapped.job), "attempts": mapped.attempts, "localised": list(mapped.localised)}
+    content["seconds"] = mapped.seconds
+    write_models(Path(mapped.job.folder) / name, mapped.models, key, also=content)
+
+
+def read_mapped(job: Job, key: str, *, name: str = FIRST) -> Mapped | None:
+    """Read what `write_mapped` wrote for this key; None if it is damaged or gone, or the matches that it rests on are.
+
+    Args:
+        job: says where the work folder, the photos and the threads are now.
+        key: of all that the models depend on.
+        name: of the stage.
+    """
+    found = read_models(Path(job.folder) / name, key)
+    if found is None:
+        return None
+    models, content = found
+    there = job_from_json(content["job"])
+    there = replace(
+        there,
+        folder=job.folder,
+        originals=job.originals,
+        threads=job.threads,
+        component=job.component,
+        skipped_checks=job.skipped_checks,
+    )
+    if not there.database.exists():
+        return None
+    return Mapped(models, there, content["attempts"], tuple(content["localised"]), content["seconds"])
+
+
+def write_models(
+    folder: Path, models: Sequence[pycolmap.Reconstruction], key: str, *, also: Mapping[str, Any] | None = None
+) -> None:
+    """Write models below a folder, in place of earlier ones, and then FOLDER.json, the stage with their hashes."""
+    stage = folder.with_suffix(".json")
+    stage.unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    for index, model in enumerate(models):
+        target = folder / str(index)
+        target.mkdir(parents=True)
+        model.write_binary(str(target))
+    write_stage(stage, key, {**(also or {}), "models": len(models), "files": file_keys(folder)})
+
+
+def read_models(folder: Path, key: str) -> tuple[list[pycolmap.Reconstruction], dict[str, Any]] | None:
+    """Read what `write_models` wrote for this key: the models, and the stage's content; None if they are not whole."""
+    content = read_stage(folder.with_suffix(".json"), key)
+    if content is None or content["files"] != file_keys(folder):
+        return None
+    return [pycolmap.Reconstruction(str(folder / str(index))) for index in range(content["models"])], content
+
+
+def mapping_key(job: Job) -> str:
+    """Return a hash of all that the models of a job depend on."""
+    content = asdict(job)
+    for name in ("folder", "originals", "threads", "component", "skipped_checks"):
+        del content[name]
+    return stage_key(content, nerfcli.__version__, pycolmap.__version__)
+
+
+def file_keys(folder: Path) -> dict[str, str]:
+    """Return a hash of each file below a folder, by its relative path; empty without the folder."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file()) if folder.is_dir() else []
+    return {str(path.relative_to(folder)): file_key(path) for path in files}

@@ -1,0 +1,182 @@
+"""From matches to a model: one run of the incremental mapper, and COLMAP files."""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from nerfcli.poses.engine.mapped import file_keys, mapping_key, read_models, write_models
+from nerfcli.poses.input.job import Job, Report
+from nerfcli.poses.input.stages import file_key, stage_key
+from nerfcli.poses.model.reasons import FEW_MATCHES
+
+
+@dataclass(frozen=True)
+class Start:
+    """How the mapper begins and what it accepts: pycolmap's names and defaults; init_pair holds image ids."""
+
+    init_min_tri_angle: float = 16.0
+    init_min_num_inliers: int = 100
+    init_max_forward_motion: float = 0.95
+    filter_min_tri_angle: float = 1.5
+    init_pair: tuple[int, int] | None = None
+
+
+def photo_numbers(model: pycolmap.Reconstruction, job: Job) -> list[int]:
+    """Numbers of the photos that a model places, rising."""
+    numbers = {file: number for number, file in enumerate(job.files)}
+    return sorted(numbers[model.image(image_id).name] for image_id in model.reg_image_ids())
+
+
+def describe_cameras(
+    model: pycolmap.Reconstruction, job: Job, uncertainty: Mapping[str, dict[str, Any]] | None = None
+) -> list[dict[str, Any]]:
+    """Intrinsics, for the report, of the cameras that took the placed photos, and how uncertain they are."""
+    counts: dict[int, int] = {}
+    for image_id in model.reg_image_ids():
+        camera_id = model.image(image_id).camera_id
+        counts[camera_id] = counts.get(camera_id, 0) + 1
+    return [
+        {
+            "model": camera.model.name,
+            "width": camera.width,
+            "height": camera.height,
+            "params": [float(value) for value in camera.params],
+            "focal_from_exif": camera.has_prior_focal_length and camera_id not in job.given_cameras,
+            "images": counts[camera_id],
+            "uncertainty": (uncertainty or {}).get(str(camera_id)),
+        }
+        for camera_id, camera in sorted(model.cameras.items())
+        if camera_id in counts
+    ]
+
+
+def with_colours(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
+    """Return the model with colours for its points: a copy if most have none, as after a merger.
+
+    Raises:
+        RuntimeError, ValueError: pycolmap cannot read a photo.
+    """
+    black = sum(not np.any(point.color) for point in model.points3D.values())
+    if 2 * black <= model.num_points3D():
+        return model
+    copy = pycolmap.Reconstruction(model)
+    copy.extract_colors_for_all_images(str(job.photos), num_threads=job.threads)
+    return copy
+
+
+def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
+    """Write sparse/0 into the job's folder, with the photos' own names."""
+    names = dict(zip(job.files, job.names, strict=True))
+    for image in model.images.values():
+        image.name = names[image.name]
+    folder = _model_folder(job)
+    shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed before it said that it was complete
+    folder.mkdir(parents=True)
+    model.write_binary(str(folder))
+
+
+def model_keys(job: Job) -> dict[str, str]:
+    """A hash of each file of the model in the job's folder, by the file's name; none if there is no model."""
+    folder = _model_folder(job)
+    return {path.name: file_key(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+
+
+def _model_folder(job: Job) -> Path:
+    return Path(job.folder) / "sparse" / "0"
+
+
+def map_photos(
+    job: Job, report: Report, *, attempt: int, start: Start, base: pycolmap.Reconstruction | None = None
+) -> list[pycolmap.Reconstruction]:
+    """Run the incremental mapper once, from nothing or from a model, unless an earlier call has done so.
+
+    Returns:
+        Its models as they are on disk, largest first, errors filled in.
+    """
+    output = Path(job.folder) / f"{job.rung}models_{attempt}"
+    base_folder = output.with_name(f"{output.name}_base")
+    if base is not None:
+        base_folder.mkdir(exist_ok=True)
+        base.write(str(base_folder))
+    key = stage_key(mapping_key(job), attempt, asdict(start), base is not None and file_keys(base_folder))
+    if (found := read_models(output, key)) is None:
+        models = _run_mapper(job, report, _options(job, attempt=attempt, start=start), base and base_folder)
+        write_models(output, models, key)
+        found = read_models(output, key)
+    if found is None:
+        raise OSError(f"the models in {output} cannot be read back")
+    return found[0]
+
+
+def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
+    """Run the global mapper once: all rotations, then all positions; its models, largest first, errors filled in.
+
+    It needs intrinsics that are about right in the database.
+    """
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = job.threads
+    options.random_seed = options.mapper.random_seed = job.seed
+    options.mapper.global_positioning.use_gpu = False
+    options.mapper.bundle_adjustment.ceres.use_gpu = False
+    with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
+        models = pycolmap.global_mapping(str(job.database), str(job.photos), output, options)
+    for model in models.values():
+        model.update_point_3d_errors()
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+
+def _options(job: Job, *, attempt: int, start: Start) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = job.threads
+    seed = job.seed + attempt
+    options.random_seed = seed
+    options.mapper.random_seed = seed
+    options.triangulation.random_seed = seed
+    # Small captures are no less whole; what is the largest is decided below.
+    options.min_model_size = 3
+    options.constant_cameras = set(job.fixed_cameras)
+    options.mapper.constant_cameras = options.constant_cameras
+    options.mapper.init_min_tri_angle = start.init_min_tri_angle
+    options.mapper.init_min_num_inliers = start.init_min_num_inliers
+    options.mapper.init_max_forward_motion = start.init_max_forward_motion
+    options.mapper.filter_min_tri_angle = start.filter_min_tri_angle
+    options.mapper.abs_pose_min_num_inliers = FEW_MATCHES
+    if start.init_pair:
+        options.init_image_id1, options.init_image_id2 = start.init_pair
+    return options
+
+
+def _run_mapper(
+    job: Job, report: Report, options: pycolmap.IncrementalPipelineOptions, base_folder: Path | None
+) -> list[pycolmap.Reconstruction]:
+    placed = 0
+
+    def started() -> None:
+        nonlocal placed
+        placed = 2
+        report("map", placed, len(job.files))
+
+    def placed_one() -> None:
+        nonlocal placed
+        placed += 1
+        report("map", min(placed, len(job.files)), len(job.files))
+
+    with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
+        models = pycolmap.incremental_mapping(
+            str(job.database),
+            str(job.photos),
+            output,
+            options=options,
+            input_path="" if base_folder is None else str(base_folder),
+            initial_image_pair_callback=started,
+            next_image_callback=placed_one,
+        )
+    for model in models.values():
+        model.update_point_3d_errors()
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)

@@ -1,0 +1,205 @@
+"""Try again where the checks refuse a model because verified pairs of photos contradict it.
+
+Wrong matches between parts that look alike put whole groups of photos into wrong places. Each hypothesis below leaves
+out other evidence and maps again; what it finds passes the same checks, against all pairs, before it is believed.
+"""
+
+import shutil
+import time
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+
+import pycolmap
+
+from nerfcli.poses.engine.database import keep_geometries
+from nerfcli.poses.engine.ladder import SMALLER_BASELINE
+from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.mapping import Start, map_globally, map_photos
+from nerfcli.poses.input.job import Job, Report, Tell
+from nerfcli.poses.input.pairs import capture_order
+from nerfcli.poses.input.plan import duration
+from nerfcli.poses.input.stages import stage_key
+from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict
+from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.examine import Examined, examine
+from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.two_views import agreements, read_verified_pairs
+from nerfcli.poses.model.view_graph import consistent_groups
+
+# Numbers of the mapper's runs that follow those of the ladder; they are part of the seed.
+_FIRST_ATTEMPT = 100
+# Of the photos that were placed, the share that must agree with itself to be built upon.
+_LEAST_CORE = 0.3
+# In an ordered capture, photos so near in the order are taken to be neighbours in space.
+_NEAR_IN_ORDER = 10
+_ALL_AT_ONCE = "all photos at once (global mapper)"
+# A hypothesis is not started when those before it took this many times as long as the first mapping.
+_MOST_TIME = 1.5
+
+
+@dataclass(frozen=True)
+class Chance:
+    """What a hypothesis led to."""
+
+    mapped: Mapped
+    examined: Examined
+
+
+def second_chance(
+    mapped: Mapped, first: Examined, report: Report, tell: Tell, *, checks: Callable[[], Checks]
+) -> Chance:
+    """Map again under one hypothesis after the other until the checks accept a model.
+
+    Args:
+        mapped: the models that the checks refused.
+        first: what they said.
+        report: called with (stage, done, total).
+        tell: called with what the user should know.
+        checks: makes the runner of the checks of one more model.
+
+    Returns:
+        The first accepted model; else the largest part of a model that is accepted by itself; else what was given.
+    """
+    start = time.perf_counter()
+    pairs = first.verdict.measures["pairs"]
+    against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
+    tell(f"{against}: the photos are mapped again, for {duration(_MOST_TIME * mapped.seconds)} at most")
+    attempts = list(mapped.attempts)
+    core = _core(mapped.models[0], mapped.job)
+    at_once: list[Mapped] = []  # what the global mapper gave, to build upon
+
+    def grown_from_all() -> Mapped | None:
+        return _regrown(mapped, _core(at_once[0].models[0], mapped.job), report) if at_once else None
+
+    hypotheses: list[tuple[str, Callable[[], Mapped | None]]] = [
+        ("from the largest part that agrees with itself", lambda: _regrown(mapped, core, report)),
+        (_ALL_AT_ONCE, lambda: _all_at_once(mapped, core)),
+        ("from the largest part of that", grown_from_all),
+        ("from nothing, from other pairs of photos", lambda: _from_nothing(mapped, core, report)),
+        ("the largest part of the first model alone", lambda: replace(mapped, models=[core.model, *mapped.models[1:]])),
+    ]
+    for number, (what, make) in enumerate(hypotheses):
+        last = number == len(hypotheses) - 1
+        if not last and time.perf_counter() - start > _MOST_TIME * mapped.seconds:
+            tell(f"not tried, for it takes too long: {what}")
+            continue
+        tell(f"next: {what}")
+        runner = checks()
+        found = runner.run(what, partial(_kept, mapped.job, f"second-chance-{number}", make), otherwise=None)
+        if found is None or not found.models:
+            tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
+            continue
+        if what == _ALL_AT_ONCE:
+            at_once.append(found)
+        examined = examine(found.models[:1], found.job, report, checks=runner)
+        size = 0 if examined.model is None else examined.model.num_reg_images()
+        attempts.append({"what": what, "models": [size, *(m.num_reg_images() for m in found.models[1:])]})
+        verdict = "accepted" if examined.verdict.accepted else examined.verdict.failures[0].kind
+        tell(f"{what}: {size} of {len(mapped.job.files)} photos placed, {verdict}")
+        if examined.verdict.accepted:
+            return Chance(replace(found, attempts=attempts), examined)
+    return Chance(replace(mapped, attempts=attempts), first)
+
+
+def is_contradicted(verdict: Verdict) -> bool:
+    """Whether pairs of photos speak against the model, rather than the capture as a whole."""
+    kinds = [failure.kind for failure in verdict.failures]
+    return any("contradict" in kind or "look alike" in kind for kind in kinds)
+
+
+@dataclass(frozen=True)
+class _Core:
+    """The largest group of photos that its strongest pairs hold together.
+
+    model: with the photos of the group only. suspects: pairs of photo numbers that may be mistaken: they contradict the
+    group from within, or would join it with photos that stronger pairs keep apart from it.
+    """
+
+    model: pycolmap.Reconstruction
+    suspects: frozenset[tuple[int, int]]
+
+
+def _core(model: pycolmap.Reconstruction, job: Job) -> _Core:
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
+    found = agreements(model, pairs)
+    joins = [(a.one, a.other, -a.matches if a.contradicts else a.matches * a.share) for a in found]
+    groups = consistent_groups(sorted(model.reg_image_ids()), joins)
+    group_of = {photo: number for number, group in enumerate(groups) for photo in group}
+    rest = pycolmap.Reconstruction(model)
+    for photo in sorted(set(model.reg_image_ids()) - set(groups[0])):
+        rest.deregister_frame(rest.image(photo).frame_id)
+    rest.tear_down()
+    numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
+    suspects = {
+        (numbers[a.one], numbers[a.other]) for a in found if a.contradicts == (group_of[a.one] == group_of[a.other])
+    }
+    return _Core(rest, frozenset(suspects - _neighbours_in_order(job, suspects)))
+
+
+def _neighbours_in_order(job: Job, pairs: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Of an ordered capture, the pairs that are near in the order: the camera was in nearly the same place."""
+    order = capture_order(job.names)
+    if order is None:
+        return set()
+    place = {number: index for index, number in enumerate(order)}
+    return {(one, other) for one, other in pairs if abs(place[one] - place[other]) <= _NEAR_IN_ORDER}
+
+
+def _regrown(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
+    """Adjust the core, and place the other photos from there without the suspects."""
+    if core.model.num_reg_images() < _LEAST_CORE * mapped.models[0].num_reg_images():
+        return None
+    base = pycolmap.Reconstruction(core.model)
+    settle(base, threads=mapped.job.threads, fixed=mapped.job.fixed_cameras)
+    return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT, base=base)
+
+
+def _from_nothing(mapped: Mapped, core: _Core, report: Report) -> Mapped | None:
+    """Map from the beginning, with another seed, from a pair of photos nearer to each other, without the suspects."""
+    return _mapped_without(mapped, core, report, attempt=_FIRST_ATTEMPT + 1, base=None)
+
+
+def _mapped_without(
+    mapped: Mapped, core: _Core, report: Report, *, attempt: int, base: pycolmap.Reconstruction | None
+) -> Mapped:
+    job = _with_own_database(mapped.job, without=core.suspects)
+    start = Start() if base is not None else SMALLER_BASELINE
+    models = map_photos(job, report, attempt=attempt, start=start, base=base)
+    job.database.unlink()
+    return Mapped(models, mapped.job, mapped.attempts)
+
+
+def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
+    """Rotations, then positions, of all photos together; with the intrinsics of the core."""
+    job = _with_own_database(mapped.job, without=frozenset())
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        for camera in core.model.cameras.values():
+            camera.has_prior_focal_length = True
+            database.update_camera(camera)
+    models = map_globally(job)
+    job.database.unlink()
+    return Mapped(models, mapped.job, mapped.attempts)
+
+
+def _with_own_database(job: Job, *, without: frozenset[tuple[int, int]]) -> Job:
+    """Copy the job's database, without some pairs of photo numbers, and return the job of the copy."""
+    copy = replace(job, rung="second-chance")
+    shutil.copyfile(job.database, copy.database)
+    left_out = {(min(pair), max(pair)) for pair in without}
+    keep_geometries(copy, [pair for pair in job.pairs if (min(pair), max(pair)) not in left_out])
+    return copy
+
+
+def _kept(job: Job, name: str, make: Callable[[], Mapped | None]) -> Mapped | None:
+    """Return what an earlier call has written under this name, or make it and write it."""
+    key = stage_key(mapping_key(job), name)
+    if (there := read_mapped(job, key, name=name)) is not None:
+        return there
+    made = make()
+    if made is None:
+        return None
+    write_mapped(made, key, name=name)
+    return read_mapped(job, key, name=name)

@@ -1,0 +1,208 @@
+"""Held-out photos that structure from motion has not seen: they are placed afterwards, with all else fixed.
+
+The training photos alone give cameras, points and poses. Then the held-out photos are searched for features and
+compared with the training photos, and each gets the pose at which the points it sees project to where it sees them.
+Nothing else moves, not by a bit: a number that is measured on these photos owes them nothing but their own poses.
+"""
+
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from nerfcli.poses.engine.database import evidence
+from nerfcli.poses.engine.features import extract, match, start_matching
+from nerfcli.poses.engine.retrieval import with_neighbours
+from nerfcli.poses.input.job import Job, Report
+from nerfcli.poses.input.stages import stage_key
+from nerfcli.poses.model.reasons import FEW_MATCHES
+
+# As in pycolmap's mapper (abs_pose_max_error, abs_pose_min_inlier_ratio).
+_MOST_ERROR_PX = 12.0
+_LEAST_INLIERS = 0.25
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Of one held-out photo: its name, how many of the points it sees agree on its pose, of how many, and how well."""
+
+    name: str
+    inliers: int
+    points: int
+    error_px: float
+
+
+def held_out_last(job: Job) -> Job:
+    """The job with cameras that took only held-out photos behind the others, so that the others keep their numbers."""
+    held_out = frozenset(job.held_out)
+    return replace(job, groups=tuple(sorted(job.groups, key=lambda group: held_out.issuperset(group.photos))))
+
+
+def training_part(job: Job) -> Job:
+    """The job of the training photos alone; their files keep their numbers, and so their ids."""
+    held_out = frozenset(job.held_out)
+    kept = [number for number in range(len(job.files)) if number not in held_out]
+    place = {number: index for index, number in enumerate(kept)}
+    groups = [
+        replace(group, photos=tuple(place[number] for number in group.photos if number in place))
+        for group in job.groups
+    ]
+    return replace(
+        job,
+        files=tuple(job.files[number] for number in kept),
+        names=tuple(job.names[number] for number in kept),
+        keys=tuple(job.keys[number] for number in kept),
+        masks=tuple(job.masks[number] for number in kept) if job.masks else (),
+        groups=tuple(group for group in groups if group.photos),
+        pairs=tuple((place[i], place[j]) for i, j in job.pairs if i in place and j in place),
+        held_out=(),
+    )
+
+
+def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Report) -> dict[str, Any]:
+    """Place the held-out photos of a job in the model that its training photos gave; the model on disk gets them too.
+
+    Args:
+        job: all photos.
+        training: its `training_part`.
+        result: what the worker found for it.
+        report: told ("extract", ...), ("match", ...) and ("map", photos done, in all).
+
+    Returns:
+        The result, for all photos of the job, with "strict": how each held-out photo was placed, and the fingerprint of
+        all that was there before, the same before and after.
+    """
+    folder = Path(job.folder) / "sparse" / "0"
+    whole = _renumbered(job, training, result)
+    if not result["models"]:
+        return whole
+    extract(job, report)
+    job = with_neighbours(job, report)
+    held_out = frozenset(job.held_out)
+    across = tuple((i, j) for i, j in job.pairs if (i in held_out) != (j in held_out))
+    start_matching(job, [(i, j) for i, j in job.pairs if not {i, j} <= held_out])
+    match(job, across, report)
+    model = pycolmap.Reconstruction(folder)
+    before = fingerprint(model)
+    placed: dict[int, Placed] = {}
+    reasons: dict[str, str] = {}
+    for done, number in enumerate(job.held_out):
+        found = _place(model, job, number, across)
+        if isinstance(found, Placed):
+            placed[number] = found
+        else:
+            reasons[str(number)] = found
+        report("map", done + 1, len(job.held_out))
+    # Held-out photos are points of view only: they are not among the images of which the fingerprint is.
+    after = fingerprint(model, without=frozenset(found.name for found in placed.values()))
+    if after != before:
+        raise AssertionError("placing held-out photos has changed the model of the training photos")
+    model.write_binary(str(folder))
+    whole["models"][0] = sorted([*whole["models"][0], *placed])
+    whole["left_out"] |= reasons
+    whole["evidence"] = evidence(job)
+    whole["pairs"] = result["pairs"] + len(across)
+    whole["strict"] = {
+        "held_out": [job.names[number] for number in job.held_out],
+        "placed": {found.name: {"inliers": found.inliers, "error_px": found.error_px} for found in placed.values()},
+        "fingerprint_before": before,
+        "fingerprint_after": after,
+    }
+    return whole
+
+
+def fingerprint(model: pycolmap.Reconstruction, *, without: frozenset[str] = frozenset()) -> str:
+    """A hash of every bit of cameras, points with their tracks, and poses of the images that are not in `without`."""
+    cameras = [(number, camera.model.name, _bits(camera.params)) for number, camera in sorted(model.cameras.items())]
+    points = [
+        (number, _bits(point.xyz), sorted((e.image_id, e.point2D_idx) for e in point.track.elements))
+        for number, point in sorted(model.points3D.items())
+    ]
+    images = [
+        (image.name, image.camera_id, _bits(image.cam_from_world().matrix()))
+        for _, image in sorted(model.images.items())
+        if image.has_pose and image.name not in without
+    ]
+    return stage_key(cameras, points, images)
+
+
+def _bits(values: Any) -> str:
+    return np.ascontiguousarray(values, dtype=np.float64).tobytes().hex()
+
+
+def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[tuple[int, int], ...]) -> Placed | str:
+    """Give one photo a pose in the model; or the reason why it has none."""
+    camera_id = next(at for at, group in enumerate(job.groups, start=1) if number in group.photos)
+    if camera_id not in model.cameras:
+        return "its camera took no photo for training"
+    pixels, points = _seen_points(model, job, number, pairs)
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = _MOST_ERROR_PX
+    options.ransac.min_inlier_ratio = _LEAST_INLIERS
+    options.ransac.random_seed = job.seed
+    refinement = pycolmap.AbsolutePoseRefinementOptions()
+    refinement.refine_focal_length = False
+    refinement.refine_extra_params = False
+    found = None
+    if len(points) >= FEW_MATCHES:
+        found = pycolmap.estimate_and_refine_absolute_pose(
+            pixels, points, model.cameras[camera_id], options, refinement
+        )
+    if found is None or found["num_inliers"] < FEW_MATCHES:
+        count = 0 if found is None else found["num_inliers"]
+        return f"matches too few points of the training photos ({count} agree of {len(points)})"
+    inside = np.asarray(found["inlier_mask"], dtype=bool)
+    image = pycolmap.Image(name=job.names[number], camera_id=camera_id, image_id=job.image_ids[number])
+    image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[inside]])
+    model.add_image_with_trivial_frame(image, found["cam_from_world"])
+    there = model.image(job.image_ids[number])
+    projected = [there.project_point(point) for point in points[inside]]
+    errors = [np.linalg.norm(p - xy) for p, xy in zip(projected, pixels[inside], strict=True) if p is not None]
+    return Placed(job.names[number], int(inside.sum()), len(points), float(np.mean(errors)))
+
+
+def _seen_points(
+    model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[tuple[int, int], ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) of a photo and the points (N, 3) that its verified matches with placed photos say are there."""
+    image_id = job.image_ids[number]
+    seen: set[tuple[int, int]] = set()  # feature of the photo, point
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        features = database.read_keypoints(image_id)[:, :2].astype(np.float64)
+        for i, j in pairs:
+            if number not in (i, j):
+                continue
+            other_id = job.image_ids[j if i == number else i]
+            if not model.exists_image(other_id) or not model.image(other_id).has_pose:
+                continue
+            matches = database.read_two_view_geometry(image_id, other_id).inlier_matches
+            observed = model.image(other_id).points2D
+            seen |= {(int(a), observed[int(b)].point3D_id) for a, b in matches if observed[int(b)].has_point3D()}
+    rows = sorted(seen)
+    pixels = features[[feature for feature, _ in rows]] if rows else np.zeros((0, 2))
+    points = np.array([model.point3D(point).xyz for _, point in rows]).reshape(-1, 3)
+    return pixels, points
+
+
+def _renumbered(job: Job, training: Job, result: Mapping[str, Any]) -> dict[str, Any]:
+    """A result of the training photos with the numbers that photos have among all."""
+    number = {index: job.files.index(file) for index, file in enumerate(training.files)}
+    by_number = {number[index]: known for index, known in enumerate(result["evidence"])}
+    nothing = {"features": 0, "best_matches": 0, "best_partner": None}
+    return {
+        **result,
+        "models": [sorted(number[index] for index in model) for model in result["models"]],
+        "evidence": [by_number.get(index, nothing) for index in range(len(job.files))],
+        "components": [
+            {**component, "photos": sorted(number[index] for index in component["photos"])}
+            for component in result["components"]
+        ],
+        **{
+            key: {str(number[int(index)]): value for index, value in result[key].items()}
+            for key in ("left_out", "pose_blur_px")
+        },
+    }

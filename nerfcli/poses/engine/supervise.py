@@ -1,0 +1,186 @@
+"""Run the worker: hear its progress, keep it within limits, end it when we end, and tell in words how it died."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from errno import ENOSPC
+from pathlib import Path
+
+import nerfcli
+from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
+from nerfcli.memory import resident_bytes
+from nerfcli.poses.input.settings import Limits
+
+_STAGES = {
+    "extract": "finding features",
+    "enlarge": "finding finer features",
+    "pair": "choosing pairs",
+    "match": "matching photos",
+    "map": "placing photos",
+    "check": "checking the poses",
+}
+_GO_ON = "what is complete is kept, and the same command goes on from there"
+_LESS_MEMORY = "use smaller photos (--max-size), fewer features (--max-features) or fewer threads (--threads)"
+# Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
+_LOOK_EVERY_SECONDS = 0.1
+# With less, SQLite and pycolmap cannot write the next part.
+_FULL_DISK_BYTES = 2_000_000
+
+
+class WorkerDiedError(UserError):
+    """The worker ended by itself, neither at a limit nor for want of room on the disk."""
+
+
+def run_worker(
+    job_path: Path,
+    *,
+    threads: int,
+    progress: Callable[[str, int, int], None],
+    limits: Limits = Limits(),
+    since: float | None = None,
+    lock: int | None = None,
+    notify: Callable[[str], None] = lambda note: None,
+) -> None:
+    """Run `nerfcli.poses.engine.worker` on a job until it is done; it is dead when this returns or raises.
+
+    Args:
+        job_path: the job's JSON file; the worker's log is written beside it.
+        threads: for OpenMP inside pycolmap, -1 for all.
+        progress: told (stage, done, total).
+        limits: the worker is ended when it goes beyond one of them.
+        since: the time of `time.monotonic` from which the limit of time counts; None for now.
+        lock: a descriptor that the worker inherits.
+        notify: told what the user should know, one sentence at a time.
+
+    Raises:
+        WorkerDiedError: the worker died; the text says while doing what, and its last words.
+        UserError: it was ended at a limit, or the disk is full.
+    """
+    log = job_path.with_name("worker.log")
+    package_root = str(Path(nerfcli.__file__).parent.parent)
+    # An empty entry would mean the current folder, whose files must not pass for libraries.
+    places = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
+    if threads > 0:
+        environment["OMP_NUM_THREADS"] = str(threads)
+    stage = "starting"
+    with log.open("wb") as stderr:
+        worker = subprocess.Popen(
+            # -P: else a file numpy.py or a folder nerfcli where the user happens to be would be taken for ours.
+            [sys.executable, "-P", "-m", "nerfcli.poses.engine.worker", str(job_path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=stderr,
+            env=environment,
+            pass_fds=() if lock is None or sys.platform == "win32" else (lock,),
+            # Ctrl-C on a terminal goes to its whole process group; only we answer it, by ending the worker.
+            start_new_session=True,
+        )
+        guard = _Guard(worker, limits, time.monotonic() if since is None else since)
+        try:
+            assert worker.stdout is not None
+            for line in worker.stdout:
+                message = json.loads(line)
+                if "note" in message:
+                    notify(message["note"])
+                    continue
+                stage = f"{_STAGES[message['stage']]} ({message['done']} of {message['total']} done)"
+                progress(message["stage"], message["done"], message["total"])
+            worker.wait()
+        finally:
+            worker.kill()
+            worker.communicate()
+            guard.stop()
+    if worker.returncode == 0:
+        return
+    if guard.reached is not None:
+        raise _limit_reached(guard.reached, limits, stage)
+    free_bytes = shutil.disk_usage(job_path.parent).free
+    raise explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"), free_bytes)
+
+
+def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> UserError:
+    """The error for a worker that ended with `returncode` while at `stage`, with the last words of its log.
+
+    Args:
+        free_bytes: on the disk that it wrote to. Where that is full, the log may be empty.
+    """
+    if free_bytes < _FULL_DISK_BYTES or "disk is full" in log or os.strerror(ENOSPC) in log:
+        return UserError(
+            f"structure from motion cannot write on while {stage}: the disk is full ({free_bytes / 1e6:.1f} MB free)",
+            f"free space on the disk, or choose another one with -o; {_GO_ON}",
+        )
+    if returncode == -signal.SIGKILL:
+        return WorkerDiedError(
+            f"structure from motion was killed while {stage}, most likely for want of memory",
+            f"{_LESS_MEMORY}; {_GO_ON}",
+            OUT_OF_MEMORY,
+        )
+    if "bad_alloc" in log or "MemoryError" in log:
+        return WorkerDiedError(
+            f"structure from motion ran out of memory while {stage}", f"{_LESS_MEMORY}; {_GO_ON}", OUT_OF_MEMORY
+        )
+    how = signal.Signals(-returncode).name if returncode < 0 else f"exit status {returncode}"
+    return WorkerDiedError(
+        f"structure from motion died ({how}) while {stage}: {_last_words(log)}",
+        "try once more with one thread; if it dies again, leave out the photos that came last, or report it",
+    )
+
+
+class _Guard:
+    """Watches a worker from a thread, and ends it when it goes beyond a limit; `reached` then says which."""
+
+    def __init__(self, worker: subprocess.Popen[bytes], limits: Limits, since: float):
+        self.reached: str | None = None
+        self._worker = worker
+        self._limits = limits
+        self._end = None if limits.seconds is None else since + limits.seconds
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Watch no longer. The worker is dead by now."""
+        self._stopped.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._stopped.wait(_LOOK_EVERY_SECONDS):
+            if self._end is not None and time.monotonic() > self._end:
+                self.reached = "time"
+            elif self._limits.memory_bytes is not None and self._resident() > self._limits.memory_bytes:
+                self.reached = "memory"
+            if self.reached is not None:
+                self._worker.kill()
+                return
+
+    def _resident(self) -> int:
+        return resident_bytes(self._worker.pid)
+
+
+def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:
+    if which == "memory":
+        assert limits.memory_bytes is not None
+        size = f"{limits.memory_bytes / 1e9:.3g} GB"
+        return UserError(
+            f"structure from motion was ended while {stage}: it needed more than the {size} of --memory",
+            f"{_LESS_MEMORY}, or allow more; {_GO_ON}",
+            OUT_OF_MEMORY,
+        )
+    return UserError(
+        f"structure from motion was ended while {stage}: the {limits.seconds:.3g} s of --time-limit are over",
+        f"allow more time or choose --quality fast; {_GO_ON}",
+        GATE_NOT_MET,
+    )
+
+
+def _last_words(log: str) -> str:
+    """The last lines that say something: not the stack frames that glog prints below them."""
+    lines = [line.strip() for line in log.splitlines() if line.strip() and not line.strip().startswith(("@", "***"))]
+    return " / ".join(lines[-3:]) or "no message"

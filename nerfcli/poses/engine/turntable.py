@@ -1,0 +1,318 @@
+"""An object that turns before a still background: recognised in a job's features, and masks that leave the object.
+
+A few pairs of photos are compared before the long work (see `stationary`). If they show two motions, masks of the
+object are found (see `background`), so that what is solved is the object's motion, as if the camera went around it.
+The masks stand in the scene's folder, named after the photos as those of `--masks` are, and training uses them too.
+Masks that are there from an earlier call are used as they are: they may have been mended by hand.
+"""
+
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from PIL import Image
+
+from nerfcli.errors import UserError
+from nerfcli.media.images import image_size, read_image
+from nerfcli.media.masks import read_mask
+from nerfcli.multiview.mutual_matches import mutual_matches
+from nerfcli.multiview.stationary import Motions, Stationary, motions, together
+from nerfcli.poses.engine.features import feature_keys
+from nerfcli.poses.input import background as still
+from nerfcli.poses.input.job import Job, LaidOutMask, Tell
+from nerfcli.poses.input.masks import write_mask, write_no_mask
+from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
+
+# Photos, evenly chosen, that are compared with those that follow them by so many places, and with one far away.
+_ANCHORS, _FIRST_ANCHORS = 24, 8
+_STEPS = (1, 2, 4)
+# Features per photo, the largest ones.
+_FEATURES = 1200
+# If fewer of the first pairs have matches that stay, the rest is not looked at.
+_FEW_STILL = 0.25
+# Of what is free of the object, a photo of the same camera place shows this share as the others do.
+_SAME_PLACE = 0.4
+# Masks are believed if most of the object's matches are in them and most of the background's are not, and if they leave
+# something of most photos, but not all.
+_LEAST_RIGHT = 0.7
+_WHITE = (0.003, 0.9)
+# To be changed with anything here that changes what is found.
+_VERSION = "two motions, 1"
+_STAGE = "turntable.json"
+MASKS = "masks"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Two photos by number, the places (N, 2) of their matches in the first one, as shares of its size, and what they
+    say."""
+
+    first: int
+    second: int
+    places: np.ndarray
+    motions: Motions
+
+
+def scene_masks(job: Job) -> Path:
+    """Where the masks of a job's object are: in the scene's folder."""
+    return Path(job.folder).parent / MASKS
+
+
+def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
+    """The job with the masks that an earlier call found, and what is to be reported; None if that is to be done anew.
+
+    Masks that the user gave are not doubted.
+    """
+    if job.masks:
+        return job, None
+    content = read_stage(Path(job.folder) / _STAGE, _key(job))
+    if content is None:
+        return None
+    if not content or not content["masked"]:
+        return job, content or None
+    masks = []
+    for name, file in zip(job.names, job.files, strict=True):
+        photo, mask = Path(job.originals) / name, scene_masks(job) / f"{name}.png"
+        target = job.mask_folder / f"{file}.png"
+        target.parent.mkdir(exist_ok=True)
+        if name in content["unmasked"]:
+            masks.append(write_no_mask(target, image_size(job.photos / file)))
+            continue
+        try:
+            masks.append(write_mask(target, read_mask(mask, photo) > 0))
+        except UserError:
+            return None
+    return replace(job, masks=tuple(masks)), content
+
+
+def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[str, Any] | None]:
+    """The job with masks of the object, if one turns before a still background; and what is to be reported of it.
+
+    Args:
+        job: its photos get masks.
+        featured: the job whose features are in the database, of the same photos or some of them.
+        tell: told in one sentence what was found.
+
+    Returns:
+        The job, and None where there is nothing to report. Without masks that can be believed the job is as it was.
+    """
+    start = time.perf_counter()
+    features = _Features(featured)
+    compared = _compared(features)
+    said = _together(compared)
+    if not said.two_motions:
+        write_stage(Path(job.folder) / _STAGE, _key(job), {})
+        return job, None
+    facts = _facts(said)
+    masks: list[np.ndarray | None] = [None] * len(job.files)
+    if said.found:
+        places = {number: job.files.index(file) for number, file in enumerate(featured.files)}
+        masks = _masks(job, compared, groups=_same_place(compared, places), places=places)
+        facts |= _judged(masks, compared, places)
+    facts["masked"] = facts.get("why_not") is None and said.found
+    facts["unmasked"] = [name for name, mask in zip(job.names, masks, strict=True) if mask is None]
+    if facts["masked"]:
+        job = replace(job, masks=_written(job, masks))
+    facts["seconds"] = round(time.perf_counter() - start, 3)
+    write_stage(Path(job.folder) / _STAGE, _key(job), facts)
+    if said.found:
+        tell(sentence(facts))
+    return job, facts
+
+
+def sentence(facts: dict[str, Any]) -> str:
+    """What was found, for the user."""
+    text = (
+        f"an object turns, or is moved, before a background that keeps its place in the picture, as on a turntable "
+        f"({facts['pairs_two_motions']} of {facts['pairs']} pairs show both motions)"
+    )
+    if not facts["masked"]:
+        return f"{text}; no masks of the object could be found, for {facts['why_not']}: give them with --masks"
+    several = len(facts["unmasked"])
+    rest = f", {several} photos have none" if several else ""
+    return (
+        f"{text}: its masks are in {MASKS}/ of the scene{rest}, and the poses are those of a camera around the object"
+    )
+
+
+def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
+    """A refusal with what to do about an object that turns before a still background, if there is one."""
+    if facts is None or not facts["wide"]:
+        return error
+    masks = f"those in {MASKS}/ of the scene, mended" if facts["masked"] else "white where the object is"
+    hint = f"an object turns before a still background: give masks of it with --masks, {masks}; or {error.hint}"
+    return UserError(error.message, hint, error.exit_code)
+
+
+class _Features:
+    """Places and descriptors of photos in the database, the largest features first, read when they are needed."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self._read: dict[int, tuple[np.ndarray, np.ndarray, tuple[int, int]]] = {}
+
+    def of(self, number: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+        """Pixels (N, 2), descriptors (N, 128), and the photo's (width, height)."""
+        if number not in self._read:
+            with closing(pycolmap.Database.open(str(self.job.database))) as database:
+                image_id = self.job.image_ids[number]
+                keypoints = np.asarray(database.read_keypoints(image_id))
+                descriptors = np.asarray(database.read_descriptors(image_id).data)
+                camera = database.read_camera(database.read_image(image_id).camera_id)
+            if keypoints.shape[1] >= 6:  # x, y and a 2 x 2 matrix
+                scales = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+            else:
+                scales = keypoints[:, 2]
+            order = np.argsort(-scales, kind="stable")[:_FEATURES]
+            pixels = keypoints[order, :2].astype(np.float64)
+            self._read[number] = pixels, descriptors[order], (camera.width, camera.height)
+        return self._read[number]
+
+    def compare(self, first: int, second: int) -> Compared | None:
+        """Two photos, None if they have not the same size."""
+        (x, one, size), (y, other, other_size) = self.of(first), self.of(second)
+        if size != other_size:
+            return None
+        a, b = mutual_matches(one, other)
+        return Compared(first, second, x[a] / size, motions(x[a], y[b], size))
+
+
+def _compared(features: _Features) -> list[Compared]:
+    """Photos that follow each other, and photos that do not; all of a choice if names follow no order."""
+    count = len(features.job.files)
+    first = _pairs(count, _FIRST_ANCHORS)
+    pairs = _all_compared(features, first)
+    if sum(pair.motions.still > 0 for pair in pairs) < _FEW_STILL * len(pairs):
+        return pairs
+    pairs += _all_compared(features, [pair for pair in _pairs(count, _ANCHORS) if pair not in set(first)])
+    said = _together(pairs)
+    if said.still > said.moved and not said.two_motions:
+        done = {(pair.first, pair.second) for pair in pairs}
+        pairs += _all_compared(
+            features, [pair for pair in combinations(_anchors(count, _ANCHORS), 2) if pair not in done]
+        )
+    return pairs
+
+
+def _together(pairs: Sequence[Compared]) -> Stationary:
+    return together([(pair.first, pair.second, pair.motions) for pair in pairs])
+
+
+def _all_compared(features: _Features, pairs: Sequence[tuple[int, int]]) -> list[Compared]:
+    found = (features.compare(first, second) for first, second in pairs)
+    return [pair for pair in found if pair is not None]
+
+
+def _anchors(count: int, most: int) -> list[int]:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
+
+
+def _pairs(count: int, most: int) -> list[tuple[int, int]]:
+    anchors = _anchors(count, most)
+    near = {(i, i + step) for i in anchors for step in _STEPS if i + step < count}
+    far = {(anchors[k], anchors[k + len(anchors) // 2]) for k in range(len(anchors) - len(anchors) // 2)}
+    return sorted(pair for pair in near | far if pair[0] < pair[1])
+
+
+def _same_place(pairs: Sequence[Compared], places: dict[int, int]) -> list[list[int]]:
+    """Photos (numbers in the whole job) that pairs with still matches join: each set is of one place of the camera."""
+    groups: list[set[int]] = []
+    for pair in pairs:
+        if pair.motions.two or pair.motions.only_still:
+            both = {places[pair.first], places[pair.second]}
+            touching = [group for group in groups if group & both]
+            groups = [group for group in groups if not group & both]
+            groups.append(both.union(*touching))
+    return sorted((sorted(group) for group in groups), key=lambda group: (-len(group), group))
+
+
+def _masks(
+    job: Job, pairs: Sequence[Compared], *, groups: Sequence[Sequence[int]], places: dict[int, int]
+) -> list[np.ndarray | None]:
+    """A small mask for each photo that a background is found for."""
+    pictures = [still.small(read_image(job.photos / file)[..., :3]) for file in job.files]
+    behinds = []
+    for group in groups:
+        members = [number for number in group if pictures[number].shape == pictures[group[0]].shape]
+        inside = set(members)
+        stay = [
+            pair.places[pair.motions.stays] for pair in pairs if {places[pair.first], places[pair.second]} <= inside
+        ]
+        if len(members) >= still.LEAST_PHOTOS and stay:
+            behinds.append(still.background([pictures[number] for number in members], np.concatenate(stay)))
+    masks: list[np.ndarray | None] = []
+    for picture in pictures:
+        fitting = [behind for behind in behinds if behind.colours.shape == picture.shape]
+        best = max(fitting, key=lambda behind: still.agreement(picture, behind), default=None)
+        believed = best is not None and still.agreement(picture, best) >= _SAME_PLACE
+        masks.append(still.differs(picture, best) if best is not None and believed else None)
+    return masks
+
+
+def _judged(masks: Sequence[np.ndarray | None], pairs: Sequence[Compared], places: dict[int, int]) -> dict[str, Any]:
+    """How much of the photos the masks leave, and how many matches of the two motions are on the right side."""
+    found = [mask for mask in masks if mask is not None]
+    moving, staying = [], []
+    for pair in pairs:
+        mask = masks[places[pair.first]]
+        if mask is None or not pair.motions.two:
+            continue
+        height, width = mask.shape
+        columns, rows = (pair.places * (width, height)).astype(int).clip(0, (width - 1, height - 1)).T
+        inside = mask[rows, columns]
+        moving.append(inside[pair.motions.moves].mean())
+        staying.append(1 - inside[pair.motions.stays].mean())
+    if not moving:
+        return {"why_not": "too few photos show the same background"}
+    white = np.quantile([mask.mean() for mask in found], [0, 0.5, 1])
+    right = float(np.median(moving)), float(np.median(staying))
+    facts: dict[str, Any] = {
+        "white_share": [round(float(share), 4) for share in white],
+        "object_matches_in_white": round(right[0], 4),
+        "background_matches_in_black": round(right[1], 4),
+    }
+    if not _WHITE[0] <= white[1] <= _WHITE[1]:
+        facts["why_not"] = f"they would leave {100 * white[1]:.1f} % of a photo"
+    elif min(right) < _LEAST_RIGHT:
+        facts["why_not"] = (
+            f"{100 * right[0]:.0f} % of the object's matches would be in them, and {100 - 100 * right[1]:.0f} % of the "
+            "background's"
+        )
+    return facts
+
+
+def _written(job: Job, masks: Sequence[np.ndarray | None]) -> tuple[LaidOutMask, ...]:
+    """Write the masks for pycolmap, and for the user those that there are."""
+    job.mask_folder.mkdir(exist_ok=True)
+    scene_masks(job).mkdir(exist_ok=True)
+    laid_out = []
+    for name, file, mask in zip(job.names, job.files, masks, strict=True):
+        size, target = image_size(job.photos / file), job.mask_folder / f"{file}.png"
+        if mask is None:
+            laid_out.append(write_no_mask(target, size))
+            continue
+        used = still.enlarged(mask, size)
+        laid_out.append(write_mask(target, used))
+        Image.fromarray(used).save(scene_masks(job) / f"{name}.png")
+    return tuple(laid_out)
+
+
+def _facts(said: Stationary) -> dict[str, Any]:
+    return {
+        "pairs": said.two + said.still + said.moved,
+        "pairs_two_motions": said.two,
+        "pairs_still": said.still,
+        "pairs_one_motion": said.moved,
+        "still_share": round(said.cells, 4),
+        "wide": said.wide,
+    }
+
+
+def _key(job: Job) -> str:
+    return stage_key(_VERSION, feature_keys(replace(job, masks=())), job.held_out)

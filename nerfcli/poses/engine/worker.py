@@ -1,0 +1,229 @@
+"""The child process: pycolmap from photos to a model on disk. Run as `python -m nerfcli.poses.engine.worker JOB.json`.
+
+pycolmap is C++ that may end the process without a Python exception, so it gets one of its own. It reads a job, goes on
+from the stages that are complete in the job's folder, leaves `sparse/0` and `result.json` there, and tells its progress
+as JSON lines {"stage", "done", "total"} on stdout, and what the user should know as {"note"}. Everything else, glog's
+lines included, goes to stderr. It ends by itself when its stdin closes, which is what happens when the parent dies,
+however it dies.
+
+Photos go by number here: pycolmap sees `00000.jpg`, `00001.png`..., so that a space or an umlaut in a name
+cannot break the list of pairs.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from nerfcli.finite import finite
+from nerfcli.poses.engine.components import describe_components
+from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images
+from nerfcli.poses.engine.features import extract, match, start_matching
+from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
+from nerfcli.poses.engine.retrieval import with_neighbours
+from nerfcli.poses.engine.second_chance import is_contradicted, second_chance
+from nerfcli.poses.engine.strict import place_held_out, training_part
+from nerfcli.poses.engine.turntable import recalled, with_object_masks
+from nerfcli.poses.input.job import Job, Report, Tell, read_job
+from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
+from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.examine import examine
+
+# The last stage's file: what the report needs. The model stands beside it, in sparse/0.
+RESULT = "result.json"
+
+
+def main(job_path: str) -> None:
+    """Do one job and write its result."""
+    report, tell = _take_stdout()
+    _end_with_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all processes of a command: the parent answers it
+    pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
+    job = read_job(Path(job_path))
+    pycolmap.set_random_seed(job.seed)
+    solve(job, report, tell)
+
+
+def solve(job: Job, report: Report, tell: Tell) -> None:
+    """Extract, match, map, check; each goes on from what earlier calls left."""
+    known = recalled(job)
+    result, key = Path(job.folder) / RESULT, result_key(job if known is None else known[0])
+    if _is_complete(job, key):
+        _name_images(job)
+        return
+    result.unlink(missing_ok=True)
+    seconds: dict[str, float] = {}
+    job, moving = _looked_at(job, report, tell, seconds=seconds) if known is None else known
+    key = result_key(job)
+    found = _solve_strictly(job, report, tell) if job.held_out else _estimate(job, report, tell)
+    for stage, value in seconds.items():
+        found["seconds"][stage] = round(found["seconds"].get(stage, 0.0) + value, 3)
+    found["moving_foreground"] = moving
+    found, replaced = finite(found)
+    found["not_finite"] = replaced
+    write_stage(result, key, found)
+    _name_images(job)
+
+
+def result_key(job: Job) -> str:
+    """Return a hash of all that the result depends on."""
+    return stage_key(mapping_key(job), job.component, job.skipped_checks)
+
+
+def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> tuple[Job, dict[str, Any] | None]:
+    """Return the job with masks of an object that turns before a still background, and what to report of it, if any.
+
+    Held-out photos get masks too, but what is looked for are the features of the others.
+    """
+    discard_if_damaged(job.database)
+    with _timed(seconds, "extract"):
+        extract(training_part(job), report)
+    with _timed(seconds, "motions"):
+        return with_object_masks(job, training_part(job), tell)
+
+
+def _solve_strictly(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
+    """Estimate from the training photos alone, then place the held-out ones in the model."""
+    training = training_part(job)
+    found = _estimate(training, report, tell)
+    with _timed(found["seconds"], "place"):
+        found = place_held_out(job, training, found, report)
+    found["model_files"] = model_keys(job)  # which the held-out photos are in now
+    return found
+
+
+def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
+    """Write `sparse/0` if there is a model, and return what the report needs."""
+    seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
+    mapped = _mapped(job, report, tell, seconds=seconds)
+    checks = Checks(Path(job.folder), skip=dict(job.skipped_checks))
+    with _timed(seconds, "check"):
+        wanted, others = _split(mapped.models, job.component)
+        examined = examine(wanted, mapped.job, report, localised=mapped.localised, checks=checks)
+        if job.component == 1 and is_contradicted(examined.verdict):
+            chance = second_chance(
+                mapped,
+                examined,
+                report,
+                tell,
+                checks=lambda: Checks(Path(job.folder), skip=dict(job.skipped_checks)),
+            )
+            mapped, examined = chance.mapped, chance.examined
+            others = mapped.models[1:]
+    model = examined.model
+    placed = [] if model is None else photo_numbers(model, job)
+    result: dict[str, Any] = {
+        "seconds": seconds,
+        "attempts": mapped.attempts,
+        "evidence": evidence(mapped.job),
+        "pairs": len(mapped.job.pairs),
+        "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
+        "models": [placed, *(photo_numbers(other, job) for other in others)] if mapped.models else [],
+        "left_out": {str(number): reason for number, reason in examined.left_out.items()},
+        "pose_blur_px": {str(number): px for number, px in examined.blur_px.items()},
+        "verdict": examined.verdict.to_json(),
+        "components": describe_components(mapped.models, mapped.job),
+        **examined.details,
+    }
+    if model is not None:
+        model = _coloured(model, job, checks)
+        result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
+        result["cameras"] = describe_cameras(model, job, examined.uncertainty)
+        result["points"] = model.num_points3D()
+        write_model(model, job)
+    result["model_files"] = model_keys(job) if model is not None else {}
+    return result
+
+
+def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) -> Mapped:
+    """Return the models of an earlier call if they are whole, or map the photos; they are on disk when this returns."""
+    discard_if_damaged(job.database)
+    key = mapping_key(job)
+    mapped = read_mapped(job, key)
+    if mapped is not None:
+        tell("the photos are mapped already: only the checks are left")
+        return mapped
+    with _timed(seconds, "extract"):
+        extract(job, report)
+    with _timed(seconds, "match"):
+        matched = with_neighbours(job, report)
+        start_matching(matched, matched.pairs)
+        match(matched, matched.pairs, report)
+    with _timed(seconds, "map"):
+        start = time.perf_counter()
+        climbed = climb(matched, report, tell)
+        write_mapped(replace(climbed, seconds=time.perf_counter() - start), key)
+    mapped = read_mapped(job, key)
+    if mapped is None:
+        raise OSError(f"the models in {job.folder} cannot be read back")
+    return mapped
+
+
+def _coloured(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> pycolmap.Reconstruction:
+    return checks.run("colours of points", lambda: with_colours(model, job), otherwise=model)
+
+
+def _split(
+    models: list[pycolmap.Reconstruction], component: int
+) -> tuple[list[pycolmap.Reconstruction], list[pycolmap.Reconstruction]]:
+    """Return the wanted model, as a list of one or none, and the others."""
+    return models[component - 1 : component], [*models[: component - 1], *models[component:]]
+
+
+def _is_complete(job: Job, key: str) -> bool:
+    """Whether the result is there and its model is the one that was written with it."""
+    there = read_stage(Path(job.folder) / RESULT, key)
+    return there is not None and there["model_files"].items() <= model_keys(job).items()
+
+
+def _name_images(job: Job) -> None:
+    """Give the images of the database the photos' own names, if it is there."""
+    if job.database.exists():
+        name_images(job)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[stage] = round(time.perf_counter() - start, 3)
+
+
+def _take_stdout() -> tuple[Report, Tell]:
+    """Functions that report on stdout, which from here on is closed to every other writer in the process."""
+    channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+
+    def send(message: dict[str, Any]) -> None:
+        channel.write(json.dumps(message) + "\n")
+        channel.flush()
+
+    return (
+        lambda stage, done, total: send({"stage": stage, "done": done, "total": total}),
+        lambda text: send({"note": text}),
+    )
+
+
+def _end_with_parent() -> None:
+    """End this process at once when stdin closes."""
+
+    def wait() -> None:
+        os.read(0, 1)
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

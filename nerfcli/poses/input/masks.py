@@ -1,0 +1,90 @@
+"""Masks for feature extraction: found by the photos' names, checked, and laid out for the worker."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from nerfcli.errors import UserError
+from nerfcli.media.masks import find_mask, read_mask
+from nerfcli.poses.input.job import LaidOutMask
+from nerfcli.poses.input.photos import Photos
+from nerfcli.poses.input.stages import stage_key
+
+_NAMES_SHOWN = 4
+_READERS = 4
+
+
+def lay_out_masks(
+    photos: Photos, files: Sequence[str], masks: Path, *, folder: Path, notify: Callable[[str], None]
+) -> tuple[LaidOutMask, ...]:
+    """Write a mask for each photo, upright, for pycolmap: 00000.jpg.png for the photo 00000.jpg, black where not used.
+
+    Args:
+        photos: the photos, and files: their names below the worker's folder of photos.
+        masks: the user's folder of masks.
+        folder: where to write; made if need be.
+        notify: told which photos have no mask, and which are hidden by theirs.
+
+    Raises:
+        UserError: no such folder, no mask in it for any photo, or masks that cannot be read or do not fit.
+    """
+    _check_folder(photos, masks)
+    found = [find_mask(name, masks) for name in photos.names]
+    if not any(found):
+        raise UserError(
+            f"no photo of {photos.folder} has a mask in {masks}",
+            f"name them after the photos: {photos.names[0]}.png or {Path(photos.names[0]).stem}.png",
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def one(index: int) -> LaidOutMask | str:
+        path, photo = found[index], photos.photos[index]
+        if path is None:
+            return write_no_mask(folder / f"{files[index]}.png", (photo.width, photo.height))
+        try:
+            used = read_mask(path, photos.folder / photo.name) > 0
+        except UserError as error:
+            return error.message
+        return write_mask(folder / f"{files[index]}.png", used)
+
+    with ThreadPoolExecutor(_READERS) as readers:
+        laid_out = list(readers.map(one, range(len(found))))
+    wrong = [text for text in laid_out if isinstance(text, str)]
+    if wrong:
+        hint = "give masks of the photos' size, upright or as the photos are stored; black is what is ignored"
+        raise UserError(f"{len(wrong)} masks do not fit: {_some(wrong, '; ')}", hint)
+    without = [name for name, mask in zip(photos.names, found, strict=True) if mask is None]
+    if without:
+        notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used whole: {_some(without)}")
+    done = tuple(mask for mask in laid_out if isinstance(mask, LaidOutMask))
+    hidden = [name for name, mask in zip(photos.names, done, strict=True) if mask.used_share == 0]
+    if hidden:
+        notify(f"{len(hidden)} masks are black all over, so that nothing of the photo is used: {_some(hidden)}")
+    return done
+
+
+def write_mask(path: Path, used: np.ndarray) -> LaidOutMask:
+    """Write a mask for pycolmap: which pixels of the upright photo are used, bool (height, width)."""
+    Image.fromarray(used).save(path)
+    return LaidOutMask(stage_key(used.shape, np.packbits(used).tobytes().hex()), float(used.mean()))
+
+
+def write_no_mask(path: Path, size: tuple[int, int]) -> LaidOutMask:
+    """Write a white mask for a photo of (width, height): pycolmap leaves out a photo whose mask is not there."""
+    Image.new("1", size, 1).save(path)
+    return LaidOutMask()
+
+
+def _check_folder(photos: Photos, masks: Path) -> None:
+    if not masks.is_dir():
+        raise UserError(f"there is no folder of masks {masks}", "give the folder that holds a mask for each photo")
+    if masks.resolve() == photos.folder.resolve():
+        raise UserError(f"{masks} holds the photos themselves", "put the masks into a folder of their own")
+
+
+def _some(texts: Sequence[str], separator: str = ", ") -> str:
+    more = f" and {len(texts) - _NAMES_SHOWN} more" if len(texts) > _NAMES_SHOWN else ""
+    return separator.join(texts[:_NAMES_SHOWN]) + more

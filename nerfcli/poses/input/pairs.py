@@ -1,0 +1,155 @@
+"""Which photos to compare with which.
+
+Matching is quadratic in the photos, and with a hundred of them the longest step.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from nerfcli.errors import UserError
+from nerfcli.poses.input.photos import Photo
+
+# What may be asked for. "auto" is one of the others, by the number of photos and what is known of them.
+PAIRINGS = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
+
+# Up to here every photo is compared with every other one, whatever the names say.
+EXHAUSTIVE_UP_TO = 60
+# In an ordered capture, so many followers...
+_FOLLOWERS = 10
+# ...and so many that look alike though they are not near in the order, which closes loops.
+_LOOP_NEIGHBOURS = 8
+# In an unordered one.
+_NEIGHBOURS = 25
+# With GPS: so many that are nearest, and so many that look alike.
+_NEAREST = 20
+_SPATIAL_NEIGHBOURS = 5
+# Neighbours that are all nearer than this look no different to a phone's GPS.
+_GPS_ERROR_METRES = 10.0
+_EARTH_RADIUS_METRES = 6_371_000.0
+# From one photo to the next, where the order of times is an order of places.
+_WALKING_PACE_SECONDS = 30.0
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """The rule, one of `PAIRINGS` but "auto", or "file"; pairs (i, j), i < j, of photo numbers; and with how many more
+    that look alike each photo is compared, which is known once their features are.
+    """
+
+    rule: str
+    pairs: tuple[tuple[int, int], ...]
+    neighbours: int
+
+
+def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
+    """Which photos to compare, by one of the rules below.
+
+    "auto" compares a small capture exhaustively, and a larger one as its photos allow: by where they were taken, if
+    their GPS can tell neighbours apart; in the order in which they were taken, if there is one; else by how alike they
+    look.
+
+    Raises:
+        ValueError: no such rule.
+        UserError: "spatial" is asked for, and a photo has no GPS position.
+    """
+    if rule == "auto":
+        rule = _best_rule(photos)
+    if rule == "exhaustive":
+        return Pairing("exhaustive", all_pairs(len(photos)), 0)
+    if rule == "sequential":
+        return Pairing("sequential", sequential_pairs(order_of_capture(photos) or range(len(photos))), _LOOP_NEIGHBOURS)
+    if rule == "retrieval":
+        return Pairing("retrieval", (), _NEIGHBOURS)
+    if rule == "spatial":
+        return Pairing("spatial", nearest_pairs(_positions(photos), _NEAREST), _SPATIAL_NEIGHBOURS)
+    raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {rule}")
+
+
+def _best_rule(photos: Sequence[Photo]) -> str:
+    if len(photos) <= EXHAUSTIVE_UP_TO:
+        return "exhaustive"
+    if all(photo.exif.gps for photo in photos):
+        places = _positions(photos)
+        radii = np.sort(np.linalg.norm(places[:, None] - places[None], axis=-1), axis=1)[:, _NEAREST]
+        if np.median(radii) > _GPS_ERROR_METRES:
+            return "spatial"
+    return "retrieval" if order_of_capture(photos) is None else "sequential"
+
+
+def sequential_pairs(order: Sequence[int]) -> tuple[tuple[int, int], ...]:
+    """Each photo with the next 10 in the order, and with those 16, 32, 64... further on."""
+    count = len(order)
+    steps = [*range(1, _FOLLOWERS + 1), *(2**k for k in range(4, count.bit_length()))]
+    near = {(i, i + step) for step in steps for i in range(count - step)}
+    return in_blocks({_rising(order[i], order[j]) for i, j in near})
+
+
+def nearest_pairs(places: np.ndarray, count: int) -> tuple[tuple[int, int], ...]:
+    """Each of the places (N, 2) with the `count` that are nearest to it."""
+    distances = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    nearest = np.argsort(distances, axis=1, kind="stable")[:, : min(count, len(places) - 1)]
+    return in_blocks({_rising(i, j) for i, row in enumerate(nearest.tolist()) for j in row})
+
+
+def all_pairs(count: int) -> tuple[tuple[int, int], ...]:
+    """Every (i, j) with i < j < count, block by block."""
+    return in_blocks(combinations(range(count), 2))
+
+
+def in_blocks(pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
+    """The pairs in an order in which few photos are in use at a time, since the matcher keeps what it used last."""
+    block = 16
+    return tuple(sorted(pairs, key=lambda pair: (pair[0] // block, pair[1] // block, pair)))
+
+
+def order_of_capture(photos: Sequence[Photo]) -> list[int] | None:
+    """Indices in the order of capture: by the numbers in the names, or by the clock of the one camera; else None."""
+    by_name = capture_order([photo.name for photo in photos])
+    if by_name is not None:
+        return by_name
+    times = [photo.exif.taken for photo in photos if photo.exif.taken is not None]
+    if len(times) < len(photos) or len({(photo.exif.make, photo.exif.model) for photo in photos}) > 1:
+        return None
+    order = sorted(range(len(times)), key=times.__getitem__)
+    gaps = sorted(times[j] - times[i] for i, j in pairwise(order))
+    # Photos of a week are in order too, but not because the camera moved from one to the next.
+    return order if gaps[len(gaps) // 2] <= _WALKING_PACE_SECONDS else None
+
+
+def capture_order(names: Sequence[str]) -> list[int] | None:
+    """Indices of the names by their number, if they differ in one number and nothing else; None otherwise.
+
+    So they do when a camera or a video tool wrote them: IMG_0412.JPG, frame_9.png, frame_10.png.
+    """
+    parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in names]
+    matches = [match for match in parts if match]
+    if len(matches) < len(names) or len({(match[1], match[3].lower()) for match in matches}) > 1:
+        return None
+    numbers = [int(match[2]) for match in matches]
+    if len(set(numbers)) < len(numbers):
+        return None
+    return sorted(range(len(numbers)), key=numbers.__getitem__)
+
+
+def _positions(photos: Sequence[Photo]) -> np.ndarray:
+    """(N, 2) metres to the east and to the north. Heights are left out: GPS knows them least."""
+    places = [photo.exif.gps for photo in photos]
+    without = [photo.name for photo in photos if photo.exif.gps is None]
+    if without:
+        raise UserError(
+            f"--pairing spatial: {len(without)} of {len(photos)} photos have no GPS position ({without[0]})",
+            "choose --pairing retrieval or auto",
+        )
+    degrees = np.array([place[:2] for place in places if place is not None])  # latitude, longitude
+    latitude = np.radians(degrees[:, 0].mean())
+    east = (degrees[:, 1] - degrees[0, 1] + 180) % 360 - 180
+    return np.radians(np.column_stack([east * np.cos(latitude), degrees[:, 0]])) * _EARTH_RADIUS_METRES
+
+
+def _rising(i: int, j: int) -> tuple[int, int]:
+    return (i, j) if i < j else (j, i)

@@ -1,0 +1,147 @@
+"""What structure from motion is about to do and about how long it will take: said before it starts."""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from nerfcli.poses.input.pairs import Pairing
+from nerfcli.poses.input.photos import Photos
+from nerfcli.poses.input.settings import PoseSettings
+
+# How many times as long a photo takes whose features are sought in the enlarged picture too, see `features.extract`.
+_ENLARGED_FACTOR = 3.0
+# CPU seconds, measured on one core of a 2-core server; within a factor of two on others.
+_SECONDS_PER_MEGAPIXEL = 0.4
+_SECONDS_PER_PAIR = 0.045
+_FEATURES_PER_PAIR = 4096
+_SECONDS_PER_LOOK = 0.0006
+# Of the mapper: the first for few photos; the second for each other photo, since all are adjusted again and again.
+_MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.3, 0.0025
+_CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.1
+# How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
+_GROWTH = {"map": 1.3}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """photos: how many. rule and pairs: see `Pairing`; pairs is the most that may come of it. seconds: per stage."""
+
+    photos: int
+    max_image_size: int
+    max_features: int
+    rule: str
+    pairs: int
+    seconds: dict[str, float]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    def describe(self) -> str:
+        """One sentence."""
+        times = ", ".join(f"{_WORDS[stage]} {duration(seconds)}" for stage, seconds in self.seconds.items())
+        about = f"about {duration(sum(self.seconds.values()))}"
+        return f"{self.photos} photos, {self.pairs} pairs to compare ({self.rule}), {about}: {times}"
+
+
+# In the order of the work.
+_WORDS = {"extract": "features", "pair": "pairs", "match": "matches", "map": "poses", "check": "checks"}
+
+
+def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threads: int) -> Plan:
+    """The plan for these photos; threads is how many there really are."""
+    count = len(photos.photos)
+    all_pairs = count * (count - 1) // 2
+    pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
+    megapixels = 0.0
+    for photo in photos.photos:
+        scale = min(1.0, settings.max_image_size / max(photo.width, photo.height))
+        megapixels += photo.width * photo.height * scale**2 / 1e6
+    seconds = {
+        "extract": megapixels * _SECONDS_PER_MEGAPIXEL / threads,
+        "pair": all_pairs * _SECONDS_PER_LOOK / threads if pairing.neighbours else 0.0,
+        "match": pairs * _SECONDS_PER_PAIR * settings.max_features / _FEATURES_PER_PAIR / threads,
+        "map": count * (_MAP_SECONDS_PER_PHOTO + count * _MAP_SECONDS_PER_TWO),
+        "check": _CHECK_SECONDS + count * _CHECK_SECONDS_PER_PHOTO,
+    }
+    return Plan(
+        photos=count,
+        max_image_size=settings.max_image_size,
+        max_features=settings.max_features,
+        rule=pairing.rule,
+        pairs=pairs,
+        seconds={stage: round(value, 1) for stage, value in seconds.items() if value > 0},
+    )
+
+
+class Outlook:
+    """How much is left, told as the work goes on: measured for the stage at hand, for later ones from the plan.
+
+    The plan's seconds are stretched by how much longer all work so far took, so that after a few photos it fits the
+    machine and what else it does. Work that an earlier call has done counts for nothing. Which photos are enlarged to
+    find more features in them is known only after the first search; where that adds work, the share that is done stands
+    still until it is true again.
+
+    Args:
+        plan: for the stages that have not begun.
+        clock: seconds.
+    """
+
+    def __init__(self, plan: Plan, clock: Callable[[], float] = time.monotonic):
+        self._plan = plan
+        self._clock = clock
+        self._start = clock()
+        self._stage = ""
+        self._began = (0.0, 0.0)
+        self._worked = (0.0, 0.0)  # seconds, and what the plan has for the same work, of the stages before
+        self._latest = (0.0, 0.0)  # the same of the stage at hand
+        self._seconds = dict(plan.seconds)
+        self._share = 0.0
+
+    def update(self, stage: str, done: int, total: int) -> tuple[float, float]:
+        """(share of all work that is done, seconds that are left)."""
+        now = self._clock()
+        if stage == "enlarge":
+            self._plan_enlarging(total)
+        ratio = (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
+        if self._begins_again(stage, ratio):
+            self._share = 0.0
+        if stage != self._stage or ratio < self._began[1]:
+            self._worked = (self._worked[0] + self._latest[0], self._worked[1] + self._latest[1])
+            self._stage, self._began = stage, (now, ratio)
+        planned = self._seconds.get(stage, 0.0)
+        began, ratio_before = self._began
+        self._latest = (now - began, planned * (ratio - ratio_before))
+        seconds, of_plan = self._worked[0] + self._latest[0], self._worked[1] + self._latest[1]
+        stretch = seconds / of_plan if of_plan > 0 else 1.0
+        if ratio > ratio_before:
+            left = (now - began) * (1 - ratio) / (ratio - ratio_before)
+        else:
+            left = stretch * planned * (1 - ratio)
+        stages = list(self._seconds)
+        later = stages[stages.index(stage) + 1 :] if stage in stages else []
+        left += stretch * sum(self._seconds[name] for name in later)
+        spent = now - self._start
+        self._share = max(self._share, spent / (spent + left) if left > 0 else 1.0)
+        return self._share, left
+
+    def _begins_again(self, stage: str, ratio: float) -> bool:
+        """Whether the work goes back, for another attempt. Stages without a plan come last."""
+        order = list(self._seconds)
+        new, old = (order.index(name) if name in order else len(order) for name in (stage, self._stage))
+        return bool(self._stage) and (new < old or (new == old and ratio < self._began[1]))
+
+    def _plan_enlarging(self, photos: int) -> None:
+        """Put the second search for features after the first."""
+        extract = self._plan.seconds.get("extract", 0.0)
+        enlarge = _ENLARGED_FACTOR * extract * photos / max(self._plan.photos, 1)
+        later = {stage: seconds for stage, seconds in self._plan.seconds.items() if stage != "extract"}
+        self._seconds = {"extract": extract, "enlarge": enlarge, **later}
+
+
+def duration(seconds: float) -> str:
+    """8 s, 3 min, 1.5 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,82 @@
+"""What may be asked of structure from motion, and what it may take."""
+
+from dataclasses import dataclass
+
+from nerfcli.holdout import DEFAULT_HOLDOUT
+from nerfcli.poses.input.pairs import PAIRINGS
+
+# What may be asked for as `camera_model`.
+CAMERA_MODELS = (
+    "auto",
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "OPENCV_FISHEYE",
+)
+
+# No photo has a longer side: its features are sought in the full size.
+FULL_SIZE = 100_000
+# (max_image_size, max_features). Measured poses hardly change from the first to the last; photos that are hard to match
+# are placed more often by the later ones.
+QUALITIES = {"fast": (1000, 2048), "default": (1600, 4096), "best": (FULL_SIZE, 8192)}
+
+
+@dataclass(frozen=True)
+class PoseSettings:
+    """What the result depends on, besides the photos.
+
+    max_image_size: longer side of the pictures that features are sought in, pixels. max_features: per photo.
+    threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
+    min_registered: the share of photos that must be placed, 0...1. pairing: one of `PAIRINGS`; with pairs_file, a text
+    file with two names per line, these pairs are compared and no others. masks: a folder of masks, see `media.masks`.
+    holdout: the rule by which photos are held out, see `nerfcli.holdout`. strict: whether these are placed afterwards,
+    with all that the others gave fixed, see `strict`. component: which of the models that share no frame becomes the
+    scene, 1 for the largest. accept_refused: whether a model that the checks refuse becomes the scene all the same.
+    """
+
+    max_image_size: int = QUALITIES["default"][0]
+    max_features: int = QUALITIES["default"][1]
+    seed: int = 0
+    threads: int = -1
+    camera_model: str = "auto"
+    min_registered: float = 0.5
+    pairing: str = "auto"
+    pairs_file: str | None = None
+    masks: str | None = None
+    holdout: str = DEFAULT_HOLDOUT
+    strict: bool = False
+    component: int = 1
+    accept_refused: bool = False
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the work may take: resident memory in bytes, and seconds; None for no limit. Results do not depend on it."""
+
+    memory_bytes: int | None = None
+    seconds: float | None = None
+
+
+def check_settings(settings: PoseSettings) -> None:
+    """Refuse values that pycolmap would die of.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
+    if settings.max_image_size < 1 or settings.max_features < 1:
+        raise ValueError(
+            f"image size and features must be positive, got {settings.max_image_size} and {settings.max_features}"
+        )
+    if settings.camera_model not in CAMERA_MODELS:
+        raise ValueError(f"camera_model must be one of {', '.join(CAMERA_MODELS)}, got {settings.camera_model}")
+    if not 0 <= settings.min_registered <= 1:
+        raise ValueError(f"min_registered must be within 0...1, got {settings.min_registered}")
+    if settings.component < 1:
+        raise ValueError(f"component must be 1 or more, got {settings.component}")
+    if settings.pairing not in PAIRINGS:
+        raise ValueError(f"pairing must be one of {', '.join(PAIRINGS)}, got {settings.pairing}")

@@ -1,0 +1,213 @@
+"""From a video to a folder of photos: its chosen frames as JPEG, and frames.json, which says where they come from.
+
+The frames keep their number in the video as a name, so that pairs are chosen as for any capture that is in order.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+import nerfcli
+from nerfcli.atomic import atomic_folder, write_json
+from nerfcli.errors import TOO_FEW_PHOTOS, UserError
+from nerfcli.media.video_input import Measured, Video, measure_frames, open_video, read_frames
+from nerfcli.poses.input.frame_choice import (
+    MOVED_SHARE,
+    SHARPNESS_SIZE_PX,
+    FrameMeasure,
+    FrameMeter,
+    MotionPicture,
+    choose_frames,
+)
+from nerfcli.poses.input.photos import MIN_PHOTOS
+
+FRAMES_FILE = "frames.json"
+DEFAULT_FRAMES = 120
+
+_JPEG_QUALITY = 97
+# Enough of a file to tell it from others without reading all of it: its size, and this much of its two ends.
+_END_BYTES = 1 << 20
+# Measuring decodes every frame and looks at it, extracting only decodes: about this share of the time is measuring.
+_MEASURING_SHARE = 0.7
+
+
+@dataclass(frozen=True)
+class VideoFrame:
+    """A frame that was written: its file's name, its number in the video from 0, its time, and its sharpness."""
+
+    name: str
+    number: int
+    seconds: float
+    sharpness: float
+
+
+def frames_folder(scene_dir: Path) -> Path:
+    """Where the frames of a video go whose scene goes to `scene_dir`: beside it, clip-frames for clip-scene."""
+    name = scene_dir.resolve().name if scene_dir.name in ("", "..") else scene_dir.name
+    return scene_dir.with_name("frames" if name == "scene" else f"{name.removesuffix('-scene')}-frames")
+
+
+def extract_frames(
+    path: Path,
+    folder: Path,
+    *,
+    count: int | None,
+    overwrite: bool,
+    notify: Callable[[str], None],
+    progress: Callable[[float, str], None],
+) -> None:
+    """Write the sharpest frames of a video to `folder`, or keep them if they are there already.
+
+    The video is cut into `count` stretches in which the camera moves equally far, standing still not counted. Of each
+    the sharpest frame is taken, unless it shows the same as the one before. The same video gives the same frames.
+
+    Args:
+        path: the video.
+        folder: gets frame_000123.jpg... and frames.json, all or nothing.
+        count: how many; None for 120, or all that a shorter video has.
+        overwrite: replace frames that were made from another video or with another count.
+        notify: told what the user should know, one sentence at a time.
+        progress: told (share done in 0...1, what is being done).
+
+    Raises:
+        UserError: the video cannot be read or is cut short, has fewer frames than `count` or shows fewer than four
+            different pictures; or other things stand at `folder`.
+    """
+    video = open_video(path)
+    request = {"video": _identity(path), "frames": count, "selection": 1}
+    if _kept(folder, path, request, overwrite=overwrite, notify=notify):
+        return
+    if video.hdr:
+        notify(f"{path.name} is HDR; its colours are taken as they are stored, which looks pale")
+    meter = FrameMeter()
+    measured = measure_frames(
+        video,
+        meter.measure,
+        longer_side=SHARPNESS_SIZE_PX,
+        progress=lambda share: progress(_MEASURING_SHARE * share, "looking for sharp frames"),
+    )
+    if measured.errors:
+        notify(f"{path.name} is damaged in {measured.errors} places; frames near them may show blocks")
+    total = len(measured.values)
+    if count is not None and count > total:
+        raise UserError(f"{path} has {total} frames, {count} were asked for", f"ask for --frames {total} or fewer")
+    numbers = choose_frames(measured.seconds, measured.values, count=min(count or DEFAULT_FRAMES, total))
+    with atomic_folder(folder) as partial:
+        frames = _write(
+            partial,
+            video,
+            numbers,
+            measured,
+            lambda share: progress(_MEASURING_SHARE + (1 - _MEASURING_SHARE) * share, "writing frames"),
+        )
+        if len(frames) < MIN_PHOTOS:
+            raise UserError(
+                f"{path} shows only {len(frames)} different pictures, at least {MIN_PHOTOS} are needed",
+                "film while walking around the scene; a camera that stands still tells nothing about depth",
+                TOO_FEW_PHOTOS,
+            )
+        write_json(partial / FRAMES_FILE, _description(video, request, total=total, frames=frames))
+    same = len(numbers) - len(frames)
+    notify(
+        f"{folder}: {len(frames)} of {total} frames of {path.name}"
+        + (f"; {same} more show the same as the one before" if same else "")
+    )
+
+
+def _write(
+    folder: Path,
+    video: Video,
+    numbers: Sequence[int],
+    measured: Measured[FrameMeasure],
+    progress: Callable[[float], None],
+) -> list[VideoFrame]:
+    """Write the chosen frames that differ from the one written before; of two alike the sharper one."""
+    written: list[VideoFrame] = []
+    for number, picture in _different(zip(numbers, read_frames(video, numbers), strict=True), measured.values):
+        name = f"frame_{number:06d}.jpg"
+        Image.fromarray(picture).save(folder / name, quality=_JPEG_QUALITY, subsampling=0)
+        sharp = measured.values[number].sharpness
+        written.append(VideoFrame(name, number, round(float(measured.seconds[number]), 6), round(sharp, 3)))
+        progress(number / len(measured.values))
+    return written
+
+
+def _different(
+    frames: Iterator[tuple[int, np.ndarray]], measures: Sequence[FrameMeasure]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """The frames without those that show the same as the one before; of a run of them, the sharpest stays."""
+    best: tuple[int, np.ndarray] | None = None
+    first: MotionPicture | None = None
+    for number, picture in frames:
+        motion = MotionPicture(picture)
+        if best is not None and first is not None and first.moved_to(motion) < MOVED_SHARE:
+            if measures[number].sharpness > measures[best[0]].sharpness:
+                best = number, picture
+            continue
+        if best is not None:
+            yield best
+        best, first = (number, picture), motion
+    if best is not None:
+        yield best
+
+
+def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool, notify: Callable[[str], None]) -> bool:
+    """Whether `folder` holds already what is asked for.
+
+    Raises:
+        UserError: it holds something else, and must not be replaced.
+    """
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return False
+    try:
+        found = json.loads((folder / FRAMES_FILE).read_text(encoding="utf-8"))
+        same, names = found["request"] == request, [frame["name"] for frame in found["frames"]]
+        source = found["request"]["video"]["name"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        hint = "choose another place with -o, or move it away"
+        raise UserError(f"cannot write the frames of {path} to {folder}: it holds something else", hint) from error
+    missing = sum(not (folder / name).is_file() for name in names)
+    if same and not (missing and overwrite):
+        left = f", {missing} of them are no longer there" if missing else ""
+        notify(f"{folder} is kept: it holds the {len(names)} frames asked for{left}")
+        return True
+    if not overwrite:
+        raise UserError(
+            f"{folder} holds other frames: {len(names)} of {source}",
+            "add --overwrite to replace them, or choose another place with -o",
+        )
+    return False
+
+
+def _identity(path: Path) -> dict[str, Any]:
+    """What tells a video from others, wherever it lies."""
+    size = path.stat().st_size
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        digest.update(file.read(_END_BYTES))
+        file.seek(max(0, size - _END_BYTES))
+        digest.update(file.read(_END_BYTES))
+    return {"name": path.name, "bytes": size, "sha256_of_ends": digest.hexdigest()}
+
+
+def _description(video: Video, request: dict[str, Any], *, total: int, frames: Sequence[VideoFrame]) -> dict[str, Any]:
+    """The content of frames.json."""
+    return {
+        "request": request,
+        "width": video.width,
+        "height": video.height,
+        "frames_in_video": total,
+        "frames": [vars(frame) for frame in frames],
+        "settings": {
+            "moved_share": MOVED_SHARE,
+            "sharpness_size_px": SHARPNESS_SIZE_PX,
+            "jpeg_quality": _JPEG_QUALITY,
+        },
+        "versions": {"nerfcli": nerfcli.__version__},
+    }

@@ -1,0 +1,89 @@
+"""The photos as the worker gets them: upright, under numbers that stay with a photo, and only what has changed anew."""
+
+import os
+import shutil
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from nerfcli.media.images import read_image
+from nerfcli.poses.input.photos import Photo, Photos
+from nerfcli.poses.input.stages import file_key, read_stage, write_stage
+
+# What pycolmap reads as we do, if stored upright. Of all else (CMYK, 16 bit, alpha, TIFF) it gets a JPEG copy.
+_PLAIN = {("JPEG", ".jpg"), ("JPEG", ".jpeg"), ("MPO", ".jpg"), ("MPO", ".jpeg"), ("PNG", ".png")}
+# Each holds a decoded photo.
+_COPIERS = 4
+# To be changed with how copies are made.
+_VERSION = "JPEG 97"
+
+
+@dataclass(frozen=True)
+class LaidOut:
+    """A photo's file below work/photos, whose stem is its number, and a hash of the original's content."""
+
+    file: str
+    key: str
+
+
+def lay_out(photos: Photos, work: Path) -> tuple[LaidOut, ...]:
+    """Give the worker each photo, upright, under its number: a link where the file will do, else a copy.
+
+    A photo keeps the number that it got when it was first laid out, and no number is given twice, so that what is known
+    of it stays its own when others come and go.
+    """
+    folder, stage = work / "photos", work / "photos.json"
+    folder.mkdir(parents=True, exist_ok=True)
+    content = read_stage(stage, _VERSION) or {"next": 0, "photos": {}}
+    known = {name: LaidOut(**laid_out) for name, laid_out in content["photos"].items()}
+    following = content["next"]
+    numbers: dict[str, int] = {}
+    for photo in photos.photos:
+        if photo.name in known:
+            numbers[photo.name] = int(Path(known[photo.name].file).stem)
+        else:
+            numbers[photo.name], following = following, following + 1
+
+    def lay_out_one(photo: Photo) -> LaidOut:
+        return _laid_out(photos.folder, photo, folder, number=numbers[photo.name], known=known.get(photo.name))
+
+    with ThreadPoolExecutor(_COPIERS) as copiers:
+        laid_out = tuple(copiers.map(lay_out_one, photos.photos))
+    listed = {photo.name: asdict(found) for photo, found in zip(photos.photos, laid_out, strict=True)}
+    write_stage(stage, _VERSION, {"next": following, "photos": listed})
+    return laid_out
+
+
+def _laid_out(photos: Path, photo: Photo, folder: Path, *, number: int, known: LaidOut | None) -> LaidOut:
+    original = (photos / photo.name).absolute()
+    key = file_key(original)
+    plain = _is_plain(original, photo)
+    laid_out = LaidOut(f"{number:05d}{original.suffix.lower() if plain else '.jpg'}", key)
+    target = folder / laid_out.file
+    if known == laid_out and target.exists() and not (target.is_symlink() and target.readlink() != original):
+        return laid_out
+    partial = folder / f".{laid_out.file}"
+    partial.unlink(missing_ok=True)
+    if plain:
+        try:
+            partial.symlink_to(original)
+        except OSError:  # Windows without the right to make links
+            shutil.copyfile(original, partial)
+    else:
+        Image.fromarray(read_image(original)).convert("RGB").save(partial, "JPEG", quality=97, subsampling=0)
+    os.replace(partial, target)
+    return laid_out
+
+
+def _is_plain(path: Path, photo: Photo) -> bool:
+    with Image.open(path) as image:
+        known = (image.format, path.suffix.lower()) in _PLAIN and image.mode in ("L", "RGB")
+    return known and photo.exif.orientation == 1
+
+
+def original_names(photos: Iterable[str], laid_out: Iterable[LaidOut]) -> dict[int, str]:
+    """The photos' own names by their ids in pycolmap's database, where ids start at 1."""
+    return {int(Path(found.file).stem) + 1: name for name, found in zip(photos, laid_out, strict=True)}

@@ -1,0 +1,113 @@
+"""Find the verified pairs of photos that a model contradicts, and leave out the photos on its weak side."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from nerfcli.poses.model.two_views import Agreement, VerifiedPair, agreements
+from nerfcli.poses.model.view_graph import Bottlenecks, parts
+
+# A pair with fewer may be mistaken even if no other joins its photos: measured, up to 81 between unlike walls.
+_CERTAIN_MATCHES = 100
+# A pair this strong, relative to the best chain that contradicts it, tells another story and not a mistake; up to the
+# second factor the chain is as good a story.
+_RIVAL_STRENGTH = 0.5
+_RIVAL_OF_EQUALS = 2.0
+# Share of the photos that may be left out because they contradict the others, which then still are a whole.
+_MOST_LEFT_OUT = 0.2
+_FARTHEST = 10.0
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Two photos whose matches cannot be as the model says, and the strongest chain of pairs that can."""
+
+    one: str
+    other: str
+    matches: int
+    agreeing_chain: float
+
+    @property
+    def outweighs(self) -> bool:
+        """Whether the pair is stronger than what supports the model; a weak one must be so by half."""
+        return self.matches > (1.0 if self.matches >= _CERTAIN_MATCHES else 1.5) * self.agreeing_chain
+
+    @property
+    def is_rival(self) -> bool:
+        """Whether pair and chain are about as strong, and one is as likely to be mistaken as the other."""
+        return self.matches <= _RIVAL_OF_EQUALS * self.agreeing_chain
+
+
+def leave_out_contradicting(
+    model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]
+) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
+    """The model without the photos that its strongest evidence contradicts, and why each was left out, by image id.
+
+    Photos are held together by their pairs. Where the strongest chain of pairs runs over one that contradicts the
+    model, the smaller side may be anywhere. If all such sides together are few, they are left out; if they are many,
+    the model is not mended but left as it is, to be refused.
+    """
+    found = agreements(model, pairs)
+    placed = sorted(model.reg_image_ids())
+    contradicting = [c for c in strong_contradictions(model, found) if c.outweighs]
+    far = _far_away(model)
+    if not contradicting and not far:
+        return model, {}
+    sound = _spanning_tree(placed, found)
+    _, *sides = parts(placed, [(a.one, a.other) for a in sound if not a.contradicts]) if contradicting else [placed]
+    reasons = dict(far)
+    for photo in (photo for side in sides for photo in side if photo not in far):
+        pair = next((c for c in contradicting if model.image(photo).name in (c.one, c.other)), None)
+        if pair is None:
+            reasons[photo] = "contradicts the rest: hangs on a photo that does"
+        else:
+            other = pair.other if pair.one == model.image(photo).name else pair.one
+            reasons[photo] = f"contradicts the rest: its {pair.matches} matches with {other} cannot be"
+    if len(reasons) > _MOST_LEFT_OUT * len(placed):
+        return model, {}
+    rest = pycolmap.Reconstruction(model)
+    for photo in reasons:
+        rest.deregister_frame(rest.image(photo).frame_id)
+    rest.tear_down()  # an image without a pose would end the covariance
+    return rest, reasons
+
+
+def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreement]) -> list[Contradiction]:
+    """Pairs that contradict a model and are at least half as strong as what supports it there, the strongest first."""
+    chains = Bottlenecks(
+        sorted(model.reg_image_ids()), [(a.one, a.other, a.matches * a.share) for a in found if not a.contradicts]
+    )
+    pairs = []
+    for a in sorted((a for a in found if a.contradicts), key=lambda a: -a.matches):
+        chain = chains.between(a.one, a.other)
+        if a.matches > _RIVAL_STRENGTH * chain:
+            pairs.append(Contradiction(model.image(a.one).name, model.image(a.other).name, a.matches, chain))
+    return pairs
+
+
+def _spanning_tree(placed: Sequence[int], found: Sequence[Agreement]) -> list[Agreement]:
+    """The strongest pairs that hold all photos together, as few as can be."""
+    taken: list[Agreement] = []
+    chains = {photo: {photo} for photo in placed}
+    for a in sorted(found, key=lambda a: -a.matches):
+        if chains[a.one] is not chains[a.other]:
+            taken.append(a)
+            joined = chains[a.one] | chains[a.other]
+            for photo in joined:
+                chains[photo] = joined
+    return taken
+
+
+def _far_away(model: pycolmap.Reconstruction) -> dict[int, str]:
+    """Photos much farther from the middle of all than the others are."""
+    photos = sorted(model.reg_image_ids())
+    centres = np.array([model.image(photo).projection_center() for photo in photos])
+    distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
+    radius = np.median(distances)
+    return {
+        photo: f"contradicts the rest: {distance / radius:.0f} times as far away as the others"
+        for photo, distance in zip(photos, distances, strict=True)
+        if radius > 0 and distance > _FARTHEST * radius
+    }

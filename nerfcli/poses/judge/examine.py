@@ -1,0 +1,141 @@
+"""After mapping: which lens the photos can hold, what contradicts the model, whether to believe it, how sharp it is."""
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import pycolmap
+
+from nerfcli.poses.input.job import Job
+from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict, judge, nothing_placed
+from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.contradictions import leave_out_contradicting
+from nerfcli.poses.judge.parallax import best_turn
+from nerfcli.poses.judge.uncertainty import pose_blur_px
+from nerfcli.poses.model.intrinsics import Lenses, choose_lenses
+from nerfcli.poses.model.localise import shared_pairs
+from nerfcli.poses.model.reasons import FEW_MATCHES
+from nerfcli.poses.model.two_views import read_verified_pairs
+from nerfcli.poses.model.view_graph import parts
+
+# From here on the covariance of all poses together takes minutes.
+_MOST_PHOTOS_FOR_BLUR = 500
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A model after examination, and what is to be said of it.
+
+    left_out: why photos were taken out, by number. blur_px: of each photo's pose, by number. details: for the report.
+    uncertainty: of the lenses, by camera id, see `determined.uncertainty`.
+    """
+
+    model: pycolmap.Reconstruction | None
+    verdict: Verdict
+    left_out: dict[int, str]
+    blur_px: dict[int, float]
+    details: dict[str, Any]
+    uncertainty: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+def examine(
+    models: list[pycolmap.Reconstruction],
+    job: Job,
+    report: Callable[[str, int, int], None],
+    *,
+    localised: Sequence[int] = (),
+    checks: Checks | None = None,
+) -> Examined:
+    """Choose lenses, leave out what contradicts, adjust, judge, and measure the uncertainty of the first model.
+
+    A check that cannot be computed is left out and listed in `details["not_computed"]`; the others go on.
+
+    Args:
+        models: as the mapper left them; the first one is examined.
+        job: that they were made for.
+        report: called with ("check", done, total).
+        localised: ids of images that are held by no pair but by points of the model.
+        checks: runs the checks.
+    """
+    checks = Checks() if checks is None else checks
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
+    sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
+    strong = [pair for pair in pairs if pair.matches >= FEW_MATCHES]
+    turn = checks.run("parallax", lambda: best_turn(strong, sizes), otherwise=None)
+    joined = parts(job.image_ids, [(pair.one, pair.other) for pair in strong])
+    details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
+    if not models:
+        return Examined(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})
+    numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
+    report("check", 0, 4)
+    mapped = with_pose_only(models[0])
+
+    def without_contradicting() -> tuple[pycolmap.Reconstruction, dict[int, str]]:
+        held = shared_pairs(mapped, localised, min_matches=MIN_MATCHES)
+        return leave_out_contradicting(mapped, [*pairs, *held])
+
+    model, left_out = checks.run("contradicting photos", without_contradicting, otherwise=(mapped, {}))
+    report("check", 1, 4)
+    lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=Lenses(model, [], {}))
+    model = lenses.model
+    details["lenses"] = [asdict(candidate) for candidate in lenses.candidates]
+    report("check", 2, 4)
+    verdict = judge(
+        model,
+        pairs,
+        turn=turn,
+        names=dict(zip(job.files, job.names, strict=True)),
+        seed=job.seed,
+        threads=job.threads,
+        given=job.given_cameras,
+        fixed=job.fixed_cameras,
+        checks=checks,
+    )
+    report("check", 3, 4)
+    blur: dict[int, float] = {}
+    if verdict.accepted and model.num_reg_images() <= _MOST_PHOTOS_FOR_BLUR:
+        blur = checks.run(
+            "pose uncertainty",
+            lambda: pose_blur_px(model, threads=job.threads, fixed=job.fixed_cameras),
+            otherwise=blur,
+        )
+    report("check", 4, 4)
+    reasons = {numbers[image_id]: _with_names(reason, job) for image_id, reason in left_out.items()}
+    details["not_computed"] = checks.not_computed
+    uncertainty = {str(camera_id): certain for camera_id, certain in lenses.uncertainty.items()}
+    return Examined(
+        model, verdict, reasons, {numbers[image_id]: px for image_id, px in blur.items()}, details, uncertainty
+    )
+
+
+def with_pose_only(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Copy a model without the images that have no pose: pycolmap's covariance raises on them."""
+    copy = pycolmap.Reconstruction(model)
+    copy.tear_down()
+    return copy
+
+
+def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> Lenses:
+    """Lens models by evidence, where neither the user nor a file has said what they are."""
+    named = [number for number, group in enumerate(job.groups, start=1) if not group.choose]
+    exif_focal_px = {
+        number: group.focal_px
+        for number, group in enumerate(job.groups, start=1)
+        if group.focal_px is not None and group.focal_is_prior
+    }
+    return choose_lenses(
+        model,
+        seed=job.seed,
+        threads=job.threads,
+        fixed=job.fixed_cameras,
+        named=named,
+        exif_focal_px=exif_focal_px,
+    )
+
+
+def _with_names(reason: str, job: Job) -> str:
+    for file, name in zip(job.files, job.names, strict=True):
+        reason = reason.replace(file, name)
+    return reason

@@ -1,0 +1,119 @@
+"""How well the photos hold their own poses: one standard deviation of each pose, as blur in pixels.
+
+The covariance of the adjustment depends on which points or cameras hold the frame, which nobody asked about. It is
+brought into the frame in which the pictures of a scene that stands still move least in all photos together (an
+S-transformation, Baarda 1973); there, every photo's own share is read off.
+
+Letters: R, t is a camera's pose from the world, C its centre. A pose's six unknowns are w, a rotation after R in the
+camera's axes, and the change of t; J maps them to pixels; a similarity has theta, tau, s as its seven.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from nerfcli.poses.model import held_out
+from nerfcli.poses.model.lens_evidence import projection_jacobians
+
+Array = NDArray[np.float64]
+
+# So many points show how a picture moves.
+_POINTS_PER_PHOTO = 60
+# pycolmap's tangent space of a quaternion is half the angle.
+_ANGLE_FROM_TANGENT = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
+
+
+def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequence[int] = ()) -> dict[int, float]:
+    """By image id: how far a typical point moves in the photo, root mean square, by one standard deviation of its pose.
+
+    The noise of an observation is taken from what the adjustment leaves. Points and intrinsics are as uncertain as
+    poses; the lens is as it came out. What all photos get wrong together, and what no lens model says, is not in it.
+
+    Args:
+        model: a converged model; it is not changed.
+        threads: of the adjustment, -1 for all.
+        fixed: ids of cameras whose intrinsics are taken to be exact.
+
+    Returns:
+        Empty if the covariance could not be had, for a model that is not held in all directions.
+    """
+    copy = pycolmap.Reconstruction(model)
+    adjuster = held_out.adjust(copy, threads=threads, fixed=fixed)
+    options = pycolmap.BACovarianceOptions()
+    options.params = pycolmap.BACovarianceOptionsParams.ALL
+    found = pycolmap.estimate_ba_covariance(options, copy, adjuster)
+    photos = sorted(copy.reg_image_ids())
+    if found is None:
+        return {}
+    covariance = _joint_covariance(found, photos)
+    if covariance is None:
+        return {}
+    metrics = [_pixel_metric(copy, photo) for photo in photos]
+    gauge = np.vstack([_gauge_directions(copy.image(photo)) for photo in photos])  # (6 photos, 7)
+    weighted = np.vstack([metric @ gauge[6 * i : 6 * i + 6] for i, metric in enumerate(metrics)])
+    onto_gauge = np.linalg.solve(gauge.T @ weighted, weighted.T)  # (7, 6 photos)
+    moved = onto_gauge @ covariance
+    noise = held_out.residual_deviation_px(copy)
+    blur = {}
+    for i, photo in enumerate(photos):
+        rows = slice(6 * i, 6 * i + 6)
+        shift = gauge[rows] @ moved[:, rows]
+        own = covariance[rows, rows] - shift - shift.T + gauge[rows] @ moved @ onto_gauge.T @ gauge[rows].T
+        blur[photo] = float(noise * np.sqrt(max(np.trace(metrics[i] @ own), 0.0)))
+    return blur
+
+
+def _joint_covariance(found: pycolmap.BACovariance, photos: list[int]) -> Array | None:
+    """(6 photos, 6 photos) for unit noise, rotations as angles."""
+    joint = np.zeros((6 * len(photos), 6 * len(photos)))
+    for i, one in enumerate(photos):
+        for j, other in enumerate(photos[: i + 1]):
+            block = found.get_cam_cov_from_world(one) if i == j else found.get_cam_cross_cov_from_world(one, other)
+            if block is None or block.shape != (6, 6):
+                return None
+            block = _ANGLE_FROM_TANGENT @ block @ _ANGLE_FROM_TANGENT
+            joint[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = block
+            joint[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = block.T
+    return joint
+
+
+def _pixel_metric(model: pycolmap.Reconstruction, photo: int) -> Array:
+    """(6, 6) mean of J^T J over points that a photo sees: its pixels' mean squared motion by a motion of its pose."""
+    image = model.image(photo)
+    camera = model.camera(image.camera_id)
+    seen = image.get_observation_points2D()
+    chosen = seen[:: max(1, len(seen) // _POINTS_PER_PHOTO)]
+    pose = image.cam_from_world()
+    points = np.array([model.point3D(point.point3D_id).xyz for point in chosen]).reshape(-1, 3)
+    rotated = points @ pose.rotation.matrix().T
+    local = rotated + pose.translation
+    metric, counted = np.zeros((6, 6)), 0
+    for turned, point, jacobian in zip(rotated, local, projection_jacobians(camera, local), strict=True):
+        if not np.isfinite(jacobian).all() or point[2] <= 0:
+            continue
+        x, y, z = turned
+        by_rotation = jacobian @ np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])  # d(w x RX) / dw = -[RX]x
+        both = np.hstack([by_rotation, jacobian])
+        metric += both.T @ both
+        counted += 1
+    return metric / max(counted, 1)
+
+
+def _gauge_directions(image: pycolmap.Image) -> Array:
+    """(6, 7) how a camera's unknowns move if the world is turned by theta, moved by tau and scaled by 1 + s.
+
+    X' = (1 + s) X + theta x X + tau and R' = R exp(-theta), so w = -R theta and dt = w x t - R (s C + theta x C + tau).
+    """
+    pose = image.cam_from_world()
+    R, t, C = pose.rotation.matrix(), pose.translation, image.projection_center()
+    directions = np.zeros((6, 7))
+    for axis in range(3):
+        theta = np.eye(3)[axis]
+        w = -R @ theta
+        directions[:3, axis] = w
+        directions[3:, axis] = np.cross(w, t) - R @ np.cross(theta, C)
+        directions[3:, 3 + axis] = -R @ theta
+    directions[3:, 6] = -R @ C
+    return directions

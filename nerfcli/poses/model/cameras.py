@@ -1,0 +1,126 @@
+"""Which photos share a camera, and where its intrinsics start: by EXIF and size, or as they are known beforehand."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from nerfcli.cameras.calibration import Calibrated, Calibration, Picture, calibrated
+from nerfcli.cameras.orientation import counted, rescaling, rescaling_told
+from nerfcli.errors import UserError
+from nerfcli.media.focal_evidence import focal_evidence
+from nerfcli.media.images import Exif
+from nerfcli.poses.input.job import CameraGroup
+from nerfcli.poses.input.photos import Photos, camera_groups
+from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
+
+# How intrinsics that are given are used: as they are, or as where the adjustment starts.
+USES = ("fixed", "prior")
+
+
+@dataclass(frozen=True)
+class GivenIntrinsics:
+    """Intrinsics that are known beforehand, and how they are used, one of `USES`."""
+
+    calibration: Calibration
+    use: str = "fixed"
+
+    def to_json(self) -> dict[str, Any]:
+        """{"file", "use", "key"}: the key is a hash of the cameras and of the names that the file lists them for."""
+        return {"file": str(self.calibration.path.absolute()), "use": self.use, "key": self.calibration.key}
+
+
+@dataclass(frozen=True)
+class Grouped:
+    """Photos by camera, what the user should know of that, and for the report what was given (None if nothing was)."""
+
+    groups: tuple[CameraGroup, ...]
+    notes: tuple[str, ...]
+    given: dict[str, Any] | None = None
+
+
+def group_photos(photos: Photos, *, model: str) -> Grouped:
+    """Groups by EXIF and upright size; model: COLMAP's name, or "auto" for the one that EXIF suggests to start from.
+
+    Where EXIF is of another picture than the file, its focal length is where the adjustment starts, but no prior.
+    """
+    numbers = {name: number for number, name in enumerate(photos.names)}
+    groups, notes = [], []
+    for names in camera_groups(photos.photos):
+        first = photos.photos[numbers[names[0]]]
+        evidence = focal_evidence(first.exif)
+        if evidence.doubt and (first.exif.focal_mm or first.exif.focal_35mm):
+            which = f"{first.name} and {len(names) - 1} more photos" if len(names) > 1 else first.name
+            notes.append(f"no focal length is taken from EXIF for {which}: {evidence.doubt}")
+        groups.append(
+            CameraGroup(
+                photos=tuple(numbers[name] for name in names),
+                model=start_model(first.exif) if model == "auto" else model,
+                width=first.width,
+                height=first.height,
+                choose=model == "auto",
+                focal_px=evidence.focal_px,
+                focal_is_prior=evidence.focal_px is not None and evidence.holds,
+            )
+        )
+    if len(groups) == 1:
+        return Grouped(tuple(groups), tuple(notes))
+    described = ", ".join(f"{len(g.photos)} photos {g.width}x{g.height} {g.model}" for g in groups)
+    return Grouped(tuple(groups), (f"{len(groups)} cameras, by EXIF and size: {described}", *notes))
+
+
+def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:
+    """Groups by the cameras of a file. Photos that it does not list share a camera only if EXIF says that they do.
+
+    Raises:
+        UserError: a photo has no camera in the file, or one that structure from motion cannot use.
+    """
+    pictures = [
+        Picture(photos.folder / photo.name, photo.width, photo.height, photo.exif.orientation or 1)
+        for photo in photos.photos
+    ]
+    calibration = given.calibration
+    found = calibrated(calibration, pictures)
+    if any(one.camera.is_spherical for one in found):
+        raise UserError(
+            f"{calibration.path} has a spherical camera (EQUIRECTANGULAR)",
+            "structure from motion needs perspective or fisheye pictures; cut the panoramas into such",
+        )
+    optics = {name: number for number, names in enumerate(camera_groups(photos.photos)) for name in names}
+    members: dict[tuple[Any, ...], list[int]] = {}
+    for number, (name, one) in enumerate(zip(photos.names, found, strict=True)):
+        key = (one.number, one.camera, one.by_name, None if one.by_name else optics[name])
+        members.setdefault(key, []).append(number)
+    groups = tuple(
+        CameraGroup(
+            photos=tuple(numbers),
+            model=camera.model,
+            width=camera.width,
+            height=camera.height,
+            params=camera.params,
+            fixed=given.use == "fixed",
+        )
+        for (_, camera, *_), numbers in members.items()
+    )
+    described = [
+        {"photos": len(numbers), "matched_by": "name" if by_name else "size", **camera.to_json()}
+        for (_, camera, by_name, _), numbers in members.items()
+    ]
+    return Grouped(groups, _notes(given, found), given.to_json() | {"cameras": described})
+
+
+def start_model(exif: Exif) -> str:
+    """The COLMAP camera model that the mapper starts from: one distortion term, or a fisheye if the lens says so."""
+    return START_FISHEYE if "fisheye" in (exif.lens or "").lower() else START_MODEL
+
+
+def _notes(given: GivenIntrinsics, found: Sequence[Calibrated]) -> tuple[str, ...]:
+    calibration = given.calibration
+    named = sum(one.by_name for one in found)
+    ways = [f"{count} by {how}" for count, how in ((named, "name"), (len(found) - named, "size")) if count]
+    used = len({one.number for one in found})
+    first = (
+        f"intrinsics of {calibration.path} ({given.use}): {used} camera{'s' if used > 1 else ''} for "
+        f"{len(found)} photos, {' and '.join(ways)}"
+    )
+    other_sizes = counted(rescaling(calibration.cameras[one.number], one.camera) for one in found)
+    return (first, *rescaling_told(other_sizes))

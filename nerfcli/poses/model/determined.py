@@ -1,0 +1,232 @@
+"""Which lens parameters a capture determines: the others stay where lenses usually are.
+
+A parameter that observations leave open is not harmless: it takes on what is wrong elsewhere, and turns or moves the
+poses with it. So the principal point stays at the centre, and higher distortion at none, until the observations speak
+for it clearly, in photos and parts of the scene taken by themselves (see `lens_evidence`). A focal length that they
+leave open stays at the one of EXIF.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.stats import chi2
+
+from nerfcli.poses.model.lens_evidence import (
+    NAMES,
+    Estimate,
+    LensEvidence,
+    UndeterminedError,
+    lens_evidence,
+    parameters_of,
+)
+
+# The chance to take a parameter that is not there; as eight parts of a scene are few, it must be small.
+_CHANCE = 5e-4
+# Where one distortion term moves the corner by less than this share of its distance from the centre, one way or the
+# other, it may be free without being sure of it: it does no harm.
+_HARMLESS = 0.003
+# Standard deviation of a focal length by EXIF; and from where on a focal length is said to be uncertain.
+_EXIF_DEVIATION = 0.03
+_WEAK_FOCAL = 0.01
+_WEAK_BORDER = 0.005
+# A principal point farther than this from the centre, as a share of the size, is a fit to something else.
+PRINCIPAL_POINT_RANGE = 0.1
+
+_PRINCIPAL_POINT = ("cx", "cy")
+_TANGENTIAL = ("fa", "p1", "p2")
+_MODELS = {
+    frozenset(): "SIMPLE_PINHOLE",
+    frozenset(["k1"]): "SIMPLE_RADIAL",
+    frozenset(["k1", "k2"]): "RADIAL",
+    frozenset(["k1", "k2", *_TANGENTIAL]): "OPENCV",
+}
+
+
+@dataclass(frozen=True)
+class Step:
+    """A decision about some parameters.
+
+    distance: how far from nothing they are, squared and in units of their uncertainty, relative to what is asked: taken
+    from 1 on; None for the model that the others are added to.
+    """
+
+    model: str
+    principal_point: bool
+    distance: float | None
+    taken: bool
+
+
+@dataclass(frozen=True)
+class Determined:
+    """What a capture determines of a lens.
+
+    Args:
+        camera: the camera with the parameters as estimated in one step, from which an adjustment starts.
+        principal_point: whether it is free.
+        held: whether all intrinsics stay as they are, since the observations leave the focal length open.
+        steps: the decisions, in their order.
+    """
+
+    camera: pycolmap.Camera
+    principal_point: bool
+    held: bool
+    steps: tuple[Step, ...]
+
+
+def determine(
+    model: pycolmap.Reconstruction,
+    camera_id: int,
+    *,
+    seed: int,
+    fixed: Sequence[int] = (),
+    named: bool = False,
+    exif_focal_px: float | None = None,
+) -> Determined:
+    """What a converged model determines of a perspective camera's lens.
+
+    Args:
+        seed: see `lens_evidence`.
+        fixed: cameras whose intrinsics are exact.
+        named: whether the camera keeps its model; its principal point may still become free.
+        exif_focal_px: where the focal length stays if it is not determined.
+
+    Raises:
+        UndeterminedError: the model has too few observations.
+    """
+    camera = model.cameras[camera_id]
+    evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
+    free = list(parameters_of(camera)) if named else ["f", "k1"]
+    steps = [_step(free, None, taken=True, camera=camera if named else None)]
+    # The principal point comes first: a sensor off its axis is what cameras have, and tangential terms imitate it.
+    # It is asked again with k2, which may hide it.
+    for group in [_PRINCIPAL_POINT] if named else [_PRINCIPAL_POINT, ("k2",), _PRINCIPAL_POINT, _TANGENTIAL]:
+        if set(group) <= set(free) or (len(steps) > 2 and "k2" not in free):
+            continue
+        distance = _relative_distance(evidence, free, group, camera)
+        tried = [*free, *group]
+        steps.append(_step(tried, distance, taken=distance > 1, camera=camera if named else None))
+        free = tried if distance > 1 else free
+    found = evidence.estimate(free)
+    if not named and "k2" not in free:
+        free, found = _with_or_without_distortion(evidence, free, found, camera, steps)
+    share = found.deviation("f") / camera.mean_focal_length()
+    if exif_focal_px is not None and share > _EXIF_DEVIATION and not named:
+        held = pycolmap.Camera.create_from_model_name(
+            camera_id, "SIMPLE_PINHOLE", exif_focal_px, camera.width, camera.height
+        )
+        held.has_prior_focal_length = True
+        return Determined(held, False, True, tuple(steps))
+    return Determined(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
+
+
+def uncertainty(
+    model: pycolmap.Reconstruction, camera_id: int, *, principal_point: bool, seed: int, fixed: Sequence[int] = ()
+) -> dict[str, Any]:
+    """How well an adjusted model knows the lens of a camera, one standard deviation of each, for the report.
+
+    Returns:
+        {"focal_percent", "principal_point_px": how uncertain it would be if it were free, "principal_point_free",
+        "distortion_border_px": how far distortion moves the corner, "reason": None}; all None but the reason where the
+        lens is not one that can be examined so, or the observations are too few; and "weak": whether the focal length
+        or the distortion is uncertain enough to say so.
+    """
+    camera = model.cameras[camera_id]
+    nothing = {"focal_percent": None, "principal_point_px": None, "distortion_border_px": None}
+    nothing |= {"principal_point_free": principal_point, "weak": None}
+    free = parameters_of(camera)
+    if camera_id in fixed:
+        return nothing | {"reason": "the intrinsics are given"}
+    if not free:
+        return nothing | {"reason": f"not examined for {camera.model.name}"}
+    try:
+        evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
+        found = evidence.estimate([*free, *(_PRINCIPAL_POINT if principal_point else ())])
+        freed = evidence.estimate([*free, *_PRINCIPAL_POINT])
+    except (UndeterminedError, np.linalg.LinAlgError) as error:
+        return nothing | {"reason": str(error)}
+    focal = found.deviation("f") / camera.mean_focal_length()
+    border = max((_border_px(evidence, found, name) for name in free if name[0] in "kp"), default=0.0)
+    return {
+        "focal_percent": 100 * focal,
+        "principal_point_px": [freed.deviation(name) for name in _PRINCIPAL_POINT],
+        "distortion_border_px": border,
+        "principal_point_free": principal_point,
+        "weak": bool(focal > _WEAK_FOCAL or border > _WEAK_BORDER * np.hypot(camera.width, camera.height) / 2),
+        "reason": None,
+    }
+
+
+def is_centred(camera: pycolmap.Camera) -> bool:
+    """Whether the principal point is within a tenth of the size of the centre."""
+    x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
+    return abs(x - 0.5) < PRINCIPAL_POINT_RANGE and abs(y - 0.5) < PRINCIPAL_POINT_RANGE
+
+
+def _relative_distance(
+    evidence: LensEvidence, free: Sequence[str], group: Sequence[str], camera: pycolmap.Camera
+) -> float:
+    try:
+        found = evidence.estimate([*free, *group])
+    except UndeterminedError:
+        return 0.0
+    if group == _PRINCIPAL_POINT and not is_centred(_camera(camera, found, named=True)):
+        return 0.0
+    return found.distance(group) / float(chi2.isf(_CHANCE, len(group)))
+
+
+def _with_or_without_distortion(
+    evidence: LensEvidence, free: list[str], found: Estimate, camera: pycolmap.Camera, steps: list[Step]
+) -> tuple[list[str], Estimate]:
+    """The free parameters without k1, if it is neither sure nor harmless."""
+    harmless = _border_px(evidence, found, "k1") < _HARMLESS * np.hypot(camera.width, camera.height) / 2
+    distance = found.distance(["k1"]) / float(chi2.isf(_CHANCE, 1))
+    if harmless or distance > 1:
+        return free, found
+    free = [name for name in free if name != "k1"]
+    # What the model has of it now goes to zero, and the others follow.
+    steps.append(_step(free, distance, taken=True, camera=None))
+    return free, evidence.without("k1").estimate(free)
+
+
+def _border_px(evidence: LensEvidence, found: Estimate, name: str) -> float:
+    return found.deviation(name) * float(evidence.border_px[NAMES.index(name)])
+
+
+def _step(free: Sequence[str], distance: float | None, *, taken: bool, camera: pycolmap.Camera | None) -> Step:
+    model = _model_name(free) if camera is None else camera.model.name
+    return Step(model, "cx" in free, distance, taken)
+
+
+def _model_name(free: Sequence[str]) -> str:
+    return _MODELS[frozenset(free) - {"f", *_PRINCIPAL_POINT}]
+
+
+def _camera(camera: pycolmap.Camera, found: Estimate, *, named: bool) -> pycolmap.Camera:
+    """A camera with the parameters that were found; those that were not free are as they were, or not there."""
+    name = camera.model.name if named else _model_name(found.names)
+    values = dict(zip(found.names, found.values.tolist(), strict=True))
+    new = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, name, values.get("f", camera.mean_focal_length()), camera.width, camera.height
+    )
+    if named:
+        new.params = camera.params.tolist()
+    if "fa" in values and len(new.focal_length_idxs()) == 2:
+        new.focal_length_x, new.focal_length_y = values["f"] + values["fa"] / 2, values["f"] - values["fa"] / 2
+    elif "f" in values:
+        _set(new, new.focal_length_idxs(), [values["f"]] * len(new.focal_length_idxs()))
+    new.principal_point_x = camera.width / 2 + values["cx"] if "cx" in values else camera.principal_point_x
+    new.principal_point_y = camera.height / 2 + values["cy"] if "cy" in values else camera.principal_point_y
+    extra = [term for term in parameters_of(new) if term not in ("f", "fa")]
+    indices = list(new.extra_params_idxs())[: len(extra)]
+    _set(new, indices, [values.get(term, new.params[index]) for term, index in zip(extra, indices, strict=True)])
+    new.has_prior_focal_length = camera.has_prior_focal_length
+    return new
+
+
+def _set(camera: pycolmap.Camera, indices: Sequence[int], values: Sequence[float]) -> None:
+    params = np.array(camera.params)
+    params[list(indices)] = values
+    camera.params = params.tolist()

@@ -1,0 +1,331 @@
+"""Which lens model a capture can hold, and the adjustment with it.
+
+Mapping starts from one distortion term. Of a perspective camera the observations then tell which parameters are
+determined (see `determined`). Fisheyes and very wide lenses are adjusted with richer models, each time without a tenth
+of the observations: a richer model is kept if it foresees these better by more than chance, and if what it adds is
+larger than its own uncertainty; the principal point is freed by the same measure.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from nerfcli.poses.model import held_out
+from nerfcli.poses.model.determined import Determined, determine, is_centred, uncertainty
+from nerfcli.poses.model.lens_evidence import UndeterminedError, parameters_of
+
+Array = NDArray[np.float64]
+
+# From simple to rich. A fisheye model is a candidate where the picture is wide enough to tell.
+PERSPECTIVE = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
+FISHEYE = ("SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE")
+_FISHEYE_FROM_DEG = 90.0
+# What a mapper starts from, by the family that the lens belongs to.
+START_MODEL = "SIMPLE_RADIAL"
+START_FISHEYE = "OPENCV_FISHEYE"
+
+# The gain must be this many standard errors, and this share of the error; a smaller one changes no picture.
+_GAIN_DEVIATIONS = 2.0
+_GAIN_SHARE = 0.001
+# Errors count up to here: one wrong match must not decide on a lens.
+_CLIP_PX = 4.0
+# What a model adds must be this many standard deviations from nothing.
+_PARAMETER_DEVIATIONS = 3.0
+# Each lens costs some adjustments; beyond this many, and for lenses with fewer photos, the simplest model stays.
+_MOST_CAMERAS = 4
+_LEAST_PHOTOS = 3
+_MOST_DESCRIBED = 8
+# As in pycolmap's mapper.
+_LEAST_ANGLE_DEG = 1.5
+_FIT_GRID = 15
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A lens model that was tried for a camera, or decided on by what the observations determine.
+
+    held_out_px: of a wide lens, mean error of the held-out observations of this camera, each counted up to 4 px. gain:
+    how many standard errors that is below the model kept before it. significance: of a wide lens, value over standard
+    deviation of what it adds, the largest; else see `determined.Step`. kept: whether it was chosen.
+    """
+
+    camera: int
+    model: str
+    principal_point: bool
+    held_out_px: float | None
+    gain: float | None
+    significance: float | None
+    kept: bool
+
+
+@dataclass(frozen=True)
+class _Trial:
+    model: pycolmap.Reconstruction
+    principal_point: bool
+    errors: Array  # (held out,) clipped, of the camera's own observations
+    deviations: Array  # of the camera's parameters, NaN where held
+
+
+@dataclass(frozen=True)
+class Lenses:
+    """A model with the lenses that were chosen, the decisions, and by camera id how certain each is, for the report."""
+
+    model: pycolmap.Reconstruction
+    candidates: list[Candidate]
+    uncertainty: dict[int, dict[str, Any]]
+
+
+def choose_lenses(
+    model: pycolmap.Reconstruction,
+    *,
+    seed: int,
+    threads: int,
+    fixed: Sequence[int] = (),
+    named: Sequence[int] = (),
+    exif_focal_px: Mapping[int, float] | None = None,
+) -> Lenses:
+    """The model with the lens models that it can hold, adjusted anew.
+
+    Args:
+        model: a converged model; it is not changed.
+        seed: which observations are looked at or held out.
+        threads: of the adjustments, -1 for all.
+        fixed: camera ids that keep their intrinsics as they are.
+        named: camera ids that keep their model; whether its principal point is free is still tried.
+        exif_focal_px: by camera id, where a focal length stays that the observations leave open.
+    """
+    photos = _photos_by_camera(model)
+    cameras = sorted((c for c in photos if c not in fixed and photos[c] >= _LEAST_PHOTOS), key=lambda c: -photos[c])
+    candidates: list[Candidate] = []
+    freed: list[int] = []
+    held: list[int] = []
+    result = pycolmap.Reconstruction(model)
+    held_out.adjust(result, threads=threads, fixed=fixed)
+    for camera_id in cameras[:_MOST_CAMERAS]:
+        camera = result.cameras[camera_id]
+        if not parameters_of(camera) or field_of_view_deg(camera) > _FISHEYE_FROM_DEG:
+            free, tried = _by_trials(result, camera_id, seed=seed, threads=threads, fixed=fixed, named=named)
+            candidates.extend(tried)
+        else:
+            try:
+                found = determine(
+                    result,
+                    camera_id,
+                    seed=seed,
+                    fixed=fixed,
+                    named=camera_id in named,
+                    exif_focal_px=(exif_focal_px or {}).get(camera_id),
+                )
+            except (UndeterminedError, np.linalg.LinAlgError):
+                continue  # the uncertainty says why
+            free = found.principal_point
+            candidates.extend(_decisions(camera_id, found))
+            camera.model = found.camera.model
+            camera.params = found.camera.params.tolist()
+            held += [camera_id] if found.held else []
+        freed += [camera_id] if free else []
+    adjusted_fixed = [*fixed, *held]
+    # pycolmap frees the principal points of all cameras or of none; those of some are found first and then stay.
+    everywhere = bool(freed) and len(freed) == len(photos)
+    if freed and not everywhere:
+        held_out.adjust(result, threads=threads, principal_points=True, fixed=[c for c in photos if c not in freed])
+    settle(result, threads=threads, principal_points=everywhere, fixed=adjusted_fixed)
+    strayed = [c for c in freed if not is_centred(result.cameras[c])]
+    if strayed:
+        for camera_id in strayed:
+            camera = result.cameras[camera_id]
+            camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
+        settle(result, threads=threads, fixed=adjusted_fixed)
+    certain = {
+        camera_id: uncertainty(
+            result, camera_id, principal_point=camera_id in freed and camera_id not in strayed, seed=seed, fixed=fixed
+        )
+        for camera_id in sorted(photos)[:_MOST_DESCRIBED]
+    }
+    return Lenses(result, candidates, certain)
+
+
+def _decisions(camera_id: int, found: Determined) -> list[Candidate]:
+    return [
+        Candidate(
+            camera_id,
+            step.model,
+            step.principal_point,
+            held_out_px=None,
+            gain=None,
+            significance=step.distance,
+            kept=step.taken,
+        )
+        for step in found.steps
+    ]
+
+
+def _by_trials(
+    result: pycolmap.Reconstruction,
+    camera_id: int,
+    *,
+    seed: int,
+    threads: int,
+    fixed: Sequence[int],
+    named: Sequence[int],
+) -> tuple[bool, list[Candidate]]:
+    """Whether the principal point is free after trials with held-out observations, and these; sets the camera."""
+    training, held = held_out.split(result, seed=seed)
+    choice = _Choice(held, camera_id, threads=threads, fixed=fixed)
+    best = choice.make(training, named=camera_id in named)
+    found = best.model.cameras[camera_id]
+    result.cameras[camera_id].model = found.model
+    result.cameras[camera_id].params = found.params.tolist()
+    return best.principal_point, choice.tried
+
+
+def settle(
+    model: pycolmap.Reconstruction, *, threads: int, principal_points: bool = False, fixed: Sequence[int] = ()
+) -> None:
+    """Adjust a whole model in place, drop the observations that do not fit any more, and adjust once more.
+
+    The last adjustment is robust: highlights and things that move are seldom far enough off to be dropped, and are
+    wrong in the same way in many photos; counted by their square, they would pull the lens.
+    """
+    held_out.adjust(model, threads=threads, principal_points=principal_points, fixed=fixed)
+    pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
+    scale_px = held_out.loss_scale_px(held_out.observation_errors_px(model))
+    held_out.adjust(model, threads=threads, principal_points=principal_points, fixed=fixed, robust_px=scale_px)
+    pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
+    model.update_point_3d_errors()
+
+
+def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
+    """A camera of another COLMAP model that sees each ray at nearly the same pixel, the principal point unchanged."""
+    start = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, name, camera.mean_focal_length(), camera.width, camera.height
+    )
+    start.principal_point_x, start.principal_point_y = camera.principal_point_x, camera.principal_point_y
+    start.has_prior_focal_length = camera.has_prior_focal_length
+    columns, rows = np.meshgrid(np.linspace(0, camera.width, _FIT_GRID), np.linspace(0, camera.height, _FIT_GRID))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    rays = np.asarray(camera.cam_ray_from_img(pixels), dtype=np.float64).reshape(-1, 3)
+    good = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.05)
+    free = [*start.focal_length_idxs(), *start.extra_params_idxs()]
+    params = np.array(start.params, dtype=np.float64)
+
+    def misses(values: Array) -> Array:
+        params[free] = values
+        start.params = params.tolist()
+        found = np.asarray(start.img_from_cam(rays[good]), dtype=np.float64).reshape(-1, 2) - pixels[good]
+        return np.nan_to_num(found, nan=1e3).ravel()  # a ray that the trial cannot project: far away
+
+    scale = np.array([camera.mean_focal_length() if i in start.focal_length_idxs() else 0.1 for i in free])
+    fitted = least_squares(misses, params[free], x_scale=scale, loss="soft_l1")
+    params[free] = fitted.x
+    start.params = params.tolist()
+    return start
+
+
+def field_of_view_deg(camera: pycolmap.Camera) -> float:
+    """From corner to corner of a picture, as far as the lens model can tell."""
+    corners = np.array([[0.0, 0.0], [camera.width, camera.height]])
+    rays = np.asarray(camera.cam_ray_from_img(corners), dtype=np.float64).reshape(-1, 3)
+    if not np.isfinite(rays).all():
+        return 180.0
+    cosine = rays[0] @ rays[1] / np.linalg.norm(rays[0]) / np.linalg.norm(rays[1])
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+class _Choice:
+    """The trials of one camera, from the simplest on, each against the best before it."""
+
+    def __init__(self, held: held_out.HeldOut, camera_id: int, *, threads: int, fixed: Sequence[int]) -> None:
+        self.held, self.camera_id, self.threads, self.fixed = held, camera_id, threads, fixed
+        self.tried: list[Candidate] = []
+
+    def make(self, training: pycolmap.Reconstruction, *, named: bool) -> _Trial:
+        """The best trial.
+
+        The principal point comes before the tangential terms: both shift the picture, but a sensor off its axis is
+        what cameras have, and it turns the poses.
+        """
+        camera = training.cameras[self.camera_id]
+        wide = field_of_view_deg(camera) > _FISHEYE_FROM_DEG
+        if named:
+            simple, richer, others = camera.model.name, (camera.model.name,), ()
+        elif camera.is_perspective_fisheye():
+            simple, richer, others = FISHEYE[0], FISHEYE[1:], PERSPECTIVE
+        else:
+            simple, richer, others = PERSPECTIVE[0], PERSPECTIVE[1:], FISHEYE if wide else ()
+        best = self._trial(training, simple, principal_point=False)
+        self._note(best, gain=None, significance=None, kept=True)
+        for number, name in enumerate(richer):
+            richer_one = best if named else self._better(best, name, principal_point=best.principal_point)
+            changed, best = richer_one is not best, richer_one
+            if not best.principal_point and (changed or number == 0):
+                best = self._better(best, best.model.cameras[self.camera_id].model.name, principal_point=True)
+        for name in others:
+            best = self._better(best, name, principal_point=best.principal_point)
+        return best
+
+    def _better(self, best: _Trial, name: str, *, principal_point: bool) -> _Trial:
+        trial = self._trial(best.model, name, principal_point=principal_point)
+        gain, significance = _gain(best.errors, trial.errors), _significance(best, trial, self.camera_id)
+        pays = bool(
+            gain > _GAIN_DEVIATIONS
+            and trial.errors.mean() < (1 - _GAIN_SHARE) * best.errors.mean()
+            and significance > _PARAMETER_DEVIATIONS
+            and is_centred(trial.model.cameras[self.camera_id])
+        )
+        self._note(trial, gain=gain, significance=significance, kept=pays)
+        return trial if pays else best
+
+    def _trial(self, training: pycolmap.Reconstruction, name: str, *, principal_point: bool) -> _Trial:
+        model = pycolmap.Reconstruction(training)
+        camera = model.cameras[self.camera_id]
+        if camera.model.name != name:
+            new = converted(camera, name)
+            camera.model = new.model
+            camera.params = new.params.tolist()
+        others = [c for c in model.cameras if c != self.camera_id] if principal_point else self.fixed
+        adjuster = held_out.adjust(model, threads=self.threads, principal_points=principal_point, fixed=others)
+        mine = np.array([model.image(int(i)).camera_id == self.camera_id for i in self.held.images], dtype=bool)
+        errors = np.minimum(held_out.errors_px(model, self.held)[mine], _CLIP_PX)
+        deviations = held_out.intrinsic_deviations(model, adjuster, principal_points=principal_point)
+        return _Trial(model, principal_point, errors, deviations[self.camera_id])
+
+    def _note(self, trial: _Trial, *, gain: float | None, significance: float | None, kept: bool) -> None:
+        error = float(trial.errors.mean()) if len(trial.errors) else None
+        name = trial.model.cameras[self.camera_id].model.name
+        self.tried.append(Candidate(self.camera_id, name, trial.principal_point, error, gain, significance, kept))
+
+
+def _gain(before: Array, after: Array) -> float:
+    """By how many standard errors the mean of paired errors fell."""
+    difference = before - after
+    if len(difference) < 2 or difference.std() == 0:
+        return 0.0
+    return float(difference.mean() / (difference.std() / np.sqrt(len(difference))))
+
+
+def _significance(before: _Trial, after: _Trial, camera_id: int) -> float:
+    """Value over standard deviation of the parameters that are free only in `after`, the largest."""
+    old, new = before.model.cameras[camera_id], after.model.cameras[camera_id]
+    if old.is_perspective_fisheye() != new.is_perspective_fisheye():
+        return float("inf")  # another family: it adds nothing, it is something else
+    added = [(index, new.params[index]) for index in new.extra_params_idxs()[len(old.extra_params_idxs()) :]]
+    if after.principal_point and not before.principal_point:
+        before_it = (old.principal_point_x, old.principal_point_y)  # the centre, or what was given
+        indices = new.principal_point_idxs()
+        added += [(index, new.params[index] - start) for index, start in zip(indices, before_it, strict=True)]
+    ratios = [abs(value) / after.deviations[index] for index, value in added if after.deviations[index] > 0]
+    return max(ratios, default=0.0)
+
+
+def _photos_by_camera(model: pycolmap.Reconstruction) -> dict[int, int]:
+    counts: dict[int, int] = {}
+    for image_id in model.reg_image_ids():
+        camera_id = model.image(image_id).camera_id
+        counts[camera_id] = counts.get(camera_id, 0) + 1
+    return counts

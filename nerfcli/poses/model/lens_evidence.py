@@ -1,0 +1,362 @@
+"""What the observations of a model say of a lens when poses and points are free to follow.
+
+A lens parameter is determined as far as no motion of poses and points can imitate it. So the parameters' effect on the
+observations is freed from all that poses and points can explain (a Schur complement); what is left tells their values
+and uncertainties in one step of Gauss-Newton, without adjusting anything.
+
+Residuals are not independent: highlights that move with the view, or photos with rolling shutters, are wrong in the
+same way many times. Noise is therefore counted by groups: photos, and neighbouring points of the scene. If one part of
+the scene says another lens than the rest, the parameter is as uncertain as that (a sandwich estimate by clusters; White
+1980, Cameron and Miller 2015).
+
+Letters: x and y are a ray's coordinates at z = 1, r its distance from the axis; k1, k2, p1, p2 are terms of the Brown
+model as COLMAP's OPENCV has them; f the focal length, fa the difference of the two along the axes of the picture.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
+
+from nerfcli.poses.model import held_out
+
+Array = NDArray[np.float64]
+
+NAMES = ("f", "fa", "cx", "cy", "k1", "k2", "p1", "p2")
+# Beyond this, more observations cost time and change little: the clusters, not their members, make the uncertainty.
+_MOST_OBSERVATIONS = 30_000
+_SCENE_CLUSTERS = 8
+# Other cameras whose focal length and distortion are free too; of captures with more, the rest is taken as it is.
+_MOST_OTHERS = 12
+# Of the diagonal: the seven directions in which all poses move together are free, and take no part in the lens.
+_DAMPING = 1e-9
+
+
+class UndeterminedError(Exception):
+    """A model has too few observations to say anything of its lens."""
+
+
+@dataclass(frozen=True)
+class LensEvidence:
+    """What observations say of the `NAMES` of one camera.
+
+    Args:
+        current: (8,) the parameters' values, relative to the centre of the picture and to no distortion.
+        information: (8, 8) inverse covariance for unit noise.
+        scores: for each way to cluster, (clusters, 8) the clusters' gradients.
+        informations: for each way, (clusters, 8, 8), their shares of the information.
+        noise_px: standard deviation of an observation.
+        border_px: (8,) how far the corner of the picture moves by a unit of each parameter.
+    """
+
+    current: Array
+    information: Array
+    scores: tuple[Array, ...]
+    informations: tuple[Array, ...]
+    noise_px: float
+    border_px: Array
+
+    def estimate(self, names: Sequence[str]) -> "Estimate":
+        """The parameters `names` if they alone are free, the others being as they are.
+
+        Raises:
+            UndeterminedError: the observations leave one of them open.
+        """
+        index = [NAMES.index(name) for name in names]
+        information = self.information[np.ix_(index, index)]
+        scale = np.sqrt(np.diag(information))
+        if not (scale > 0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e10:
+            raise UndeterminedError(f"the observations leave {', '.join(names)} open")
+        inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        change = inverse @ self.scores[0][:, index].sum(axis=0)
+        covariances = [self.noise_px**2 * inverse]
+        for scores, informations in zip(self.scores, self.informations, strict=True):
+            left = scores[:, index] - informations[:, index][:, :, index] @ change
+            count = len(left)
+            meat = left.T @ left * (count / max(count - 1, 1))
+            covariances.append(inverse @ meat @ inverse)
+        return Estimate(tuple(names), self.current[index] + change, change, tuple(covariances))
+
+    def without(self, name: str) -> "LensEvidence":
+        """The evidence as it would be with a parameter at zero: what it explained is among the residuals."""
+        index = NAMES.index(name)
+        value = self.current[index]
+        scores = tuple(
+            one + value * informations[:, :, index]
+            for one, informations in zip(self.scores, self.informations, strict=True)
+        )
+        current = self.current.copy()
+        current[index] = 0.0
+        return replace(self, scores=scores, current=current)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Values of lens parameters, their change from the model's, and their covariance, by each way to count noise."""
+
+    names: tuple[str, ...]
+    values: Array
+    change: Array
+    covariances: tuple[Array, ...]
+
+    def deviation(self, name: str) -> float:
+        """Standard deviation of a parameter, the largest of all ways to count noise."""
+        index = self.names.index(name)
+        return float(np.sqrt(max(covariance[index, index] for covariance in self.covariances)))
+
+    def value(self, name: str) -> float:
+        """The value of a parameter."""
+        return float(self.values[self.names.index(name)])
+
+    def distance(self, names: Sequence[str]) -> float:
+        """How far some parameters are from zero, squared and in units of their covariance; the least of all ways."""
+        index = [self.names.index(name) for name in names]
+        values = self.values[index]
+        return float(
+            min(values @ np.linalg.pinv(covariance[np.ix_(index, index)]) @ values for covariance in self.covariances)
+        )
+
+
+def lens_evidence(
+    model: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int] = ()
+) -> LensEvidence:
+    """What a converged model's observations say of a perspective camera.
+
+    Observations are weighted as the robust adjustment does, see `held_out.adjust`.
+
+    Args:
+        seed: of the part of the points that is taken of a large model, and of the clusters.
+        fixed: cameras whose intrinsics are exact.
+
+    Raises:
+        UndeterminedError: there are fewer observations than unknowns.
+    """
+    seen = _observations(model, seed=seed)
+    others = [c for c in seen.cameras if c != camera_id and c not in fixed][:_MOST_OTHERS]
+    poses, points, lens, residuals = _jacobians(model, seen, camera_id, others=others)
+    rows, columns = len(residuals), lens.shape[2]
+    unknowns = 6 * len(seen.images) + 3 * len(seen.xyz) - 7 + columns
+    if 2 * rows <= unknowns:
+        raise UndeterminedError(f"{rows} observations for {unknowns} unknowns")
+    errors = np.linalg.norm(residuals, axis=1)
+    root_weights = np.sqrt(1 / (1 + (errors / held_out.loss_scale_px(errors)) ** 2))
+    for array in (poses, points, lens):
+        array *= root_weights[:, None, None]
+    residuals = residuals * root_weights[:, None]
+    own = _freed(poses, points, lens, seen)
+    # The other cameras' lenses follow too; they are few, and go the way of the poses.
+    if others:
+        flat = own.reshape(2 * rows, columns)
+        first, rest = flat[:, : len(NAMES)], flat[:, len(NAMES) :]
+        own = (first - rest @ np.linalg.lstsq(rest, first, rcond=1e-10)[0]).reshape(rows, 2, len(NAMES))
+    scores = np.einsum("nij,ni->nj", own, residuals)
+    products = np.einsum("nij,nik->njk", own, own)
+    clusters = (seen.photos, _scene_clusters(seen, seed=seed))
+    camera = model.cameras[camera_id]
+    return LensEvidence(
+        current=_current(camera),
+        information=products.sum(axis=0),
+        scores=tuple(_summed(scores, labels) for labels in clusters),
+        informations=tuple(_summed(products, labels) for labels in clusters),
+        # Observations that count less take part of the unknowns with them.
+        noise_px=float(np.sqrt((residuals**2).sum() / np.mean(root_weights**2) / max(2 * rows - unknowns, 1))),
+        border_px=_border_px(camera),
+    )
+
+
+def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:
+    """Which of `NAMES` a camera's model has, the principal point aside; empty if it has others."""
+    return {
+        "SIMPLE_PINHOLE": ("f",),
+        "PINHOLE": ("f", "fa"),
+        "SIMPLE_RADIAL": ("f", "k1"),
+        "RADIAL": ("f", "k1", "k2"),
+        "OPENCV": ("f", "fa", "k1", "k2", "p1", "p2"),
+    }.get(camera.model.name, ())
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Observations: (n,) positions in `images` and `xyz`, (n, 2) pixels."""
+
+    images: list[int]
+    cameras: list[int]
+    photos: NDArray[np.int64]
+    points: NDArray[np.int64]
+    pixels: Array
+    xyz: Array
+
+
+def _observations(model: pycolmap.Reconstruction, *, seed: int) -> _Seen:
+    finite = [i for i, point in model.points3D.items() if np.isfinite(point.xyz).all()]
+    ids = np.array(sorted(finite), dtype=np.int64)
+    kept = _MOST_OBSERVATIONS / max(model.compute_num_observations(), 1)
+    if kept < 1:
+        ids = ids[np.random.default_rng(seed).uniform(size=len(ids)) < kept]
+    images = sorted(model.reg_image_ids())
+    photos, points, pixels = [], [], []
+    for position, image_id in enumerate(images):
+        seen = model.image(image_id).get_observation_points2D()
+        ours = np.array([point.point3D_id for point in seen], dtype=np.int64)
+        places = np.searchsorted(ids, ours)
+        inside = np.flatnonzero(places < len(ids))
+        inside = inside[ids[places[inside]] == ours[inside]]
+        photos.append(np.full(len(inside), position, dtype=np.int64))
+        points.append(places[inside])
+        pixels += [seen[i].xy for i in inside]
+    xyz = np.array([model.point3D(int(i)).xyz for i in ids], dtype=np.float64).reshape(-1, 3)
+    cameras = sorted({model.image(image_id).camera_id for image_id in images})
+    return _Seen(
+        images,
+        cameras,
+        np.concatenate([np.zeros(0, dtype=np.int64), *photos]),
+        np.concatenate([np.zeros(0, dtype=np.int64), *points]),
+        np.array(pixels, dtype=np.float64).reshape(-1, 2),
+        xyz,
+    )
+
+
+def _jacobians(
+    model: pycolmap.Reconstruction, seen: _Seen, camera_id: int, *, others: list[int]
+) -> tuple[Array, Array, Array, Array]:
+    """Pixels per unit of pose (n, 2, 6), point (n, 2, 3) and lenses (n, 2, 8 + 2 others); residuals (n, 2)."""
+    count = len(seen.photos)
+    poses, points = np.zeros((count, 2, 6)), np.zeros((count, 2, 3))
+    lens, residuals = np.zeros((count, 2, len(NAMES) + 2 * len(others))), np.zeros((count, 2))
+    for position, image_id in enumerate(seen.images):
+        rows = np.flatnonzero(seen.photos == position)
+        image = model.image(image_id)
+        camera, pose = model.camera(image.camera_id), image.cam_from_world()
+        rotation = pose.rotation.matrix()
+        rotated = seen.xyz[seen.points[rows]] @ rotation.T
+        local = rotated + pose.translation
+        local[local[:, 2] <= 1e-6 * np.abs(local).max(axis=1, initial=1e-300)] = np.nan
+        jacobian = projection_jacobians(camera, local)
+        x, y, z = rotated.T
+        turned = np.zeros((len(rows), 3, 3))  # -[RX]x
+        turned[:, 0, 1], turned[:, 0, 2], turned[:, 1, 2] = z, -y, x
+        turned -= turned.transpose(0, 2, 1)
+        poses[rows] = np.concatenate([jacobian @ turned, jacobian], axis=2)
+        points[rows] = jacobian @ rotation
+        residuals[rows] = seen.pixels[rows] - np.asarray(camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
+        terms = _lens_terms(camera, local)
+        if image.camera_id == camera_id:
+            lens[rows, :, : len(NAMES)] = terms
+        elif image.camera_id in others:
+            start = len(NAMES) + 2 * others.index(image.camera_id)
+            lens[rows, :, start : start + 2] = terms[:, :, [NAMES.index("f"), NAMES.index("k1")]]
+    # What cannot be projected says nothing.
+    bad = ~(
+        np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(residuals).all(axis=1) & np.isfinite(lens).all(axis=(1, 2))
+    )
+    for array in (poses, points, lens, residuals):
+        array[bad] = 0
+    return poses, points, lens, residuals
+
+
+def projection_jacobians(camera: pycolmap.Camera, local: Array) -> Array:
+    """(n, 2, 3) pixels per unit of points (n, 3) in the camera's axes, by central differences."""
+    step = 1e-5 * np.linalg.norm(local, axis=1, keepdims=True)
+    columns = []
+    for axis in range(3):
+        offset = np.zeros((1, 3))
+        offset[0, axis] = 1.0
+        ahead = np.asarray(camera.img_from_cam(local + step * offset), dtype=np.float64).reshape(-1, 2)
+        behind = np.asarray(camera.img_from_cam(local - step * offset), dtype=np.float64).reshape(-1, 2)
+        columns.append((ahead - behind) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def _lens_terms(camera: pycolmap.Camera, local: Array) -> Array:
+    """(n, 2, 8) pixels per unit of the `NAMES`."""
+    x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
+    r2 = x * x + y * y
+    focal, none, one = camera.mean_focal_length(), np.zeros_like(x), np.ones_like(x)
+    terms = (
+        (x, y),
+        (x / 2, -y / 2),
+        (one, none),
+        (none, one),
+        (focal * x * r2, focal * y * r2),
+        (focal * x * r2**2, focal * y * r2**2),
+        (2 * focal * x * y, focal * (r2 + 2 * y * y)),
+        (focal * (r2 + 2 * x * x), 2 * focal * x * y),
+    )
+    return np.stack([np.stack(term, axis=-1) for term in terms], axis=-1)
+
+
+def _freed(poses: Array, points: Array, lens: Array, seen: _Seen) -> Array:
+    """(n, 2, columns) the effect of lens parameters that no motion of poses and points can imitate."""
+    count, columns = len(poses), lens.shape[2]
+    by_pose = _sparse(poses, seen.photos, width=6 * len(seen.images))
+    by_point = _sparse(points, seen.points, width=3 * len(seen.xyz))
+    flat = lens.reshape(2 * count, columns)
+    blocks = np.zeros((len(seen.xyz), 3, 3))
+    np.add.at(blocks, seen.points, np.einsum("nij,nik->njk", points, points))
+    blocks += _DAMPING * (np.trace(blocks, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(3)
+    inverse = _block_diagonal(np.linalg.inv(blocks))
+    cross = csr_array(by_point.T @ by_pose)
+    cross_lens = by_point.T @ flat
+    normal = (by_pose.T @ by_pose - cross.T @ (inverse @ cross)).toarray()
+    right = by_pose.T @ flat - cross.T @ (inverse @ cross_lens)
+    scale = np.sqrt(np.maximum(np.diag((by_pose.T @ by_pose).toarray()), 1e-300))
+    normal = normal / np.outer(scale, scale) + _DAMPING * np.eye(len(normal))
+    by_lens = cho_solve(cho_factor(normal), right / scale[:, None]) / scale[:, None]
+    left = flat - by_pose @ by_lens - by_point @ (inverse @ (cross_lens - cross @ by_lens))
+    return np.asarray(left).reshape(count, 2, columns)
+
+
+def _sparse(blocks: Array, columns: NDArray[np.int64], *, width: int) -> csr_array:
+    """Rows of blocks (n, 2, size), block i at the place `columns[i]` of its row."""
+    count, _, size = blocks.shape
+    places = np.repeat((columns[:, None] * size + np.arange(size))[:, None, :], 2, axis=1)
+    pointers = np.arange(0, 2 * count * size + 1, size)
+    return csr_array((blocks.ravel(), places.ravel(), pointers), shape=(2 * count, width))
+
+
+def _block_diagonal(blocks: Array) -> csr_array:
+    count = len(blocks)
+    places = np.repeat((3 * np.arange(count)[:, None] + np.arange(3))[:, None, :], 3, axis=1)
+    pointers = np.arange(0, 9 * count + 1, 3)
+    return csr_array((blocks.ravel(), places.ravel(), pointers), shape=(3 * count, 3 * count))
+
+
+def _scene_clusters(seen: _Seen, *, seed: int) -> NDArray[np.int64]:
+    """(n,) which part of the scene each observation is of; far points are drawn near, so that they are one part."""
+    offsets = seen.xyz - np.median(seen.xyz, axis=0)
+    distances = np.linalg.norm(offsets, axis=1)
+    typical = np.median(distances) + 1e-300
+    drawn = offsets / np.maximum(distances / (3 * typical), 1)[:, None]
+    count = min(_SCENE_CLUSTERS, len(drawn))
+    _, labels = kmeans2(drawn / typical, count, minit="++", rng=np.random.default_rng(seed), missing="warn")
+    return labels.astype(np.int64)[seen.points]
+
+
+def _summed(values: Array, labels: NDArray[np.int64]) -> Array:
+    _, places = np.unique(labels, return_inverse=True)
+    total = np.zeros((int(places.max(initial=-1)) + 1, *values.shape[1:]))
+    np.add.at(total, places, values)
+    return total
+
+
+def _current(camera: pycolmap.Camera) -> Array:
+    values: dict[str, float] = dict.fromkeys(NAMES, 0.0)
+    values["f"] = camera.mean_focal_length()
+    values["fa"] = camera.focal_length_x - camera.focal_length_y
+    values["cx"] = camera.principal_point_x - camera.width / 2
+    values["cy"] = camera.principal_point_y - camera.height / 2
+    extra = [name for name in parameters_of(camera) if name not in ("f", "fa")]
+    for name, index in zip(extra, camera.extra_params_idxs(), strict=False):
+        values[name] = camera.params[index]
+    return np.array([values[name] for name in NAMES])
+
+
+def _border_px(camera: pycolmap.Camera) -> Array:
+    """(8,) how far the corner of the picture moves by a unit of each parameter."""
+    corner = np.array([[camera.width / 2, camera.height / 2, camera.mean_focal_length()]])
+    return np.linalg.norm(_lens_terms(camera, corner)[0], axis=0)

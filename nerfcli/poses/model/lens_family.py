@@ -1,0 +1,102 @@
+"""Whether photos were taken with a fisheye, asked of pairs of photos before there is a model of all.
+
+A mapper that starts from a perspective lens finds few photos that fit together if the lens was a fisheye, or many that
+fit badly. A pair of photos alone can tell: with the right projection, more of its matches agree on one motion of the
+camera. Two matches in pixels may agree on any fundamental matrix, which is freer than a motion with a known lens; so a
+perspective photo never gains by a fisheye.
+"""
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from nerfcli.poses.input.job import CameraGroup, Job
+from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
+
+Array = NDArray[np.float64]
+
+# Focal lengths to try, as a share of the longer side: an equidistant lens that shows 1 / share radians along it.
+_FOCAL_SHARES = np.geomspace(0.25, 0.85, 8)
+# More matches must agree by this factor.
+_CLEARLY = 1.1
+_PAIRS_ASKED = 8
+_LEAST_MATCHES = 60
+_MOST_MATCHES = 400
+_MAX_ERROR_PX = 4.0
+
+
+def as_fisheye(job: Job) -> Job | None:
+    """The job with cameras that start from a fisheye, where pairs of photos say so; None where none of them does.
+
+    Only cameras of which neither a file nor the user has said anything are asked.
+    """
+    groups = []
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        for group in job.groups:
+            asked = group.choose and group.model == START_MODEL and group.params is None
+            focal_px = _fisheye_focal_px(group, job, database) if asked else None
+            groups.append(group if focal_px is None else _fisheye(group, focal_px))
+    return None if tuple(groups) == job.groups else replace(job, groups=tuple(groups))
+
+
+def _fisheye(group: CameraGroup, focal_px: float) -> CameraGroup:
+    params = (focal_px, focal_px, group.width / 2, group.height / 2, 0.0, 0.0, 0.0, 0.0)
+    return replace(group, model=START_FISHEYE, params=params)
+
+
+def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database) -> float | None:
+    """The focal length of the fisheye with which clearly more matches agree than without; None if there is none."""
+    pairs = _strongest_pairs({job.image_ids[number] for number in group.photos}, database)
+    if not pairs:
+        return None
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = job.seed
+    options.ransac.max_error = _MAX_ERROR_PX
+    options.ransac.max_num_trials = 1000
+    camera = pycolmap.Camera.create_from_model_name(1, START_MODEL, 1.2 * group.width, group.width, group.height)
+    freely = sum(_agreeing(pycolmap.estimate_two_view_geometry, camera, pair, options) for pair in pairs)
+    longer = max(group.width, group.height)
+    found = []
+    for focal_px in longer * _FOCAL_SHARES:
+        start = _fisheye(group, float(focal_px))
+        camera = pycolmap.Camera.create_from_model_name(1, start.model, focal_px, group.width, group.height)
+        camera.params = list(start.params or ())
+        count = sum(_agreeing(pycolmap.estimate_calibrated_two_view_geometry, camera, pair, options) for pair in pairs)
+        found.append((count, float(focal_px)))
+    best, focal_px = max(found)
+    return focal_px if best > _CLEARLY * freely else None
+
+
+def _agreeing(
+    estimate: Callable[..., pycolmap.TwoViewGeometry],
+    camera: pycolmap.Camera,
+    pair: tuple[Array, Array],
+    options: pycolmap.TwoViewGeometryOptions,
+) -> int:
+    """How many of a pair's matches agree on one geometry."""
+    matches = np.repeat(np.arange(len(pair[0]), dtype=np.uint32)[:, None], 2, axis=1)
+    return len(estimate(camera, pair[0], camera, pair[1], matches=matches, options=options).inlier_matches)
+
+
+def _strongest_pairs(images: set[int], database: pycolmap.Database) -> list[tuple[Array, Array]]:
+    """Pixels (matches, 2) in both photos of the pairs with the most matches, each photo in one pair at the most.
+
+    Of photos that were taken side by side all matches agree whatever the lens, so that a photo is asked once.
+    """
+    pair_ids, counts = database.read_num_matches()
+    pairs = [(count, *pycolmap.pair_id_to_image_pair(pair_id)) for pair_id, count in zip(pair_ids, counts, strict=True)]
+    chosen: list[tuple[Array, Array]] = []
+    for count, one, other in sorted(pairs, reverse=True):
+        if count < _LEAST_MATCHES or len(chosen) == _PAIRS_ASKED:
+            break
+        if {one, other} <= images:
+            images = images - {one, other}
+            matches = np.asarray(database.read_matches(one, other), dtype=np.int64)
+            matches = matches[:: max(1, len(matches) // _MOST_MATCHES)]
+            first, second = (np.asarray(database.read_keypoints(i), dtype=np.float64)[:, :2] for i in (one, other))
+            chosen.append((first[matches[:, 0]], second[matches[:, 1]]))
+    return chosen

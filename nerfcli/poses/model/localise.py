@@ -1,0 +1,383 @@
+"""Photos that no other photo matches well, placed by what the whole model knows.
+
+Two photos far apart may share too few certain matches to hold one of them. The points of a model were seen by many
+photos: a feature that looks more like one point than like any other votes for it, and a pose that many votes agree on
+is no accident. Where that pose expects the points, more features are found than anyone could tell by looks alone;
+beside these places, where nothing should be, hardly any. A photo of which this cannot be said is not placed.
+
+Source: 2D-3D matching as in Sattler et al. 2011 (ICCV), the ratio test between points as there in section 3.
+"""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from nerfcli.poses.input.job import Job
+from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
+from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+# How far a point may be seen from where it is expected, as a share of the longer side, and pixels at least.
+_TOLERANCE_SHARE, _LEAST_TOLERANCE_PX = 0.004, 3.0
+# A vote counts if the nearest other point looks this much less alike. Measured on photos 40 degrees apart: at 0.8 one
+# vote in four is right and there are too few, at 0.95 one in thirty.
+_RATIO = 0.9
+_MOST_VOTES = 600
+_TRIALS = 40_000
+# Where a point is expected, a feature is the point if descriptors of length 1 are this near.
+_ALIKE = 0.5
+# Fewer agreeing votes, or features found, than these place nothing.
+_LEAST_VOTES = 10
+_LEAST_FOUND = 25
+# The first pose is rough: features are sought so far around, in tolerances, first and then.
+_WITHIN = (2.0, 1.0)
+# Beside the places where points are expected, in tolerances, so many times fewer features may look like them.
+_BESIDE = (6.0, 9.0)
+_HERE = np.zeros(2)
+_CLEARLY = 2.5
+# A second pose with this share of the votes makes the first one a guess.
+_RIVAL_SHARE = 0.5
+# Share of the picture that what is found must be spread over. Measured: 0.02 where a detail looks like one that is
+# elsewhere, 0.13 and more where the place was right.
+_LEAST_AREA = 0.05
+# Standard deviations of a pose: of its angles, and of its place relative to the distance of what it sees.
+_MOST_TURN_DEG, _MOST_SHIFT = 0.5, 0.02
+# What is compared with; more of the points' descriptors take time and memory.
+_MOST_DESCRIPTORS = 150_000
+_BLOCK = 256
+# Of the features that place a photo, the share that must be left after the adjustment.
+_LEAST_KEPT = 0.6
+# A photo that was placed may make others possible.
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What was tried for a photo.
+
+    image_id, votes: features that choose a point. agreeing: of them, those that a pose explains. found: points found
+    where the pose expects them. beside: how many are found, at most, where none should be. refused: why the photo was
+    not placed, "" if it was.
+    """
+
+    image_id: int
+    votes: int = 0
+    agreeing: int = 0
+    found: int = 0
+    beside: int = 0
+    refused: str = ""
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What a model's points look like: their ids (points,) and places, the descriptors, and the point of each."""
+
+    ids: Indices
+    places: Array
+    descriptors: NDArray[np.float32]
+    of: Indices  # (descriptors,) index of the point
+
+
+@dataclass(frozen=True)
+class _Photo:
+    image_id: int
+    camera: pycolmap.Camera
+    pixels: Array
+    descriptors: NDArray[np.float32]
+
+    @property
+    def tolerance_px(self) -> float:
+        return max(_TOLERANCE_SHARE * max(self.camera.width, self.camera.height), _LEAST_TOLERANCE_PX)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    pose: pycolmap.Rigid3d
+    features: Indices
+    points: Indices
+
+
+def localise(
+    model: pycolmap.Reconstruction, job: Job, *, image_ids: Sequence[int]
+) -> tuple[pycolmap.Reconstruction, list[Attempt]]:
+    """A copy of the model with those of the photos placed that its points tell the place of, adjusted; what was tried.
+
+    Photos that a placed one makes possible are tried again, so that a chain of them is followed. One whose own matches
+    with other photos, however few, contradict its place is not kept.
+    """
+    grown = pycolmap.Reconstruction(model)
+    if model.num_points3D() < _LEAST_FOUND:
+        return grown, [Attempt(image_id, refused="the model has too few points") for image_id in sorted(image_ids)]
+    attempts: dict[int, Attempt] = {}
+    left = sorted(image_ids)
+    files = dict(zip(job.image_ids, job.files, strict=True))
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        for _ in range(_ROUNDS):
+            known = _known(grown, database)
+            placed_now = []
+            for image_id in left:
+                photo = _photo(grown, database, image_id)
+                if photo is None:
+                    attempts[image_id] = Attempt(image_id, refused="nothing is known of its camera")
+                    continue
+                placed, attempts[image_id] = _place(photo, known, seed=job.seed)
+                if placed is not None:
+                    _add(grown, photo, placed, known=known, name=files[image_id])
+                    placed_now.append(image_id)
+            left = [image_id for image_id in left if image_id not in placed_now]
+            if not left or not placed_now:
+                break
+        pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
+    if any(not attempt.refused for attempt in attempts.values()):
+        settle(grown, threads=job.threads, fixed=job.fixed_cameras)
+    for image_id in (image_id for image_id, attempt in attempts.items() if not attempt.refused):
+        if doubt := _doubt(grown, image_id, pairs):
+            grown.deregister_frame(grown.image(image_id).frame_id)
+            attempts[image_id] = replace(attempts[image_id], refused=doubt)
+    return grown, [attempts[image_id] for image_id in sorted(attempts)]
+
+
+def left_out(model: pycolmap.Reconstruction, job: Job) -> list[int]:
+    """Ids of the images that a model does not place though they have features enough."""
+    placed = set(model.reg_image_ids())
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        return [
+            image_id
+            for image_id in job.image_ids
+            if image_id not in placed
+            and database.num_keypoints_for_image(image_id) >= FEW_FEATURES
+            and database.exists_descriptors(image_id)
+        ]
+
+
+def shared_pairs(model: pycolmap.Reconstruction, image_ids: Sequence[int], *, min_matches: int) -> list[VerifiedPair]:
+    """The pairs of these photos with all others of a model, by the points that they both see."""
+    pixels: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
+    for image_id in image_ids:
+        for seen in model.image(image_id).get_observation_points2D():
+            for element in model.point3D(seen.point3D_id).track.elements:
+                if element.image_id != image_id:
+                    there = model.image(element.image_id).points2D[element.point2D_idx]
+                    both = (seen.xy, there.xy) if image_id < element.image_id else (there.xy, seen.xy)
+                    pixels.setdefault((min(image_id, element.image_id), max(image_id, element.image_id)), []).append(
+                        both
+                    )
+    return [
+        VerifiedPair(*pair, np.array([one for one, _ in both]), np.array([other for _, other in both]))
+        for pair, both in sorted(pixels.items())
+        if len(both) >= min_matches
+    ]
+
+
+def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[VerifiedPair]) -> str:
+    """What speaks against a photo's place after the adjustment, "" if nothing does."""
+    observations = model.image(image_id).num_points3D
+    if observations < _LEAST_KEPT * _LEAST_FOUND:
+        return f"only {observations} of its points are left after the adjustment"
+    own = [pair for pair in pairs if image_id in (pair.one, pair.other)]
+    against = [agreement for agreement in agreements(model, own) if agreement.contradicts]
+    return f"{against[0].matches} verified matches contradict its place" if against else ""
+
+
+def _known(model: pycolmap.Reconstruction, database: pycolmap.Database) -> _Known:
+    ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
+    most = max(1, _MOST_DESCRIPTORS // max(len(ids), 1))
+    features: dict[int, tuple[list[int], list[int]]] = {}  # by photo: features, and the points they are of
+    for index, point_id in enumerate(ids):
+        for element in model.point3D(int(point_id)).track.elements[:most]:
+            numbers, points = features.setdefault(element.image_id, ([], []))
+            numbers.append(element.point2D_idx)
+            points.append(index)
+    photos = sorted(features)
+    return _Known(
+        ids,
+        np.array([model.point3D(int(point_id)).xyz for point_id in ids]).reshape(-1, 3),
+        np.concatenate([_descriptors(database, photo)[features[photo][0]] for photo in photos]),
+        np.concatenate([np.array(features[photo][1], dtype=np.int64) for photo in photos]),
+    )
+
+
+def _photo(model: pycolmap.Reconstruction, database: pycolmap.Database, image_id: int) -> _Photo | None:
+    """None where the focal length is neither known beforehand nor found with other photos of the same camera."""
+    camera_id = database.read_image(image_id).camera_id
+    in_use = {model.image(placed).camera_id for placed in model.reg_image_ids()}
+    camera = model.camera(camera_id) if camera_id in in_use else database.read_camera(camera_id)
+    if camera_id not in in_use and not camera.has_prior_focal_length:
+        return None
+    pixels = np.asarray(database.read_keypoints(image_id), dtype=np.float64)[:, :2]
+    return _Photo(image_id, camera, pixels, _descriptors(database, image_id))
+
+
+def _descriptors(database: pycolmap.Database, image_id: int) -> NDArray[np.float32]:
+    """Of length 1."""
+    found = np.asarray(database.read_descriptors(image_id).data, dtype=np.float32)
+    return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1.0)
+
+
+def _place(photo: _Photo, known: _Known, *, seed: int) -> tuple[_Placed | None, Attempt]:
+    """Where a photo was taken and what it sees, or None; and how that was found or why not."""
+    features, points = _votes(photo, known)
+    first = _pose(photo, known, features, points, seed=seed)
+    agreeing = 0 if first is None else len(first.features)
+    attempt = Attempt(photo.image_id, len(features), agreeing)
+    if first is None or agreeing < _LEAST_VOTES:
+        return None, replace(attempt, refused=f"only {agreeing} of {len(features)} features agree on a place")
+    others = ~np.isin(features, first.features)
+    second = _pose(photo, known, features[others], points[others], seed=seed)
+    if second is not None and len(second.features) >= _RIVAL_SHARE * agreeing and not _alike(first, second, known):
+        return None, replace(attempt, refused=f"{len(second.features)} features agree on another place than {agreeing}")
+    placed = first
+    for within in _WITHIN:
+        found = _pose(photo, known, *_expected(photo, known, placed.pose, within=within), seed=seed)
+        if found is None:
+            break
+        placed = found
+    count, *beside = (len(_expected(photo, known, placed.pose, beside=step)[0]) for step in (np.zeros(2), *_steps()))
+    attempt = replace(attempt, found=count, beside=max(beside))
+    if count < _LEAST_FOUND or count < _CLEARLY * max(beside):
+        said = f"{count} features are where it expects them, and {max(beside)} where none should be"
+        return None, replace(attempt, refused=said)
+    area = _area(photo, placed.features)
+    if area < _LEAST_AREA:
+        return None, replace(attempt, refused=f"only {area:.0%} of the picture agrees with the model")
+    turn_deg, shift = _deviations(photo, known, placed)
+    if turn_deg > _MOST_TURN_DEG or shift > _MOST_SHIFT:
+        return None, replace(attempt, refused=f"its place is uncertain by {shift:.1%} of the distance")
+    return placed, attempt
+
+
+def _votes(photo: _Photo, known: _Known) -> tuple[Indices, Indices]:
+    """Features and the points that they choose, each point once."""
+    nearest = np.empty(len(photo.pixels), dtype=np.int64)
+    ratios, cosines = np.empty(len(nearest)), np.empty(len(nearest))
+    for start in range(0, len(nearest), _BLOCK):
+        alike = photo.descriptors[start : start + _BLOCK] @ known.descriptors.T  # (block, descriptors)
+        rows = np.arange(len(alike))
+        best = alike.argmax(axis=1)
+        points, cosine = known.of[best], alike[rows, best]
+        alike[known.of[None, :] == points[:, None]] = -1.0
+        second = alike.max(axis=1)
+        block = slice(start, start + len(alike))
+        nearest[block], cosines[block] = points, cosine
+        ratios[block] = np.sqrt(np.maximum(2 - 2 * cosine, 0) / np.maximum(2 - 2 * second, 1e-12))
+    features = np.flatnonzero(ratios < _RATIO)
+    features = features[np.argsort(ratios[features], kind="stable")]
+    _, first = np.unique(nearest[features], return_index=True)
+    features = features[np.sort(first)][:_MOST_VOTES]
+    return features, nearest[features]
+
+
+def _pose(photo: _Photo, known: _Known, features: Indices, points: Indices, *, seed: int) -> _Placed | None:
+    """The pose that most of the features agree on, and which do."""
+    if len(features) < _LEAST_VOTES:
+        return None
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = photo.tolerance_px
+    options.ransac.random_seed = seed
+    options.ransac.max_num_trials = _TRIALS
+    options.ransac.confidence = 0.9999
+    found = pycolmap.estimate_and_refine_absolute_pose(
+        photo.pixels[features], known.places[points], photo.camera, estimation_options=options
+    )
+    if found is None:
+        return None
+    inliers = np.asarray(found["inlier_mask"], dtype=bool)
+    return _Placed(found["cam_from_world"], features[inliers], points[inliers])
+
+
+def _expected(
+    photo: _Photo, known: _Known, pose: pycolmap.Rigid3d, *, within: float = 1.0, beside: Array = _HERE
+) -> tuple[Indices, Indices]:
+    """Features that look like the points that a pose expects there, and these points.
+
+    within: how near. beside: how far away from there. Both are in tolerances.
+    """
+    local = known.places @ pose.rotation.matrix().T + pose.translation
+    pixels = np.full((len(local), 2), np.nan)
+    before = local[:, 2] > 0
+    pixels[before] = np.asarray(photo.camera.img_from_cam(local[before]), dtype=np.float64).reshape(-1, 2)
+    pixels += photo.tolerance_px * beside
+    with np.errstate(invalid="ignore"):
+        seen = np.all((pixels >= 0) & (pixels < (photo.camera.width, photo.camera.height)), axis=1)
+    pixels[~seen] = -1e6  # where no feature is
+    near = KDTree(photo.pixels).query_ball_point(pixels, within * photo.tolerance_px)
+    counts = np.array([len(features) for features in near])[known.of]
+    looks = np.repeat(np.arange(len(known.of)), counts)
+    features = np.array([feature for point in known.of for feature in near[point]], dtype=np.int64)
+    distances = np.empty(len(features))
+    for start in range(0, len(features), _BLOCK * 64):
+        rows = slice(start, start + _BLOCK * 64)
+        cosines = np.einsum("ij,ij->i", photo.descriptors[features[rows]], known.descriptors[looks[rows]])
+        distances[rows] = np.sqrt(np.maximum(2 - 2 * cosines, 0))
+    points = known.of[looks]
+    order = np.argsort(distances, kind="stable")
+    order = order[distances[order] < _ALIKE]
+    for ids in (points, features):  # of each point the likest feature, and of each feature the likest point
+        _, first = np.unique(ids[order], return_index=True)
+        order = order[np.sort(first)]
+    return features[order], points[order]
+
+
+def _steps() -> list[Array]:
+    """In eight directions to where no feature is expected, tolerances."""
+    angles = np.arange(8) * np.pi / 4
+    return [_BESIDE[i % 2] * np.array([np.cos(angle), np.sin(angle)]) for i, angle in enumerate(angles)]
+
+
+def _area(photo: _Photo, features: Indices) -> float:
+    """Share of the picture that the features lie in: an ellipse of their spread."""
+    spread = np.sqrt(max(np.linalg.det(np.cov(photo.pixels[features].T)), 0.0))
+    return float(4 * np.pi * spread / (photo.camera.width * photo.camera.height))
+
+
+def _alike(one: _Placed, other: _Placed, known: _Known) -> bool:
+    """Whether two poses are the same but for noise."""
+    turned = np.degrees((one.pose.rotation * other.pose.rotation.inverse()).angle())
+    places = [np.asarray(placed.pose.inverse().translation) for placed in (one, other)]
+    distance = np.median(np.linalg.norm(known.places[one.points] - places[0], axis=1))
+    return bool(turned < 5 and np.linalg.norm(places[0] - places[1]) < 0.1 * distance)
+
+
+def _deviations(photo: _Photo, known: _Known, placed: _Placed) -> tuple[float, float]:
+    """Standard deviations of a pose: of its angles, degrees, and of its place by the distance of what it sees."""
+    refined = pycolmap.refine_absolute_pose(
+        placed.pose,
+        photo.pixels[placed.features],
+        known.places[placed.points],
+        np.ones(len(placed.features), dtype=bool),
+        photo.camera,
+        return_covariance=True,
+    )
+    if refined is None:
+        return np.inf, np.inf
+    pose = refined["cam_from_world"]
+    local = known.places[placed.points] @ pose.rotation.matrix().T + pose.translation
+    pixels = np.asarray(photo.camera.img_from_cam(local), dtype=np.float64).reshape(-1, 2)
+    noise_px = np.sqrt(np.mean((pixels - photo.pixels[placed.features]) ** 2))
+    spread = np.sqrt(np.maximum(np.diag(refined["covariance"]), 0)) * noise_px  # three of angles, three of translation
+    distance = np.median(np.linalg.norm(local, axis=1))
+    return float(np.degrees(spread[:3].max())), float(spread[3:].max() / distance)
+
+
+def _add(model: pycolmap.Reconstruction, photo: _Photo, placed: _Placed, *, known: _Known, name: str) -> None:
+    """Put a photo with what it sees into a model."""
+    if not model.exists_camera(photo.camera.camera_id):
+        model.add_camera_with_trivial_rig(photo.camera)
+    if model.exists_image(photo.image_id):
+        frame = model.frame(model.image(photo.image_id).frame_id)
+        frame.rig_from_world = placed.pose
+        model.register_frame(frame.frame_id)
+    else:
+        image = pycolmap.Image(name=name, camera_id=photo.camera.camera_id, image_id=photo.image_id)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in photo.pixels])
+        model.add_image_with_trivial_frame(image, placed.pose)
+    for feature, point in zip(placed.features, placed.points, strict=True):
+        model.add_observation(int(known.ids[point]), pycolmap.TrackElement(photo.image_id, int(feature)))

@@ -1,0 +1,217 @@
+"""Sub-models brought together where they see the same points.
+
+A mapper that runs out of photos it can add starts again elsewhere, and leaves models that each have their own frame.
+Matches between a photo of the one and a photo of the other whose pixels are points in both give pairs of points; a
+similarity that brings many of them together joins the models.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
+
+Array = NDArray[np.float64]
+
+# A similarity has seven unknowns; that many points agreeing within the tolerance is no accident.
+_LEAST_COMMON = 15
+_TOLERANCE_PX = 12.0
+_TRIALS = 500
+# Of the matches between the two parts, this share must agree with the joined model.
+_LEAST_AGREEMENT = 0.5
+
+
+@dataclass(frozen=True)
+class CommonPoints:
+    """Points that two models have both placed: (n, 3) in each, and where a photo of the first saw them."""
+
+    first: Array
+    second: Array
+    photos: NDArray[np.int64]
+    pixels: Array
+
+
+def merge_models(
+    models: Sequence[pycolmap.Reconstruction],
+    database: Path,
+    *,
+    output: Path,
+    seed: int,
+    threads: int,
+    fixed: Sequence[int] = (),
+) -> list[pycolmap.Reconstruction]:
+    """The models, largest first, each joined with the ones before where they have enough in common.
+
+    Of two models with the same photos, or one with some of the other's, the larger stays.
+
+    Args:
+        models: of one database, largest first; they are not changed.
+        database: with the matches.
+        output: a folder for what pycolmap writes on the way.
+        seed: of the search for the similarity.
+        threads: -1 for all.
+        fixed: ids of cameras whose intrinsics stay as they are.
+    """
+    with pycolmap.Database.open(str(database)) as opened:
+        pairs = read_verified_pairs(opened, min_matches=1)
+        tracks = _matched_keypoints(opened)
+    merged: list[pycolmap.Reconstruction] = []
+    for model in models:
+        if any(set(model.reg_image_ids()) <= set(base.reg_image_ids()) for base in merged):
+            continue  # nothing that is not there already
+        for index, base in enumerate(merged):
+            common = common_points(base, model, tracks)
+            similarity = align(base, common, seed=seed)
+            if similarity is None:
+                continue
+            joined = _joined(base, model, similarity, database, output=output, threads=threads, fixed=fixed)
+            if _holds(joined, base, pairs):
+                merged[index] = joined
+                break
+        else:
+            merged.append(model)
+    return sorted(merged, key=lambda model: -model.num_reg_images())
+
+
+def common_points(
+    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, tracks: dict[tuple[int, int], NDArray[np.int64]]
+) -> CommonPoints:
+    """What two models have both placed: points of photos in both, and points that matches join.
+
+    tracks: by pair of image ids, (matches, 2) numbers of the features that belong together.
+    """
+    pairs: set[tuple[int, int, int, int]] = set()  # point in first, point in second, photo of first, its feature
+    in_first, in_second = set(first.reg_image_ids()), set(second.reg_image_ids())
+    for photo in in_first & in_second:
+        for index, point in enumerate(first.image(photo).points2D):
+            twin = second.image(photo).points2D[index]
+            if point.has_point3D() and twin.has_point3D():
+                pairs.add((point.point3D_id, twin.point3D_id, photo, index))
+    for (one, other), matches in tracks.items():
+        for photo, partner, columns in ((one, other, matches), (other, one, matches[:, ::-1])):
+            if photo not in in_first or partner not in in_second:
+                continue
+            here, there = first.image(photo).points2D, second.image(partner).points2D
+            for index, twin_index in columns:
+                if here[int(index)].has_point3D() and there[int(twin_index)].has_point3D():
+                    pairs.add((here[int(index)].point3D_id, there[int(twin_index)].point3D_id, photo, int(index)))
+    ordered = sorted(pairs)
+    return CommonPoints(
+        np.array([first.point3D(a).xyz for a, _, _, _ in ordered]).reshape(-1, 3),
+        np.array([second.point3D(b).xyz for _, b, _, _ in ordered]).reshape(-1, 3),
+        np.array([photo for _, _, photo, _ in ordered], dtype=np.int64),
+        np.array([first.image(photo).points2D[index].xy for _, _, photo, index in ordered]).reshape(-1, 2),
+    )
+
+
+def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) -> pycolmap.Sim3d | None:
+    """The similarity first_from_second that brings most common points to where the first's photos see them, or None."""
+    count = len(common.first)
+    if count < _LEAST_COMMON:
+        return None
+    rng = np.random.default_rng(seed)
+    best = np.zeros(count, dtype=bool)
+    for _ in range(_TRIALS):
+        sample = rng.choice(count, 3, replace=False)
+        fits = _fits(first, common, _similarity(common.second[sample], common.first[sample]))
+        if fits.sum() > best.sum():
+            best = fits
+    if best.sum() < _LEAST_COMMON:
+        return None
+    scale, rotation, translation = _similarity(common.second[best], common.first[best])
+    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)
+
+
+def _similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
+    """scale, rotation, translation with target = scale * rotation @ source + translation (Umeyama 1991)."""
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    u, sizes, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
+    rotation = (u * signs) @ vt
+    scale = (sizes * signs).sum() / max(((source - source_mean) ** 2).sum(), 1e-300)
+    return float(scale), rotation, target_mean - scale * rotation @ source_mean
+
+
+def _fits(
+    first: pycolmap.Reconstruction, common: CommonPoints, similarity: tuple[float, Array, Array]
+) -> NDArray[np.bool_]:
+    scale, rotation, translation = similarity
+    moved = scale * common.second @ rotation.T + translation
+    fits = np.zeros(len(moved), dtype=bool)
+    for photo in np.unique(common.photos):
+        rows = np.flatnonzero(common.photos == photo)
+        image = first.image(int(photo))
+        pose = image.cam_from_world()
+        local = moved[rows] @ pose.rotation.matrix().T + pose.translation
+        pixels = np.asarray(first.camera(image.camera_id).img_from_cam(local), dtype=np.float64).reshape(-1, 2)
+        distances = np.linalg.norm(pixels - common.pixels[rows], axis=1)
+        fits[rows] = (local[:, 2] > 0) & (distances < _TOLERANCE_PX)  # NaN is not smaller
+    return fits
+
+
+def _joined(
+    first: pycolmap.Reconstruction,
+    second: pycolmap.Reconstruction,
+    first_from_second: pycolmap.Sim3d,
+    database: Path,
+    *,
+    output: Path,
+    threads: int,
+    fixed: Sequence[int],
+) -> pycolmap.Reconstruction:
+    """All photos of both in the frame of the first; points found again from the matches of all, then adjusted."""
+    moved = pycolmap.Reconstruction(second)
+    moved.transform(first_from_second)
+    joined = pycolmap.Reconstruction(first)
+    for photo in sorted(set(second.reg_image_ids()) - set(first.reg_image_ids())):
+        image = moved.image(photo)
+        if not joined.exists_camera(image.camera_id):
+            joined.add_camera_with_trivial_rig(second.camera(image.camera_id))
+        if joined.exists_image(photo):
+            frame = joined.frame(joined.image(photo).frame_id)
+            frame.rig_from_world = image.cam_from_world()
+            joined.register_frame(frame.frame_id)
+        else:
+            fresh = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=photo)
+            fresh.points2D = pycolmap.Point2DList([pycolmap.Point2D(point.xy) for point in image.points2D])
+            joined.add_image_with_trivial_frame(fresh, image.cam_from_world())
+    output.mkdir(parents=True, exist_ok=True)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = threads
+    options.extract_colors = False
+    joined = pycolmap.triangulate_points(
+        joined,
+        str(database),
+        str(output),
+        str(output),
+        clear_points=True,
+        options=options,
+        refine_intrinsics=not fixed,
+    )
+    settle(joined, threads=threads, fixed=fixed)
+    return joined
+
+
+def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]) -> bool:
+    """Whether the matches between the old photos and the new ones agree with where they are now."""
+    old = set(first.reg_image_ids())
+    between = [pair for pair in pairs if (pair.one in old) != (pair.other in old)]
+    found = agreements(joined, between)
+    matches = sum(a.matches for a in found)
+    return matches > 0 and sum(a.matches * a.share for a in found) > _LEAST_AGREEMENT * matches
+
+
+def _matched_keypoints(database: pycolmap.Database) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """By pair of image ids, (matches, 2) numbers of the features that verified matches hold together."""
+    pair_ids, counts = database.read_two_view_geometry_num_inliers()
+    tracks = {}
+    for pair_id, count in zip(pair_ids, counts, strict=True):
+        if count:
+            one, other = pycolmap.pair_id_to_image_pair(pair_id)
+            tracks[one, other] = np.asarray(database.read_two_view_geometry(one, other).inlier_matches, dtype=np.int64)
+    return tracks

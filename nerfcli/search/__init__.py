@@ -1,0 +1,1 @@
+"""Which components a scene needs: short trainings against each other, and how they are judged."""

@@ -1,0 +1,75 @@
+"""What the residuals of a short training say about what its model lacks: reasons to try a component, no proof."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.field.exposure import linear_from_srgb
+from nerfcli.search.sky import explained_by_direction
+
+# Levels that are compared in brightness: below is noise, above the sensor is full.
+DARKEST, BRIGHTEST = 0.06, 0.95
+# A photo with fewer such pixels tells nothing of its exposure.
+FEWEST_PIXELS = 12
+# The standard error of a median, in units of that of a mean; a standard deviation, in units of the median deviation.
+_OF_MEDIAN, _OF_DEVIATION = 1.2533, 1.4826
+
+
+@dataclass(frozen=True)
+class Signs:
+    """Of a scene, as a trained model sees it.
+
+    Args:
+        log_gains: (photos, 3) how much brighter each photo is than its rendering, in logarithms of linear light; their
+            mean is 0.
+        exposure_spread: standard deviation of the photos' brightness among them, without what the estimates' own noise
+            brings.
+        far_share: of the pixels, those whose light comes from where no photo sees it move, for the larger part.
+        sky_psnr: how well one colour explains these pixels, and a colour by direction, see
+            `sky.explained_by_direction`.
+    """
+
+    log_gains: Tensor
+    exposure_spread: float
+    far_share: float
+    sky_psnr: tuple[float, float]
+
+
+def signs_of(
+    rendered: Tensor, measured: Tensor, photos: Tensor, *, directions: Tensor, from_beyond: Tensor, count: int
+) -> Signs:
+    """The signs in some pixels.
+
+    The gain of a photo is the median over its pixels of log(measured / rendered), channel by channel: highlights and
+    edges that the model does not have yet do not move it.
+
+    Args:
+        rendered, measured: (N, 3) sRGB.
+        photos: (N,) which photo each is of.
+        directions: (N, 3) of their rays, unit.
+        from_beyond: (N,) shares of their light that come from beyond the field, had it a background.
+        count: of the photos.
+    """
+    compared = ((measured > DARKEST) & (measured < BRIGHTEST) & (rendered > DARKEST)).cpu().numpy()
+    ratios = (linear_from_srgb(measured).log() - linear_from_srgb(rendered.clamp_min(DARKEST)).log()).cpu().numpy()
+    of_photo = photos.cpu().numpy()
+    far = from_beyond > 0.5
+    far_share = float(far.float().mean())
+    sky_psnr = explained_by_direction(directions[far], measured[far], photos[far])
+    gains, errors = np.zeros((count, 3)), np.full(count, np.nan)
+    for photo in range(count):
+        mine = of_photo == photo
+        good = mine & compared.all(-1)
+        if good.sum() >= FEWEST_PIXELS:
+            gains[photo] = np.median(ratios[good], axis=0)
+            common = ratios[good].mean(-1)
+            deviation = _OF_DEVIATION * np.median(np.abs(common - np.median(common)))
+            errors[photo] = _OF_MEDIAN * deviation / np.sqrt(good.sum())
+    known = np.isfinite(errors)
+    if known.sum() < 2:
+        return Signs(torch.zeros(count, 3), 0.0, far_share, sky_psnr)
+    gains[known] -= gains[known].mean(0)
+    excess = gains[known].mean(-1).var(ddof=1) - np.square(errors[known]).mean()
+    return Signs(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_share, sky_psnr)

@@ -1,0 +1,137 @@
+"""What paired short trainings say of a change: its gain, the gain's error, and whether it is kept."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from nerfcli.runs.components import Change
+from nerfcli.runs.decisions import Decision
+from nerfcli.search.trials import Trial
+
+# A gain counts if it is above this many standard errors, and above what nobody sees.
+STANDARD_ERRORS = 2.0
+# The same of a gain that signs speak for, as well as the trial.
+LIKELY_ERRORS = 1.0
+# Of a gain with one seed only, and what it would differ by with another: measured 0.03 dB on the desk, 0.15 dB on balls
+# in front of nothing, which learn faster.
+CLEAR_ERRORS, SEED_DB = 5.0, 0.1
+LEAST_GAIN_DB = 0.05
+# What a model may lose that becomes simpler.
+MOST_LOSS_DB = 0.1
+# Photos in which there is next to nothing have hardly any error, and its logarithm is noise: this share of the mean
+# error is added to that of every photo.
+FLOOR = 0.1
+ROUNDING_DB = 1e-6
+
+
+class Rule(Protocol):
+    """How trials of a change are judged; see `judge_one`."""
+
+    def __call__(self, base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision: ...
+
+
+def judge_one(
+    base: Sequence[Trial],
+    change: Change,
+    tried: Sequence[Trial],
+    *,
+    by_time: bool,
+    standard_errors: float = STANDARD_ERRORS,
+    clear_errors: float = CLEAR_ERRORS,
+) -> Decision:
+    """What paired trials say of something added to the model: it has to gain more than the noise.
+
+    gain = mean over photos and seeds of 10 log10(MSE of base / MSE of candidate). Its variance is that of the mean over
+    photos, and that between seeds; with a single one that is SEED_DB squared, and the gain has to be the clearer. A
+    gain that becomes less by more than its error in the second half of the steps is taken for one that vanishes in a
+    longer training.
+
+    Args:
+        base: trials without the change, one per seed.
+        change: what was tried.
+        tried: trials with it, in the same order of seeds.
+        by_time: whether it has to gain what its time would bring, too; where steps are what counts, the answer must not
+            depend on how fast the machine is.
+        standard_errors, clear_errors: that the gain has to be above, with more than one seed and with one.
+    """
+    gains = np.array([_gains(one, other) for one, other in zip(base, tried, strict=True)])
+    seeds, photos = gains.shape
+    gain = float(gains.mean())
+    between_seeds = float(gains.mean(1).var(ddof=1)) / seeds if seeds > 1 else SEED_DB**2
+    between_photos = float(gains.mean(0).var(ddof=1)) / photos if photos > 1 else 0.0
+    error = math.sqrt(between_seeds + between_photos)
+    halves = [_gains(one, other, halfway=True).mean() for one, other in zip(base, tried, strict=True)]
+    trend = gain - float(np.mean(halves))
+    cost = sum(trial.seconds for trial in tried) / sum(trial.seconds for trial in base) - 1.0
+    # What twice as many steps bring to the model as it is.
+    slope_db = max(0.0, float(np.mean([_gains_by_steps(trial).mean() for trial in base])))
+    at_equal_time = gain - slope_db * math.log2(1.0 + cost) if by_time else gain
+    errors = standard_errors if seeds > 1 else clear_errors
+    against = _against(gain, error, errors=errors, trend=trend, at_equal_time=at_equal_time)
+    why = against or f"gains more than {LEAST_GAIN_DB:g} dB and {errors:g} standard errors"
+    return Decision(*change, gain, error, trend, cost, at_equal_time, against is None, why)
+
+
+def judge_likely(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
+    """What paired trials say of something that signs speak for: a gain above one standard error is enough, or above two
+    with one seed.
+
+    Arguments as of `judge_one`.
+    """
+    return judge_one(base, change, tried, by_time=by_time, standard_errors=LIKELY_ERRORS, clear_errors=STANDARD_ERRORS)
+
+
+def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
+    """What paired trials say of something that mends a fault which is known from elsewhere: it must not lose.
+
+    A trial is too short for most of its gain. Arguments as of `judge_one`.
+    """
+    measured = judge_one(base, change, tried, by_time=by_time)
+    gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
+    if gain > -error:
+        return replace(measured, kept=True, why="matched features speak for it, and it does not lose")
+    return replace(measured, kept=False, why="loses, though matched features speak for it")
+
+
+def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
+    """What paired trials say of what is left out of the model: hardly anything must be lost, noise and trend included.
+
+    What the model has learned by means of it is gone at once, and a model that does not need it learns that again
+    within the trial. Arguments as of `judge_one`.
+    """
+    measured = judge_one(base, change, tried, by_time=by_time)
+    gain, error, trend = measured.gain_db or 0.0, measured.error_db or 0.0, measured.trend_db or 0.0
+    worst = gain + min(0.0, trend) - STANDARD_ERRORS * error
+    if worst > -MOST_LOSS_DB:
+        return replace(measured, kept=True, why=f"not needed: without it surely within {MOST_LOSS_DB:g} dB")
+    why = "needed: loses without it" if gain < -STANDARD_ERRORS * error else "may be needed"
+    return replace(measured, kept=False, why=why)
+
+
+def _against(gain: float, error: float, *, errors: float, trend: float, at_equal_time: float) -> str | None:
+    """What speaks against a candidate; None where nothing does."""
+    if gain < -STANDARD_ERRORS * error:
+        return "loses"
+    if not gain > LEAST_GAIN_DB + errors * error:
+        return "no gain above the noise"
+    if trend < -error - ROUNDING_DB:
+        return "gains at first only"
+    if at_equal_time <= LEAST_GAIN_DB:
+        return "gains less than the steps would that it costs"
+    return None
+
+
+def _gains(base: Trial, changed: Trial, *, halfway: bool = False) -> np.ndarray:
+    """(judged photos,) dB that the change gains in each."""
+    judged = base.counts > 0
+    errors = [(trial.halfway if halfway else trial.errors)[judged] / base.counts[judged] for trial in (base, changed)]
+    floor = FLOOR * errors[0].mean() + 1e-12
+    return 10.0 * np.log10((errors[0] + floor) / (errors[1] + floor))
+
+
+def _gains_by_steps(trial: Trial) -> np.ndarray:
+    """(judged photos,) dB that the second half of its steps brought."""
+    return _gains(replace(trial, errors=trial.halfway), trial)

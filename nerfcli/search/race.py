@@ -1,0 +1,198 @@
+"""Candidates against one another, within a limit of time or steps: the best first, the others beside it."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+
+from torch import Tensor
+
+from nerfcli.runs.components import Change, Components
+from nerfcli.runs.decisions import Decision, untried
+from nerfcli.search.judgement import (
+    LEAST_GAIN_DB,
+    MOST_LOSS_DB,
+    SEED_DB,
+    Rule,
+    judge_one,
+    judge_removal,
+    judge_supported,
+)
+from nerfcli.search.trials import Start, Trial, Trials
+
+# Steps of a trial against those of the training that it goes on from.
+STEPS_OF_START = 0.5
+SEEDS = 2
+# Leaving something out saves a little time in the training, and trying it takes some: of a limit of time, this share
+# may be over by then.
+REMOVAL_SHARE = 0.65
+# And so much of it may be spent: 2 % of a training, where a search has 15. View dependence takes 5 %
+# of the time, and was left out on one scene of three.
+REMOVAL_COST = 0.13
+NO_TIME, ONCE = "not tried, no time was left", "not clear, and no time was left to try it again"
+COSTS_MORE = "not tried, that would take longer than it may save"
+
+
+class Purse:
+    """What there is to spend: seconds, or steps, all trials together."""
+
+    def __init__(self, seconds: float | None, steps: int | None):
+        self._seconds, self._steps = seconds, steps
+        self._began, self._gone = time.perf_counter(), 0
+
+    @property
+    def is_time(self) -> bool:
+        """Whether seconds are what is spent."""
+        return self._seconds is not None
+
+    @property
+    def spent(self) -> float:
+        """Seconds so far."""
+        return time.perf_counter() - self._began
+
+    def takes(self, trials: int, *, of_steps: int, seconds_each: float, share_of_time: float = 1.0) -> bool:
+        """Whether there is enough left for some trials; of time, within a share of what there was."""
+        if self._seconds is not None:
+            return self.spent + trials * seconds_each <= share_of_time * self._seconds
+        return self._gone + trials * of_steps <= (self._steps or 0)
+
+    def is_little(self, trials: int, *, of_steps: int, seconds_each: float) -> bool:
+        """Whether some trials take no more than the share that is for leaving something out."""
+        if self._seconds is not None:
+            return trials * seconds_each <= REMOVAL_COST * self._seconds
+        return trials * of_steps <= REMOVAL_COST * (self._steps or 0)
+
+    def take(self, steps: int) -> None:
+        """Count steps that were gone."""
+        self._gone += steps
+
+
+class Race:
+    """Candidates against one another, all from the same start.
+
+    Args:
+        trials, start: what they go on from.
+        purse: pays for them.
+        asked: the model that has to be bettered.
+    """
+
+    def __init__(self, trials: Trials, start: Start, purse: Purse, asked: Components):
+        self._trials, self._start, self._purse, self._asked = trials, start, purse, asked
+        self._length = max(1, round(STEPS_OF_START * start.steps))
+        self._seconds_each = start.seconds * self._length / start.steps
+        self.kept: list[Change] = []
+        self.decisions: dict[Change, Decision] = {}
+        # Trials of what is kept so far, one per seed; and of what gained once beside it.
+        self._base: list[Trial] = []
+        self._once: dict[Change, Trial] = {}
+        self._rules: Mapping[Change, Rule] = {}
+
+    @property
+    def log_gains(self) -> Tensor | None:
+        """Of the exposures that the model which won has found."""
+        return self._base[0].log_gains if self._base else None
+
+    def run(
+        self,
+        additions: Sequence[Change],
+        removals: Sequence[Change],
+        rules: Mapping[Change, Rule] = MappingProxyType({}),
+    ) -> None:
+        """Fill `decisions` and `kept`.
+
+        All additions with one seed; then the best of them with the others unless it is clear already, and if it is
+        kept, the rest once more beside it; and so on. Removals last, as what is added may do their work.
+
+        Args:
+            additions, removals: changes of the model that was asked for.
+            rules: for those of the additions that more than a trial speaks for; else `judge_one`.
+        """
+        self.decisions = {change: untried(*change, NO_TIME) for change in (*additions, *removals)}
+        self._rules = rules
+        if additions and self._can_run(2):
+            self._base = [self._trial([], seed=0)]
+            self._try_once(additions)
+        while self._once:
+            best = self._best()
+            if self._is_confirmed(best, self._rule(best)):
+                for other in [other for other in self._once if other[0] == best[0]]:
+                    self._drop(other, f"{best[0]}={best[1]} is better")
+                self._try_once(list(self._once))
+        for change in removals:
+            trials = 2 * SEEDS - len(self._base)  # to know for sure
+            if not self._can_run(trials, share_of_time=REMOVAL_SHARE):
+                continue
+            if not self._purse.is_little(trials, of_steps=self._length, seconds_each=self._seconds_each):
+                self.decisions[change] = untried(*change, COSTS_MORE)
+                continue
+            self._base = self._base or [self._trial([], seed=0)]
+            self._once[change] = self._trial([change], seed=0)
+            self._is_confirmed(change, judge_removal)
+
+    def _try_once(self, changes: Sequence[Change]) -> None:
+        """Each with the first seed, beside what is kept: those that may gain are in `_once` then.
+
+        What gains is tried with the other seeds before others are tried at all, where there is no time for both.
+        """
+        reserved = 0
+        for change in changes:
+            self._once.pop(change, None)
+            if not self._can_run(1 + reserved):
+                if self.kept:
+                    self._drop(change, ONCE)
+                continue
+            trial = self._trial([change], seed=0)
+            decision = self._judged(self._rule(change), change, [trial])
+            self.decisions[change] = replace(decision, kept=False)
+            if self._rule(change) is judge_supported or (decision.gain_db or 0.0) > LEAST_GAIN_DB:
+                self._once[change] = trial
+                reserved = 0 if decision.kept else SEEDS - len(self._base) + SEEDS - 1
+
+    def _rule(self, addition: Change) -> Rule:
+        return self._rules.get(addition, judge_one)
+
+    def _best(self) -> Change:
+        """The one that gains most; of a component's values that gain as much as seeds differ by, the one proposed
+        first, as it is the plainest."""
+        gains = {change: self.decisions[change].gain_db or 0.0 for change in self._once}
+        best = max(gains, key=lambda change: gains[change])
+        return next(change for change in gains if change[0] == best[0] and gains[change] >= gains[best] - SEED_DB)
+
+    def _is_confirmed(self, change: Change, rule: Rule) -> bool:
+        """Whether a change is clear with one seed, or stands the other seeds, too; it then is in the model."""
+        own = [self._once.pop(change)]
+        decision = self._judged(rule, change, own)
+        if not decision.kept and (decision.gain_db or 0.0) > -MOST_LOSS_DB:
+            if not self._can_run(SEEDS - len(self._base) + SEEDS - 1):
+                self.decisions[change] = replace(decision, why=ONCE)
+                return False
+            self._base += [self._trial([], seed=seed) for seed in range(len(self._base), SEEDS)]
+            own += [self._trial([change], seed=seed) for seed in range(1, SEEDS)]
+            decision = self._judged(rule, change, own)
+        self.decisions[change] = decision
+        if decision.kept:
+            self.kept.append(change)
+            self._base = own
+        return decision.kept
+
+    def _drop(self, change: Change, why: str) -> None:
+        self._once.pop(change, None)
+        self.decisions[change] = replace(self.decisions[change], kept=False, why=why)
+
+    def _judged(self, rule: Rule, change: Change, own: Sequence[Trial]) -> Decision:
+        decision = rule(self._base[: len(own)], change, own, by_time=self._purse.is_time)
+        others = ", ".join(name for name, _ in self.kept)
+        return replace(decision, why=f"{decision.why} beside {others}") if others else decision
+
+    def _can_run(self, trials: int, *, share_of_time: float = 1.0) -> bool:
+        return self._purse.takes(
+            trials, of_steps=self._length, seconds_each=self._seconds_each, share_of_time=share_of_time
+        )
+
+    def _trial(self, changes: Sequence[Change], *, seed: int) -> Trial:
+        before = self._purse.spent
+        components = replace(self._asked, **dict([*self.kept, *changes]))
+        trial = self._trials.go_on(self._start, components, seed=seed, steps=self._length)
+        self._purse.take(self._length)
+        self._seconds_each = max(self._seconds_each, self._purse.spent - before)
+        return trial

@@ -1,0 +1,264 @@
+"""Which components a scene needs: each against the model as it is, in paired short trainings, with their noise.
+
+A component is added only if it is better by more than the noise, and left out only if that surely loses nothing. Gain
+and noise are measured, not assumed: every candidate goes on from the same start with the same seeds and pixels as the
+model that it would change, and what the gains differ by between seeds and between photos is their error. What is kept
+first is in the model that the next one has to better: two components that mend the same fault are not both needed.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from nerfcli.multiview.camera_check import CameraCheck
+from nerfcli.runs.components import CHOICES, Change, Components
+from nerfcli.runs.decisions import Decision, Selection, untried
+from nerfcli.search.diagnostics import Signs
+from nerfcli.search.judgement import Rule, judge_likely, judge_supported
+from nerfcli.search.race import Purse, Race
+from nerfcli.search.trials import Trials
+
+# Of the budget, for all trials together; and of those, for the training that they go on from.
+SEARCH_SHARE, START_SHARE = 0.15, 0.2
+# A search whose first training is shorter than this tells nothing, and is left out.
+FEWEST_STEPS = 120
+# No machine goes so many steps in less time than this, and what an attempt takes would be missed elsewhere.
+LEAST_START_SECONDS = 0.3
+# A start of so many steps tells all that a longer one would: with 200, the right component is found in 9 or 10 of 10
+# seeds, on scenes of all kinds.
+MOST_START_STEPS = 250
+# Photos whose brightness differs by less than this, in logarithms of light, are as well without exposures.
+# Measured 0.12 to 0.23 where they need them, after 120 and 250 steps, up to 0.10 and 0.06 where not: a larger spread
+# speaks for them, whatever the trial says.
+LEAST_EXPOSURE_SPREAD, LIKELY_EXPOSURE_SPREAD = 0.06, 0.11
+# A sky that fills less of the pixels is as well painted on the field. Measured 14 to 26 % where there is one,
+# 0 to 3 % on most real captures, after 120 to 500 steps. A larger share speaks for a sky, whatever the trial says.
+LEAST_FAR_SHARE, LIKELY_FAR_SHARE = 0.01, 0.1
+# Directions tell the colours of a sky so much better than one colour does: measured 7.0 to 10.2 dB before a sky, 0.0 to
+# 0.8 on surfaces that a coarse field has put far away. Or they tell them well: an overcast sky has one colour.
+LEAST_SKY_DB, LEAST_SKY_PSNR = 1.0, 22.0
+# Cameras whose photos agree to this are as good as the features: structure from motion leaves 0.1 to 0.4.
+LEAST_MISS_PX = 0.6
+# Poses with which they miss by this, whatever the lenses, are wrong; in between, a trial decides. Turned by half a
+# degree, photos of the desk miss by 1.5 to 2.3, at 400 pixels of width.
+SURELY_MISSED_PX = 1.2
+# The focal length that matches tell is taken if it is so many standard errors and so far away from the given one, and
+# makes the misses so much smaller.
+FOCAL_ERRORS, LEAST_FOCAL, MISS_SHARE = 5.0, 0.003, 0.85
+# Values of "cameras" with which focal lengths learn.
+LEARN_FOCAL = ("focal", "all")
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of a scene and asked for, before anything is learned.
+
+    Args:
+        field: the kind of field.
+        has_alpha: whether the photos have alpha: then nothing is behind the object.
+        has_exif: whether EXIF tells different exposures.
+        cameras_known: why the cameras need no doubt, in words; None where they may be wrong.
+        cameras: what matched features say of them; None where nothing is known.
+        points: how many pixels see a point whose distance is known.
+        fixed: components that the user has decided on.
+    """
+
+    field: str
+    has_alpha: bool
+    has_exif: bool
+    cameras_known: str | None = None
+    cameras: CameraCheck | None = None
+    points: int = 0
+    fixed: tuple[str, ...] = ()
+
+
+def with_known_cameras(asked: Components, facts: Facts) -> tuple[Components, float, list[Decision]]:
+    """The model with what matched features surely tell of the cameras: another focal length than the given one, or
+    poses that do not fit; the logarithm of the length's factor, which is 0 elsewhere; and the decisions.
+
+    Trials cannot decide about lengths: a model that has begun with a wrong one is bent to fit, and stays so for long.
+    For the same reason a model that is asked for with lenses that learn begins with the length that features tell. And
+    of poses a trial is too short to show more than that they do no harm, which features have told.
+    """
+    check, learns = facts.cameras, asked.cameras in LEARN_FOCAL
+    if check is None or ("cameras" in facts.fixed and not learns):
+        return asked, 0.0, []
+    given, changed = check.misses_px
+    if math.isfinite(check.error):
+        told = (
+            f"{check.matches} matched features ask for lenses {math.expm1(check.log_focal):+.2%} +- {check.error:.2%} "
+            f"as long, and miss by {given:.2f} px as they are, by {changed:.2f} px then"
+        )
+    else:
+        told = f"{check.matches} matched features miss by {given:.2f} px, and by more with other lenses"
+    is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error)
+    # Wrong poses ask for any length: one that is right leaves nothing to ask for.
+    is_sure = is_sure and changed < min(MISS_SHARE * given, LEAST_MISS_PX)
+    if is_sure:
+        value = asked.cameras if learns else "focal"
+        return replace(asked, cameras=value), check.log_focal, [untried("cameras", value, told, kept=True)]
+    if learns:
+        return asked, 0.0, []
+    decisions = [untried("cameras", "focal", f"not tried, {told}")]
+    if min(check.misses_px) < SURELY_MISSED_PX:
+        return asked, 0.0, decisions
+    told = f"{check.matches} matched features miss by {min(check.misses_px):.2f} px, whatever the length of lenses"
+    return replace(asked, cameras="poses"), 0.0, [*decisions, untried("cameras", "poses", told, kept=True)]
+
+
+def tells_points(asked: Components, facts: Facts) -> bool:
+    """Whether points that photos share may be asked how far away surfaces are.
+
+    The cameras have to fit. And where alpha tells what is empty, points gain at first only: they have cost half a
+    decibel on lego, in the time that their rays take.
+    """
+    if "points" in facts.fixed:
+        return bool(asked.points)
+    fit = facts.cameras is None or facts.cameras.misses_px[0] < LEAST_MISS_PX
+    return fit and asked.cameras == "fixed" and not facts.has_alpha
+
+
+def with_points(asked: Components, facts: Facts) -> tuple[Components, list[Decision]]:
+    """The model whose rays end at the points that photos share, where that is not decided; and the decision about it.
+
+    It is in the model from the first step on: later, light has ended elsewhere already, and points change little.
+    """
+    if facts.points == 0 or "points" in facts.fixed or not tells_points(asked, facts):
+        return asked, []
+    value = CHOICES["points"].on
+    told = f"{facts.points} pixels see points whose distance is known"
+    return replace(asked, points=value), [untried("points", value, told, kept=True)]
+
+
+def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Change], list[Decision]]:
+    """Components that may help a scene, and those that nothing speaks for.
+
+    Args:
+        start: what is in the model already.
+        signs: of its first training.
+        facts: of the scene.
+    """
+    candidates: list[Change] = []
+    declined: list[Decision] = []
+    if facts.has_exif:
+        candidates.append(("exposure", "exif"))
+    if signs.exposure_spread > LEAST_EXPOSURE_SPREAD:
+        candidates.append(("exposure", "learned"))
+    else:
+        told = f"not tried, photos differ in brightness by {math.expm1(signs.exposure_spread):.1%} only"
+        declined.append(untried("exposure", "learned", told))
+    check = facts.cameras
+    if facts.cameras_known is not None:
+        declined.append(untried("cameras", "poses", f"not tried, {facts.cameras_known}"))
+    elif check is None:
+        candidates.append(("cameras", "poses"))
+        # Within a trial, a right length changes as much as a wrong one: the coarse field pulls at both.
+        declined.append(untried("cameras", "focal", "not tried, photos share too few features to tell"))
+    elif min(check.misses_px) < LEAST_MISS_PX:
+        told = f"not tried, matched features miss by {min(check.misses_px):.2f} px only"
+        declined.append(untried("cameras", "poses", told))
+    else:
+        candidates.append(("cameras", "poses"))
+    against_sky = _against_sky(signs)
+    if not facts.has_alpha and against_sky is None:
+        candidates.append(("background", "sphere"))
+    elif not facts.has_alpha:
+        declined.append(untried("background", "sphere", f"not tried, {against_sky}"))
+    open_ones = [(name, value) for name, value in candidates if getattr(start, name) != value]
+    return (
+        [change for change in open_ones if change[0] not in facts.fixed],
+        [decision for decision in declined if decision.component not in facts.fixed],
+    )
+
+
+def _against_sky(signs: Signs) -> str | None:
+    """Why there is none to be looked for; None where there may be one."""
+    far = f"{signs.far_share:.1%} of the pixels have most of their light from far away"
+    if signs.far_share <= LEAST_FAR_SHARE:
+        return far
+    one, painted = signs.sky_psnr
+    if painted < LEAST_SKY_PSNR and painted - one < LEAST_SKY_DB:
+        return f"{far}, but their colours are no matter of direction: {painted:.1f} dB by it, {one:.1f} with one colour"
+    return None
+
+
+def rules(candidates: Sequence[Change], signs: Signs, facts: Facts) -> dict[Change, Rule]:
+    """How those of the candidates are judged that more than a trial speaks for."""
+    found: dict[Change, Rule] = {}
+    for change in candidates:
+        if change[0] == "cameras" and facts.cameras is not None:
+            found[change] = judge_supported  # photos disagree
+        if change[0] == "background" and signs.far_share > LIKELY_FAR_SHARE:
+            found[change] = judge_likely
+        if change[0] == "exposure" and signs.exposure_spread > LIKELY_EXPOSURE_SPREAD:
+            found[change] = judge_likely
+    return found
+
+
+def removals(start: Components, facts: Facts) -> list[Change]:
+    """What may be left out of a half-trained model: only a hash grid can be, as its shape stays the same."""
+    return [("view", 0)] if start.view and "view" not in facts.fixed and facts.field == "hash" else []
+
+
+def _without_poses(model: Components) -> Components:
+    """What is tried of a model. Poses learn in their own trial only: they take a third of the time, and others are too
+    short for them to come anywhere."""
+    return replace(model, cameras="fixed") if model.cameras == "poses" else model
+
+
+def is_worth_a_search(seconds: float | None, steps: int | None) -> bool:
+    """Whether a training of so long can spare what a search takes; see `select`."""
+    if seconds is not None:
+        return START_SHARE * SEARCH_SHARE * seconds >= LEAST_START_SECONDS
+    return round(START_SHARE * SEARCH_SHARE * (steps or 0)) >= FEWEST_STEPS
+
+
+def select(
+    trials: Trials,
+    asked: Components,
+    facts: Facts,
+    *,
+    seconds: float | None,
+    steps: int | None,
+) -> Selection:
+    """Find the components that a scene needs.
+
+    Candidates race one another, see `race.Race`; beside those that are kept, what is in the model already is left out
+    if nothing is lost by that.
+
+    Args:
+        trials: of the scene.
+        asked: what is in the model where nothing is found out.
+        facts: of the scene.
+        seconds: for all trials together; None to go by `steps`.
+        steps: of all trials together, where there is no limit of time.
+
+    Returns:
+        What needs no trial, where a first training of `FEWEST_STEPS` is too much.
+    """
+    purse = Purse(seconds, steps)
+    first_steps = MOST_START_STEPS if seconds is not None else round(START_SHARE * (steps or 0))
+    model, told = with_points(asked, facts)
+    start = trials.begin(
+        _without_poses(model),
+        steps=min(first_steps, MOST_START_STEPS),
+        seconds=math.inf if seconds is None else START_SHARE * seconds,
+        fewest=FEWEST_STEPS,
+    )
+    if start is None:
+        return Selection(model, tuple(told), purse.spent)
+    purse.take(start.steps)
+    if told:
+        without = trials.begin(_without_poses(asked), steps=start.steps)
+        assert without is not None  # it has no fewest steps
+        purse.take(without.steps)
+        change = (told[0].component, told[0].value)
+        told = [judge_supported([without.trial], change, [start.trial], by_time=purse.is_time)]
+        if not told[0].kept:
+            model, start = asked, without
+    candidates, declined = proposals(model, start.signs, facts)
+    race = Race(trials, start, purse, _without_poses(model))
+    race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
+    chosen = replace(model, **dict(race.kept))
+    gains = race.log_gains if chosen.exposure == "learned" else None
+    return Selection(chosen, (*told, *race.decisions.values(), *declined), purse.spent, gains)
