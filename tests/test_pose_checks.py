@@ -298,3 +298,19 @@ def test_closing_notes_name_components_and_checks(photos: Path, tmp_path: Path):
         "component 2 has 2 photos (x.jpg ... y.jpg): no photo of it matches; --component 2 takes it",
         "a check could not be computed (pose uncertainty): ValueError: singular",
     ]
+
+
+def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
+    job: Job, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """What looks for a turntable is auxiliary: what it raises is told, and the photos are mapped as they are."""
+
+    def broken(job: Job, training: Job, tell: Callable[[str], None]) -> None:
+        raise IndexError("tuple index out of range")
+
+    monkeypatch.setattr(worker, "extract", lambda job, report: None)
+    monkeypatch.setattr(worker, "with_object_masks", broken)
+    notes: list[str] = []
+    worker.solve(replace(job, component=2), lambda *progress: None, notes.append)
+    why = "IndexError: tuple index out of range"
+    assert f"whether an object moves before a still background is unknown: {why}" in notes

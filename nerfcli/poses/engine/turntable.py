@@ -165,6 +165,8 @@ class _Features:
                 keypoints = np.asarray(database.read_keypoints(image_id))
                 descriptors = np.asarray(database.read_descriptors(image_id).data)
                 camera = database.read_camera(database.read_image(image_id).camera_id)
+            if not len(keypoints):
+                keypoints, descriptors = np.zeros((0, 6)), np.zeros((0, 128), np.uint8)
             if keypoints.shape[1] >= 6:  # x, y and a 2 x 2 matrix
                 scales = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
             else:

@@ -89,8 +89,13 @@ def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float
     discard_if_damaged(job.database)
     with _timed(seconds, "extract"):
         extract(training_part(job), report)
+    checks, name = Checks(Path(job.folder), skip=dict(job.skipped_checks)), "moving foreground"
     with _timed(seconds, "motions"):
-        return with_object_masks(job, training_part(job), tell)
+        found = checks.run(name, lambda: with_object_masks(job, training_part(job), tell), otherwise=None)
+    if found is None:
+        tell(f"whether an object moves before a still background is unknown: {checks.not_computed[name]}")
+        return job, None
+    return found
 
 
 def _solve_strictly(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
