@@ -36,8 +36,8 @@ _STEPS = (1, 2, 4)
 _FEATURES = 1200
 # If fewer of the first pairs have matches that stay, the rest is not looked at.
 _FEW_STILL = 0.25
-# Of what is free of the object, a photo of the same camera place shows this share as the others do.
-_SAME_PLACE = 0.4
+# Of what is free of the object in some photos, one of the same camera place shows this share as the others do.
+_SAME_PLACE = 0.25
 # Masks are believed if most of the object's matches are in them and most of the background's are not, and if they leave
 # something of most photos, but not all.
 _LEAST_RIGHT = 0.7
