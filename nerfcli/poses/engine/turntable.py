@@ -3,7 +3,7 @@
 A few pairs of photos are compared before the long work (see `stationary`). If they show two motions, masks of the
 object are found (see `background`), so that what is solved is the object's motion, as if the camera went around it.
 The masks stand in the scene's folder, named after the photos as those of `--masks` are, and training uses them too.
-Masks that are there from an earlier call are used as they are: they may have been mended by hand.
+Masks that are there from an earlier call are used as they are: they may have been edited by hand.
 """
 
 import time
@@ -145,7 +145,7 @@ def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
     """A refusal with what to do about an object that turns before a still background, if there is one."""
     if facts is None or not facts["wide"]:
         return error
-    masks = f"those in {MASKS}/ of the scene, mended" if facts["masked"] else "white where the object is"
+    masks = f"those in {MASKS}/ of the scene, edited" if facts["masked"] else "white where the object is"
     hint = f"an object turns before a still background: give masks of it with --masks, {masks}; or {error.hint}"
     return UserError(error.message, hint, error.exit_code)
 
