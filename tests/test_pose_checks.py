@@ -314,3 +314,12 @@ def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
     worker.solve(replace(job, component=2), lambda *progress: None, notes.append)
     why = "IndexError: tuple index out of range"
     assert f"whether an object moves before a still background is unknown: {why}" in notes
+
+
+def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch):
+    """The photo with file 00001.jpg is called frame_00002.jpg, which holds the file name of the next one."""
+    named = replace(job, names=tuple(f"frame_{number + 1:05d}.jpg" for number in range(8)))
+    reason = "contradicts the rest: its 28.5 matches with 00001.jpg cannot be"
+    monkeypatch.setattr(examine, "leave_out_contradicting", lambda model, pairs: (model, {3: reason}))
+    found = examine.examine([mapped_model(job)], named, lambda *progress: None)
+    assert found.left_out == {2: "contradicts the rest: its 28.5 matches with frame_00002.jpg cannot be"}

@@ -1,5 +1,6 @@
 """After mapping: which lens the photos can hold, what contradicts the model, whether to believe it, how sharp it is."""
 
+import re
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
@@ -136,6 +137,6 @@ def _with_lenses(model: pycolmap.Reconstruction, job: Job) -> Lenses:
 
 
 def _with_names(reason: str, job: Job) -> str:
-    for file, name in zip(job.files, job.names, strict=True):
-        reason = reason.replace(file, name)
-    return reason
+    """Replace the numbered files of a reason by the photos' names, in one pass: a name may hold another's number."""
+    names = dict(zip(job.files, job.names, strict=True))
+    return re.sub(r"\d+\.\w+", lambda found: names.get(found[0], found[0]), reason)
