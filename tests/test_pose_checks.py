@@ -33,7 +33,7 @@ from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.judge import acceptance, examine
 from nerfcli.poses.judge.checks import UNDERWAY, Checks
-from nerfcli.poses.report import PosesReport, closing_notes
+from nerfcli.poses.report import PosesReport, closing_notes, refusal
 from nerfcli.poses.structure_from_motion import estimate_poses
 
 ONE_THREAD = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
@@ -323,3 +323,12 @@ def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(examine, "leave_out_contradicting", lambda model, pairs: (model, {3: reason}))
     found = examine.examine([mapped_model(job)], named, lambda *progress: None)
     assert found.left_out == {2: "contradicts the rest: its 28.5 matches with frame_00002.jpg cannot be"}
+
+
+def test_a_smaller_component_needs_no_share_of_all_photos(photos: Path, tmp_path: Path):
+    """4 of 20 photos: too few for the scene of all, enough for the component that was asked for."""
+    report, _ = estimate(photos, tmp_path / "scene")
+    few = replace(report, registered=4, total=20)
+    assert refusal(few, photos) is not None
+    assert refusal(replace(few, settings=replace(few.settings, component=2)), photos) is None
+    assert refusal(replace(few, registered=3, settings=replace(few.settings, component=2)), photos) is not None
