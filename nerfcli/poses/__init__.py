@@ -4,7 +4,3 @@
 worker, a child process. `engine` supervises that process, finds features and maps; `model` knows lenses, pairs and
 further photos; `judge` says whether a model may be believed.
 """
-
-# pycolmap brings a zlib of its own. If that is loaded first, Pillow and OpenCV mix it with theirs, and writing a PNG
-# ends the process ("free(): invalid pointer" in deflateEnd). So Python's is loaded before all else.
-import zlib as _zlib  # noqa: F401
