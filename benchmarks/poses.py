@@ -35,9 +35,9 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from nerfcli import scene as scenes
 from nerfcli.cameras import rigid
+from nerfcli.cameras.alignment import align
 from nerfcli.errors import TOO_FEW_PHOTOS
 from nerfcli.media.images import image_size, list_images
-from nerfcli.scale.alignment import align
 
 NAN = float("nan")
 # Frames of a video between two given poses get one by interpolation, if these are no farther apart.

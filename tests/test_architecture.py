@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "scene": {"holdout", "cameras", "media"},
     "poses.input": {"holdout", "media"},
     "poses.model": {"poses.input", "cameras", "media"},
-    "poses.judge": {"poses.model", "poses.input"},
+    "poses.judge": {"multiview", "poses.model", "poses.input"},
     "poses.engine": {"multiview", "poses.judge", "poses.model", "poses.input", "media"},
     "poses": {
         *("poses.engine", "poses.judge", "poses.model", "poses.input", "scene", "holdout", "media"),
@@ -44,7 +44,7 @@ MAY_IMPORT = {
     "doctor": {
         *("poses.engine", "poses.judge", "scale", "scene", "cameras", "media", "pages", "multiview"),
     },
-    "convert": {"scale", "scene", "cameras", "media"},
+    "convert": {"multiview", "scale", "scene", "cameras", "media"},
     "render": {"field", "kernels", "cameras"},
     "photos": {"runs", "render", "kernels", "cameras", "media"},
     "multiview": {"photos", "scene", "cameras"},

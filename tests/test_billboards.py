@@ -15,9 +15,10 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
 from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, ShapeEvidence, random_pixels
-from nerfcli.evaluate.metrics import psnr_of, to_8_bit
+from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.evaluate.protocol import Extras, HeldOut, evaluate_model, over_white
 from nerfcli.photos.loading import load_photos
+from nerfcli.photos.psnr import psnr_of
 from nerfcli.render.model import load_model
 
 CAMERA = Camera.pinhole(80, 60, 70.0)

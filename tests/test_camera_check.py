@@ -11,7 +11,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.lens_change import FOCAL, changed
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.multiview.camera_check import FARTHEST, FEWEST_MATCHES, CameraCheck, check_cameras
-from nerfcli.multiview.matching import LONGER_SIDE_PX, Matches, chosen_pairs
+from nerfcli.multiview.features import Matches
+from nerfcli.multiview.matching import LONGER_SIDE_PX, chosen_pairs
 from nerfcli.photos.loading import Photo
 
 PINHOLE = Camera.pinhole(600, 450, 550.0)

@@ -19,8 +19,9 @@ from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.convert.axes import Convention, expressed, for_picture, opencv_from_axes, poses_of, reinterpreted
 from nerfcli.convert.detect import Detection, detect
 from nerfcli.convert.evidence import Intrinsics, MatchEvidence
-from nerfcli.convert.matches import PairMatches, match_neighbours
+from nerfcli.convert.matches import match_neighbours
 from nerfcli.errors import BAD_INPUT, UserError
+from nerfcli.multiview.features import Matches
 
 
 def silent(share: float, detail: str) -> None:
@@ -111,7 +112,7 @@ def test_poses_that_fit_in_no_convention_are_told():
     assert found.convention == Convention("opencv")
 
 
-def matched_pairs(capture: Capture) -> list[PairMatches]:
+def matched_pairs(capture: Capture) -> list[Matches]:
     """What a perfect matcher finds: the points that neighbours both see."""
     seen = capture.observations
     assert isinstance(seen, Observations)
@@ -128,7 +129,7 @@ def matched_pairs(capture: Capture) -> list[PairMatches]:
     for first in range(len(capture.frames) - 1):
         both = sorted(set(where[first]) & set(where[first + 1]))
         rows = [[where[first + step][point] for point in both] for step in (0, 1)]
-        pairs.append(PairMatches(first, first + 1, seen.pixels[rows[0]], seen.pixels[rows[1]]))
+        pairs.append(Matches((first, first + 1), (seen.pixels[rows[0]], seen.pixels[rows[1]])))
     return pairs
 
 
@@ -159,7 +160,7 @@ def test_the_epipolar_error_is_the_distance_in_pixels():
     first_pixels, _ = camera.project(points)
     second_pixels, _ = camera.project(points - second[:3, 3])
     second_pixels[:, 1] += 3.0
-    pair = PairMatches(0, 1, first_pixels, second_pixels)
+    pair = Matches((0, 1), (first_pixels, second_pixels))
     evidence = MatchEvidence([pair], {0: camera, 1: camera}, 2)
     errors = evidence.errors_px(evidence.directions(Intrinsics()), np.stack([np.eye(4), second]))
     np.testing.assert_allclose(errors, 3 / np.sqrt(2), rtol=2e-3)

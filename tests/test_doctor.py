@@ -29,7 +29,8 @@ from nerfcli.doctor.sharpness import measure
 from nerfcli.doctor.subject import Subject, find_subject
 from nerfcli.errors import UserError
 from nerfcli.media.images import Exif
-from nerfcli.multiview.mutual_matches import mutual_matches
+from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
+from nerfcli.multiview.graph import connected_groups
 from nerfcli.scene import Scene
 
 ONE = 3  # the number of the photo that is spoilt
@@ -294,7 +295,7 @@ def test_matches_are_those_of_a_double_loop():
         j = int(row.argmin())
         if distances[:, j].argmin() == i and row[j] < 0.8 * np.delete(row, j).min():
             expected.append((i, j))
-    assert [(int(i), int(j)) for i, j in zip(*mutual_matches(one, other), strict=True)] == expected
+    assert [(int(i), int(j)) for i, j in zip(*mutual_matches(one, other, ratio=LOOSE_RATIO), strict=True)] == expected
     assert len(expected) > 15
 
 
@@ -312,7 +313,7 @@ def test_heights_come_back_from_differences_of_which_some_are_wrong():
 
 
 def test_sets_of_connected_photos():
-    assert consensus.connected(6, [(4, 1), (1, 5), (0, 3)]) == [[1, 4, 5], [0, 3], [2]]
+    assert connected_groups(range(6), [(4, 1), (1, 5), (0, 3)]) == [[1, 4, 5], [0, 3], [2]]
 
 
 def test_large_captures_are_not_compared_exhaustively(clean):

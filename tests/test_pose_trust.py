@@ -15,6 +15,7 @@ import pytest
 import synthetic_captures as synthetic
 from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
+from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine import second_chance as chances
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
@@ -30,7 +31,7 @@ from nerfcli.poses.judge.parallax import best_turn
 from nerfcli.poses.model import merging
 from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.two_views import read_verified_pairs, rotation_errors
-from nerfcli.poses.model.view_graph import Bottlenecks, consistent_groups, parts
+from nerfcli.poses.model.view_graph import Bottlenecks, consistent_groups
 
 pytestmark = pytest.mark.usefixtures("_quiet")
 
@@ -371,4 +372,4 @@ def test_the_bottleneck_is_the_weakest_join_of_the_strongest_chain():
     assert chains.between(1, 3) == chains.between(3, 1) == 5
     assert chains.between(1, 2) == 9
     assert chains.between(1, 4) == 0
-    assert parts([1, 2, 3, 4, 5], [(1, 2), (2, 3), (1, 3), (4, 5)]) == [[1, 2, 3], [4, 5]]
+    assert connected_groups([1, 2, 3, 4, 5], [(1, 2), (2, 3), (1, 3), (4, 5)]) == [[1, 2, 3], [4, 5]]

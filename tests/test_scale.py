@@ -13,18 +13,20 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from nerfcli.cameras import rigid
+from nerfcli.cameras.alignment import align, align_robustly
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.cameras.world import transformed
 from nerfcli.errors import UserError
+from nerfcli.media.geodesy import Position, east_north_up, ecef
 from nerfcli.media.images import write_png
-from nerfcli.scale.alignment import align, align_robustly
 from nerfcli.scale.boards import CharucoBoard, scale_from_charuco, scale_from_markers
-from nerfcli.scale.corners import Side, nearest_to_rays, scale_from_corners
+from nerfcli.scale.corners import Side, nearest_in_pixels, scale_from_corners
 from nerfcli.scale.distances import KnownDistance, known_distance, scale_from_distances
 from nerfcli.scale.edges import refined_corners
-from nerfcli.scale.estimate import ScaleEstimate, in_metres
-from nerfcli.scale.gps import Position, east_north_up, ecef, gps_positions, scale_from_gps
+from nerfcli.scale.estimate import ScaleEstimate
+from nerfcli.scale.gps import gps_positions, scale_from_gps
 
 few = examples(20)
 seeds = st.integers(0, 2**32 - 1)
@@ -40,11 +42,10 @@ def frames_at(centres: np.ndarray) -> list[Frame]:
     return [Frame(f"{i:03d}.jpg", camera, rigid.from_parts(np.eye(3), centre)) for i, centre in enumerate(centres)]
 
 
-def test_a_capture_in_metres_is_scaled_and_says_so():
+def test_a_capture_is_scaled_to_metres():
     capture = Capture(tuple(frames_at(np.array([[1.0, 2, 3]]))), np.array([[1.0, 1, 1]]), (), None, "colmap")
     estimate = ScaleEstimate(2.5, 0.01, (("a", 3.0), ("b", -4.0)), "percent", "2 known distances")
-    metric = in_metres(capture, estimate)
-    assert metric.unit == "metre"
+    metric = transformed(capture, estimate.similarity)
     np.testing.assert_array_equal(metric.points, [[2.5, 2.5, 2.5]])
     np.testing.assert_array_equal(metric.frames[0].centre, [2.5, 5, 7.5])
     assert estimate.to_json() == {
@@ -510,7 +511,7 @@ def test_a_point_from_rays_is_exact_and_one_wrong_ray_moves_it_little(seed, wron
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     if wrong:
         d[0] = Rotation.from_rotvec(0.05 * rng.normal(size=3)).apply(d[0])
-    found, missed = nearest_to_rays(c, d, np.full(8, 500.0))
+    found, missed = nearest_in_pixels(c, d, np.full(8, 500.0))
     np.testing.assert_allclose(found, point, rtol=0, atol=0.02 if wrong else 1e-9)
     assert missed.shape == (8,)
 

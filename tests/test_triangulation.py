@@ -15,7 +15,8 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
-from nerfcli.multiview.matching import MOST_PHOTOS, Matches, chosen_pairs, match
+from nerfcli.multiview.features import Matches
+from nerfcli.multiview.matching import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.multiview.tracks import Tracks, places_of, tracks_of_matches
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import Photo

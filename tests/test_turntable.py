@@ -13,6 +13,7 @@ from synthetic_captures import WIDE, Scene, View
 from turntable_capture import Turntable, turntable, write
 
 from nerfcli import scene as scenes
+from nerfcli.cameras.alignment import align
 from nerfcli.doctor.examination import Diagnosis, examine
 from nerfcli.doctor.findings import LOOK
 from nerfcli.doctor.subject import find_subject
@@ -22,7 +23,6 @@ from nerfcli.poses.engine.turntable import advised, sentence
 from nerfcli.poses.input import background as still
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
-from nerfcli.scale.alignment import align
 
 SIZE = (WIDE.width, WIDE.height)
 

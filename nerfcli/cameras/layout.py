@@ -3,7 +3,7 @@
 Letters: a camera has centre c and unit viewing direction d.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -47,17 +47,10 @@ def focus_point(frames: Sequence[Frame], *, depth_hint: float | None = None) -> 
         raise ValueError("focus_point needs at least one frame")
     centres, views = centres_of(frames), views_of(frames)
     across = np.eye(3) - views[:, :, None] * views[:, None, :]  # (frames, 3, 3), projects onto the plane across d
-    weights = np.ones(len(frames))
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
     # The smallest eigenvalue is the mean squared sine between the axes and their common direction.
     if np.linalg.eigvalsh(across.mean(axis=0))[0] > np.sin(_PARALLEL_RAD) ** 2:
-        point = centres.mean(axis=0)
-        for _ in range(30):
-            normal = np.einsum("n,nij->ij", weights, across)
-            point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, across, centres))
-            distances = np.linalg.norm(np.einsum("nij,nj->ni", across, point - centres), axis=1)
-            weights = 1.0 / np.maximum(distances, 1e-6 * spread + 1e-300)
-            weights /= weights.sum()
+        point = nearest_to_rays(centres, views, lambda off, offsets: 1.0 / np.maximum(off, 1e-6 * spread + 1e-300))
         depths = np.einsum("ni,ni->n", point - centres, views)
         if np.mean(depths > 0) > 0.5:
             return point
@@ -66,6 +59,29 @@ def focus_point(frames: Sequence[Frame], *, depth_hint: float | None = None) -> 
     if depth_hint is None:
         depth_hint = _DEPTH_PER_SPREAD * spread if spread > 0 else 1.0
     return centres.mean(axis=0) + depth_hint * mean_direction(views)
+
+
+def nearest_to_rays(
+    origins: np.ndarray, directions: np.ndarray, weigh: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Find the point (3,) nearest to rays, by iteratively reweighted least squares.
+
+    x = (sum_i w_i (I - d_i d_i^T))^-1 sum_i w_i (I - d_i d_i^T) o_i
+
+    Args:
+        origins, directions: (n, 3), unit directions, n >= 2, not all parallel.
+        weigh: gives the weights (n,) from the distances (n,) of the point to the rays, and from its offsets (n, 3) from
+            their origins.
+    """
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    weights, point = np.ones(len(origins)), np.zeros(3)
+    for _ in range(30):
+        normal = np.einsum("n,nij->ij", weights, across)
+        point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, across, origins))
+        offsets = point - origins
+        weights = weigh(np.linalg.norm(np.einsum("nij,nj->ni", across, offsets), axis=1), offsets)
+        weights = weights / weights.sum()
+    return point
 
 
 def up_direction(frames: Sequence[Frame]) -> np.ndarray:

@@ -13,8 +13,8 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import for_picture, shifted
-from nerfcli.convert.matches import PairMatches
 from nerfcli.convert.probes import distinct, rows_of_each
+from nerfcli.multiview.features import Matches
 
 # Observations that are looked at: enough for a median, few enough to try hundreds of hypotheses.
 _MOST_OBSERVATIONS = 20_000
@@ -77,12 +77,12 @@ class MatchEvidence:
 
     threshold_px = 4.0
 
-    def __init__(self, pairs: Sequence[PairMatches], cameras: dict[int, Camera], num_frames: int):
-        self.groups = np.repeat(np.arange(len(pairs)), [len(pair.first_pixels) for pair in pairs])
-        self._first = np.array([pair.first for pair in pairs])[self.groups]
-        self._second = np.array([pair.second for pair in pairs])[self.groups]
-        self._first_pixels = np.concatenate([pair.first_pixels for pair in pairs])
-        self._second_pixels = np.concatenate([pair.second_pixels for pair in pairs])
+    def __init__(self, pairs: Sequence[Matches], cameras: dict[int, Camera], num_frames: int):
+        self.groups = np.repeat(np.arange(len(pairs)), [len(pair.pixels[0]) for pair in pairs])
+        self._first = np.array([pair.photos[0] for pair in pairs])[self.groups]
+        self._second = np.array([pair.photos[1] for pair in pairs])[self.groups]
+        self._first_pixels = np.concatenate([pair.pixels[0] for pair in pairs])
+        self._second_pixels = np.concatenate([pair.pixels[1] for pair in pairs])
         stand_in = next(iter(cameras.values()))
         self._cameras = [cameras.get(index, stand_in) for index in range(num_frames)]
         self.name = f"{len(self.groups)} SIFT matches in {len(pairs)} pairs of photos"

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nerfcli.multiview.graph import connected_groups
+
 _ROUNDS = 10
 # Differences between photos are off by about this much; larger residuals weigh less.
 _TYPICAL_ERROR = 0.1
@@ -44,26 +46,8 @@ def potentials(
         residuals = np.abs(values[j] - values[i] - differences)
         weights = trust / trust.mean() / np.maximum(residuals, _TYPICAL_ERROR) if len(trust) else trust
     values[backing == 0] = np.nan
-    for members in connected(count, list(zip(i.tolist(), j.tolist(), strict=True))):
+    for members in connected_groups(range(count), zip(i.tolist(), j.tolist(), strict=True)):
         told = [member for member in members if backing[member]]
         if told:
             values[told] -= np.median(values[told])
     return values, backing
-
-
-def connected(count: int, pairs: Sequence[tuple[int, int]]) -> list[list[int]]:
-    """Sets of photos that pairs connect, the largest first, each in rising order."""
-    label = list(range(count))
-
-    def root(photo: int) -> int:
-        while label[photo] != photo:
-            label[photo] = label[label[photo]]
-            photo = label[photo]
-        return photo
-
-    for i, j in pairs:
-        label[max(root(i), root(j))] = min(root(i), root(j))
-    sets: dict[int, list[int]] = {}
-    for photo in range(count):
-        sets.setdefault(root(photo), []).append(photo)
-    return sorted(sets.values(), key=lambda members: (-len(members), members[0]))

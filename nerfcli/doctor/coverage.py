@@ -11,7 +11,7 @@ from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_
 from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photos import PhotoFacts
-from nerfcli.scale.gps import east_north_up
+from nerfcli.media.geodesy import east_north_up
 from nerfcli.scene import Scene, model_folder
 
 # Cameras that look at one thing go around it from this span on; below, they look at it from the front.

@@ -5,10 +5,10 @@ from itertools import combinations
 
 import numpy as np
 
-from nerfcli.doctor.consensus import connected
 from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, worst
 from nerfcli.doctor.matching import Pair
 from nerfcli.doctor.photos import PhotoFacts
+from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.retrieval import alike, likeness
 
 # Up to here every photo is compared with every other one.
@@ -47,14 +47,14 @@ def pair_count(count: int) -> int:
 
 def apart(count: int, pairs: Sequence[Pair]) -> set[int]:
     """The photos that are not in the largest set that matches hold together."""
-    parts = connected(count, [(pair.first, pair.second) for pair in pairs if pair.linked])
+    parts = connected_groups(range(count), [(pair.first, pair.second) for pair in pairs if pair.linked])
     return {photo for part in parts[1:] for photo in part}
 
 
 def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
     """Whether all photos hang together by matches, and which do so by little."""
     linked = [pair for pair in pairs if pair.linked]
-    parts = connected(len(photos), [(pair.first, pair.second) for pair in linked])
+    parts = connected_groups(range(len(photos)), [(pair.first, pair.second) for pair in linked])
     loose = [photo for part in parts[1:] for photo in part]
     best, partners = np.zeros(len(photos), dtype=int), np.zeros(len(photos), dtype=int)
     for pair in linked:

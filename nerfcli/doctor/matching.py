@@ -10,10 +10,11 @@ import numpy as np
 
 from nerfcli.doctor import two_views
 from nerfcli.doctor.moving import Patch, moving_patches
-from nerfcli.doctor.photos import Features, PhotoFacts
+from nerfcli.doctor.photos import PhotoFacts, PhotoFeatures
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import Exif
-from nerfcli.multiview.mutual_matches import mutual_matches
+from nerfcli.multiview.epipolar import fundamental_matrix
+from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, in_place, motions
 
 # Of each photo so many features are compared at first; all of them where these link it to nothing.
@@ -81,9 +82,9 @@ def compare(
         most_features: of each photo, the clearest ones.
     """
     one, other = (photo.features for photo in photos)
-    a, b = mutual_matches(one.descriptors[:most_features], other.descriptors[:most_features])
+    a, b = mutual_matches(one.descriptors[:most_features], other.descriptors[:most_features], ratio=LOOSE_RATIO)
     x, y = one.pixels[a], other.pixels[b]
-    _, agree = two_views.fundamental_matrix(x, y, EPIPOLAR_PX)
+    _, agree = fundamental_matrix(x, y, within_px=EPIPOLAR_PX)
     count = int(agree.sum())
     if count < LEAST_MATCHES:
         unknown = float("nan")
@@ -114,7 +115,7 @@ def compare(
     )
 
 
-def focal_px(features: Features, exif: Exif) -> float:
+def focal_px(features: PhotoFeatures, exif: Exif) -> float:
     """The focal length at the features' size: as EXIF tells it, else as most phones and cameras have it."""
     longer = max(features.size)
     known_px = focal_evidence(exif).focal_px

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
-from nerfcli.doctor.two_views import fundamental_matrix
+from nerfcli.multiview.epipolar import epipolar_px, fundamental_matrix
 
 # A match that is this many times the tolerance from its epipolar line does not follow the camera.
 _FAR = 3.0
@@ -50,7 +51,7 @@ def moving_patches(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, within_px
     fundamental, _ = cv2.findFundamentalMat(x[agree], y[agree], cv2.FM_8POINT)
     if fundamental is None or fundamental.shape != (3, 3):
         return ()
-    away = np.flatnonzero(~agree & (_epipolar_px(x, y, fundamental) > _FAR * within_px))
+    away = np.flatnonzero(~agree & (epipolar_px(x, y, fundamental) > _FAR * within_px))
     found = []
     for group in _moving_together(x[away], y[away]):
         members = away[group]
@@ -69,12 +70,7 @@ def _moving_together(x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
     motion = y - x
     differs = np.linalg.norm(motion[:, None] - motion, axis=2)
     alike = (apart < _REACH_PX) & (differs < _MOTION_PX + _MOTION_PER_DISTANCE * apart)
-    label = np.arange(count)
-    for _ in range(count):  # the smallest label spreads through each group
-        spread = np.where(alike, label, count).min(axis=1)
-        if (spread == label).all():
-            break
-        label = spread
+    label = connected_components(alike, directed=False)[1]
     groups = [np.flatnonzero(label == which) for which in np.unique(label)]
     # A feature may have been found several times in one place, with several orientations.
     return [group for group in groups if len(np.unique(np.rint(x[group]), axis=0)) >= _LEAST_IN_PATCH]
@@ -89,25 +85,15 @@ def _is_patch(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, members: np.nd
     rest = np.flatnonzero(agree)
     chosen = rest[np.linspace(0, len(rest) - 1, min(len(rest), max(3 * len(members), 40))).astype(int)]
     both = np.concatenate([members, chosen])
-    voted, _ = fundamental_matrix(x[both], y[both], within_px)
+    voted, _ = fundamental_matrix(x[both], y[both], within_px=within_px)
     median, _ = cv2.findFundamentalMat(x[both], y[both], cv2.FM_LMEDS)
     for matrix in (voted, median):
         if matrix is None or matrix.shape != (3, 3) or np.isnan(matrix).any():
             continue
-        error = _epipolar_px(x, y, matrix)
+        error = epipolar_px(x, y, matrix)
         if min(np.mean(error[members] < 2 * within_px), np.mean(error[chosen] < 2 * within_px)) > _EXPLAINED:
             return False
     return True
-
-
-def _epipolar_px(x: np.ndarray, y: np.ndarray, fundamental: np.ndarray) -> np.ndarray:
-    """The larger of the two distances of each match from its epipolar lines, pixels."""
-    ones = np.ones((len(x), 1))
-    first, second = np.hstack([x, ones]), np.hstack([y, ones])
-    lines, back = first @ fundamental.T, second @ fundamental
-    products = np.abs((second * lines).sum(axis=1))
-    lengths = np.minimum(np.linalg.norm(lines[:, :2], axis=1), np.linalg.norm(back[:, :2], axis=1))
-    return products / np.maximum(lengths, 1e-12)
 
 
 def _box(points: np.ndarray) -> tuple[float, float, float, float]:

@@ -12,6 +12,7 @@ import numpy as np
 from nerfcli.doctor import exposure, sharpness
 from nerfcli.errors import UserError
 from nerfcli.media.images import Exif, downscale, read_exif, read_image
+from nerfcli.multiview.features import find_features
 
 # The longer side of the pictures in which features are sought; every threshold in pixels is meant at this size.
 LONGER_SIDE_PX = 800
@@ -27,7 +28,7 @@ _TINY_PX = 32
 
 
 @dataclass(frozen=True)
-class Features:
+class PhotoFeatures:
     """Points of a photo that can be found again in another one, at `LONGER_SIDE_PX`, the clearest first.
 
     Args:
@@ -68,7 +69,7 @@ class PhotoFacts:
     transparent: bool
     sharpness: sharpness.Sharpness
     exposure: exposure.Exposure
-    features: Features
+    features: PhotoFeatures
 
 
 @dataclass(frozen=True)
@@ -155,26 +156,20 @@ def _opaque(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return on_white, image[..., 3] > 127
 
 
-def _features(rgb: np.ndarray, seen: np.ndarray, *, local_detail: np.ndarray, most_features: int) -> Features:
+def _features(rgb: np.ndarray, seen: np.ndarray, *, local_detail: np.ndarray, most_features: int) -> PhotoFeatures:
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    # Without the precise upscaling, OpenCV's keypoints lie a quarter of a pixel off.
-    sift = cv2.SIFT.create(nfeatures=most_features, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(grey, seen)
-    height, width = grey.shape
-    if descriptors is None:
-        keypoints, descriptors = [], np.zeros((0, 128), dtype=np.float32)
+    found = find_features(grey, longer_side_px=max(grey.shape), most=most_features, used=seen)
     # At equal response there may be a few more than were asked for.
-    clearest = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")[:most_features]
-    keypoints, descriptors = [keypoints[i] for i in clearest], descriptors[clearest]
-    # OpenCV's positions have pixel centres at whole numbers.
-    pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float32).reshape(-1, 2) + 0.5
+    clearest = np.argsort(-found.responses, kind="stable")[:most_features]
+    height, width = grey.shape
+    pixels = found.pixels[clearest].astype(np.float32)
     column, row = (np.clip(pixels[:, i].astype(int), 0, (width, height)[i] - 1) for i in (0, 1))
     rows, columns = local_detail.shape
-    return Features(
+    return PhotoFeatures(
         size=(width, height),
         pixels=pixels,
-        scales=np.array([keypoint.size for keypoint in keypoints], dtype=np.float32),
-        descriptors=descriptors.astype(np.uint8),
+        scales=found.sizes[clearest],
+        descriptors=found.descriptors[clearest].astype(np.uint8),
         detail=local_detail[row * rows // height, column * columns // width],
         light=exposure.local_light(rgb)[row, column],
     )

@@ -36,23 +36,6 @@ class TwoViews:
         return self.homography_share >= _EXPLAINS
 
 
-def fundamental_matrix(x: np.ndarray, y: np.ndarray, within_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """The fundamental matrix (3, 3) that most matches (N, 2) agree on, and which do, (N,) bool.
-
-    All NaN, and none, where there is no such matrix.
-    """
-    nothing = np.full((3, 3), np.nan), np.zeros(len(x), dtype=bool)
-    if len(x) < 8:
-        return nothing
-    try:
-        matrix, mask = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, within_px, 0.999, 2000)
-    except cv2.error:  # OpenCV's USAC asserts (!model.empty()) on some matches that all lie on a plane
-        matrix, mask = cv2.findFundamentalMat(x, y, cv2.FM_RANSAC, within_px, 0.999, 2000)
-    if matrix is None or mask is None or matrix.shape != (3, 3):
-        return nothing
-    return matrix, mask.ravel().astype(bool)
-
-
 def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> TwoViews | None:
     """The motion between two photos from matches (N, 2) without outliers; None where they fix none.
 

@@ -19,8 +19,9 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of, focus_point, views_of
 from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.errors import reason_of
-from nerfcli.evaluate.metrics import psnr_of, to_8_bit
+from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.media.images import downscale
+from nerfcli.photos.psnr import psnr_of
 
 # Sides of the photos on the billboards, at most; a model without shape is off by more than these pixels.
 LONGER_SIDE_PX = 400

@@ -4,17 +4,15 @@ Colours are sRGB in [0, 1], as float or rounded to 8 bits. Pixels that do not co
 left out entirely: of PSNR pixel by pixel, of SSIM with every window that holds one.
 """
 
-import math
-
 import numpy as np
 from scipy.ndimage import minimum_filter
 from skimage.metrics import structural_similarity
 
+from nerfcli.photos.psnr import psnr_of
+
 # Of Wang et al.: the Gaussian's standard deviation, and the width at which scikit-image cuts it off (3.5 sigma).
 SIGMA = 1.5
 WINDOW = 11
-# Identical pictures: the error of less than a thousandth of a grey level, where the logarithm has no end.
-MOST_PSNR = 100.0
 
 
 def to_8_bit(picture: np.ndarray) -> np.ndarray:
@@ -37,11 +35,6 @@ def mean_squared_error(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarr
         used: (H, W) bool, the pixels that count; at least one.
     """
     return float(np.square(as_float(picture[used]) - as_float(photo[used])).mean())
-
-
-def psnr_of(error: float) -> float:
-    """Peak signal-to-noise ratio in dB of a mean squared error of values in [0, 1]: -10 log10, at most 100."""
-    return -10.0 * math.log10(max(error, 10.0 ** (-MOST_PSNR / 10)))
 
 
 def psnr(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> float:

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.lens_change import FOCAL, changeable, changed
-from nerfcli.multiview.matching import Matches, radians_per_pixel
+from nerfcli.multiview.features import Matches
+from nerfcli.multiview.matching import radians_per_pixel
 from nerfcli.photos.loading import Photo
 
 # Logarithms of factors of the focal length that are looked at: a wrong unit or crop is off by more, and every photo

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from functools import cached_property
 
-from nerfcli.multiview.matching import LONGER_SIDE_PX, Matches, chosen_pairs, match
+from nerfcli.multiview.features import Matches
+from nerfcli.multiview.matching import LONGER_SIDE_PX, chosen_pairs, match
 from nerfcli.multiview.tracks import Tracks, tracks_of_matches, tracks_of_model
 from nerfcli.photos.loading import Photo
 from nerfcli.scene import Scene

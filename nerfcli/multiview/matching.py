@@ -5,13 +5,13 @@ They tell of the geometry of a capture before anything is learned: where surface
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.layout import centres_of, views_of
+from nerfcli.multiview.features import Features, Matches, find_features, mutual_matches
 from nerfcli.photos.loading import Photo
 
 # Features are sought in photos whose longer side is at most this, so that it takes seconds.
@@ -22,24 +22,6 @@ MOST_FEATURES = 1500
 MOST_PHOTOS = 16
 PARTNERS = (1, 3, 9)
 SAME_WAY_COS = np.cos(np.radians(40.0))
-# A match is kept if the second-best feature is this much farther away. Source: Lowe 2004, section 7.1.
-RATIO = 0.75
-
-# Pixels (K, 2) with centres at 0.5, and descriptors (K, 128).
-Features = tuple[np.ndarray, np.ndarray]
-
-
-@dataclass(frozen=True)
-class Matches:
-    """What two photos have in common; some of it is wrong.
-
-    Args:
-        photos: their numbers.
-        pixels: (N, 2) of each, centres at 0.5.
-    """
-
-    photos: tuple[int, int]
-    pixels: tuple[np.ndarray, np.ndarray]
 
 
 def match(photos: Sequence[Photo], *, threads: int) -> tuple[Matches, ...]:
@@ -75,38 +57,13 @@ def chosen_pairs(photos: Sequence[Photo]) -> list[tuple[int, int]]:
 
 def _features(photo: Photo) -> Features:
     grey = cv2.cvtColor(np.ascontiguousarray(photo.pixels[..., :3]), cv2.COLOR_RGB2GRAY)
-    height, width = grey.shape
-    scale = min(1.0, LONGER_SIDE_PX / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1 else grey
-    used = (
-        None if photo.used is None else cv2.resize(photo.used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    )
-    # Without the precise upscaling, OpenCV's keypoints lie a quarter of a pixel off.
-    sift = cv2.SIFT.create(nfeatures=MOST_FEATURES, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(small, used)
-    if descriptors is None:
-        return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
-    # OpenCV's positions have pixel centres at whole numbers.
-    found = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64) + 0.5
-    return found * (width / size[0], height / size[1]), descriptors
+    return find_features(grey, longer_side_px=LONGER_SIDE_PX, most=MOST_FEATURES, used=photo.used)
 
 
 def _in_common(pair: tuple[int, int], features: tuple[Features, Features]) -> Matches:
-    """Features of two photos that are each other's nearest, and clearly so."""
-    (one_pixels, one), (other_pixels, other) = features
-    if min(len(one), len(other)) < 2:
-        return Matches(pair, (np.zeros((0, 2)), np.zeros((0, 2))))
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    back = {match.queryIdx: match.trainIdx for match in matcher.match(other, one)}
-    nearest = matcher.knnMatch(one, other, k=2)
-    chosen = [
-        (best.queryIdx, best.trainIdx)
-        for best, second in nearest
-        if best.distance < RATIO * second.distance and back[best.trainIdx] == best.queryIdx
-    ]
-    a, b = np.array(chosen, dtype=int).reshape(-1, 2).T
-    return Matches(pair, (one_pixels[a], other_pixels[b]))
+    one, other = features
+    a, b = mutual_matches(one.descriptors, other.descriptors)
+    return Matches(pair, (one.pixels[a], other.pixels[b]))
 
 
 def radians_per_pixel(camera: Camera) -> float:

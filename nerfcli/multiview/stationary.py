@@ -12,8 +12,9 @@ Letters: x and y are the pixels of a match in the first and in the second photo,
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
+
+from nerfcli.multiview.epipolar import epipolar_px, fundamental_matrix
 
 # A match is still if it moved by less than this share of the picture's diagonal; that is 2 px at 1600 x 1200.
 _STILL = 0.001
@@ -27,6 +28,7 @@ _SHAKEN = 4.0
 # From so many such lengths on a match moved for certain.
 _MOVED = 4.0
 _LEAST_MATCHES = 15
+_LEAST_FOR_GEOMETRY = 12
 # A geometry that explains so much of what stays and of what moves, to twice a length, makes them one motion.
 _MOST_AGREEING = 0.7
 # Cells of the picture in which still matches are counted.
@@ -167,12 +169,12 @@ def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
     within = still_px(size)
     stays, shift = in_place(x, y, size)
     moves = np.linalg.norm(y - x - shift, axis=1) > _MOVED * within
-    fundamental, agree = fundamental_of(x[moves], y[moves], within)
+    fundamental, agree = _geometry(x[moves], y[moves], within)
     moves[moves] = agree
     agreeing = float("nan")
-    if fundamental is not None and stays.any() and agree.any():
+    if stays.any() and agree.any():
         common = _common(x, y, one=stays, other=moves, within=within)
-        explained = [epipolar_px(x, y, matrix) < 2 * within for matrix in (fundamental, common) if matrix is not None]
+        explained = [epipolar_px(x, y, matrix) < 2 * within for matrix in (fundamental, common)]
         agreeing = max(float(min(right[stays].mean(), right[moves].mean())) for right in explained)
     columns, rows = _CELLS
     cells = frozenset(
@@ -202,7 +204,7 @@ def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:
     )
 
 
-def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray, within: float) -> np.ndarray | None:
+def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray, within: float) -> np.ndarray:
     """The fundamental matrix that most of two sets of matches agree on, as many of the one as of the other.
 
     What moved may be flat, and then has many such matrices, of which one may hold for what stayed, too.
@@ -211,29 +213,8 @@ def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray,
     chosen = np.concatenate(
         [np.flatnonzero(which)[np.linspace(0, which.sum() - 1, count).astype(int)] for which in (one, other)]
     )
-    return fundamental_of(x[chosen], y[chosen], within)[0]
+    return _geometry(x[chosen], y[chosen], within)[0]
 
 
-def fundamental_of(x: np.ndarray, y: np.ndarray, within_px: float) -> tuple[np.ndarray | None, np.ndarray]:
-    """The fundamental matrix that most matches (N, 2) agree on, None where there is none, and which do, (N,) bool."""
-    nothing = np.zeros(len(x), dtype=bool)
-    if len(x) < 12:
-        return None, nothing
-    cv2.setRNGSeed(0)
-    try:
-        matrix, mask = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, within_px, 0.999, 2000)
-    except cv2.error:  # OpenCV's USAC asserts (!model.empty()) on some matches that all lie on a plane
-        matrix, mask = cv2.findFundamentalMat(x, y, cv2.FM_RANSAC, within_px, 0.999, 2000)
-    if matrix is None or mask is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        return None, nothing
-    return matrix, mask.ravel().astype(bool)
-
-
-def epipolar_px(x: np.ndarray, y: np.ndarray, fundamental: np.ndarray) -> np.ndarray:
-    """The larger of the two distances of each match (N, 2) from its epipolar lines, pixels."""
-    ones = np.ones((len(x), 1))
-    first, second = np.hstack([x, ones]), np.hstack([y, ones])
-    lines, back = first @ fundamental.T, second @ fundamental
-    products = np.abs((second * lines).sum(axis=1))
-    lengths = np.minimum(np.linalg.norm(lines[:, :2], axis=1), np.linalg.norm(back[:, :2], axis=1))
-    return products / np.maximum(lengths, 1e-12)
+def _geometry(x: np.ndarray, y: np.ndarray, within: float) -> tuple[np.ndarray, np.ndarray]:
+    return fundamental_matrix(x, y, within_px=within, least=_LEAST_FOR_GEOMETRY)

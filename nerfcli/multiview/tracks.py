@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.formats.colmap import parse_colmap
-from nerfcli.multiview.matching import Matches
+from nerfcli.multiview.features import Matches
 from nerfcli.photos.loading import Photo
 from nerfcli.scene import Scene, model_folder
 

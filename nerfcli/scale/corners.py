@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import nearest_to_rays
 from nerfcli.errors import UserError
 from nerfcli.scale.estimate import ScaleEstimate
 
@@ -94,7 +95,7 @@ def _triangulated(frames: Sequence[Frame], seen: Sequence[tuple[int, np.ndarray]
     f = np.array([frame.camera.focal_px for frame, _ in rays])
     if (d @ d.T).min() > np.cos(_LEAST_PARALLAX):
         return "seen from nearly the same direction only"
-    point, missed = nearest_to_rays(c, d, f)
+    point, missed = nearest_in_pixels(c, d, f)
     if np.median(missed) > _MOST_MISSED_PX:
         return f"its directions miss each other by {np.median(missed):.1f} px"
     if np.median(np.sum((point - c) * d, axis=1)) <= 0:
@@ -102,29 +103,28 @@ def _triangulated(frames: Sequence[Frame], seen: Sequence[tuple[int, np.ndarray]
     return point
 
 
-def nearest_to_rays(c: np.ndarray, d: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The point (3,) that appears nearest to where rays point, and by how many pixels each misses it, (n,).
+def nearest_in_pixels(c: np.ndarray, d: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the point (3,) that appears nearest to where rays point, and by how many pixels each misses it, (n,).
 
     p = argmin sum_i log(1 + e_i^2),  e_i = f_i |(1 - d_i d_i^T) (p - c_i)| / |p - c_i|
 
-    in pixels, by iteratively reweighted least squares; the logarithm (Cauchy) keeps a wrong ray from moving it much.
+    in pixels; the logarithm (Cauchy) keeps a wrong ray from moving it much.
 
     Args:
         c, d: (n, 3) origins and unit directions, n >= 2, not all parallel.
         f: (n,) pixels per radian.
     """
-    across = np.eye(3) - d[:, :, None] * d[:, None, :]
-    weights, missed = np.ones(len(c)), np.zeros(len(c))
-    point = np.zeros(3)
-    for _ in range(30):
-        normal = np.einsum("n,nij->ij", weights, across)
-        point = np.linalg.solve(normal, np.einsum("n,nij,nj->i", weights, across, c))
-        offsets = point - c
-        per_length = f / np.maximum(np.linalg.norm(offsets, axis=1), 1e-150)
-        missed = per_length * np.linalg.norm(np.einsum("nij,nj->ni", across, offsets), axis=1)
-        weights = per_length**2 / (1 + missed**2)
-        weights /= weights.max()
-    return point, missed
+
+    def pixels_per_length(offsets: np.ndarray) -> np.ndarray:
+        return f / np.maximum(np.linalg.norm(offsets, axis=1), 1e-150)
+
+    def weigh(off: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+        squared = pixels_per_length(offsets) ** 2
+        return squared / (1 + squared * off**2)
+
+    point = nearest_to_rays(c, d, weigh)
+    off = np.linalg.norm(np.cross(d, point - c), axis=1)
+    return point, pixels_per_length(point - c) * off
 
 
 def _no_scale(pattern: str, sightings: Sightings, reasons: Sequence[str]) -> UserError:

@@ -9,20 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfcli.cameras.alignment import align, align_robustly
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import centres_of
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
+from nerfcli.media.geodesy import Position, east_north_up
 from nerfcli.media.images import read_exif
-from nerfcli.scale.alignment import align, align_robustly
 from nerfcli.scale.estimate import ScaleEstimate
-
-# Latitude and longitude in degrees, altitude in metres or None.
-Position = tuple[float, float, float | None]
-
-# WGS 84: semi-major axis in metres and flattening. Source: NIMA TR8350.2, table 3.1.
-_SEMI_MAJOR = 6378137.0
-_FLATTENING = 1 / 298.257223563
 
 # The photos must be spread this many times as wide as the GPS is off; pure noise, of which a similarity fits a part,
 # reaches 1.7 with 6 photos and 1.1 with 20.
@@ -69,44 +63,6 @@ def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
     """
     found = {frame.name: read_exif(frame.image).gps for frame in frames if frame.image is not None}
     return {name: gps for name, gps in found.items() if gps is not None and gps[:2] != (0.0, 0.0)}
-
-
-def ecef(latitude_deg: np.ndarray, longitude_deg: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Earth-centred coordinates (N, 3) in metres, of positions (N,) on WGS 84 with heights above the ellipsoid.
-
-    x = (n + h) cos(lat) cos(lon), y = (n + h) cos(lat) sin(lon), z = ((1 - e^2) n + h) sin(lat),
-    n = a / sqrt(1 - e^2 sin^2(lat)), e^2 = f (2 - f).  Source: NIMA TR8350.2, eq. 4-14.
-    """
-    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
-    squared = _FLATTENING * (2 - _FLATTENING)
-    n = _SEMI_MAJOR / np.sqrt(1 - squared * np.sin(latitude) ** 2)
-    out = (n + height) * np.cos(latitude)
-    return np.stack(
-        [out * np.cos(longitude), out * np.sin(longitude), ((1 - squared) * n + height) * np.sin(latitude)], axis=-1
-    )
-
-
-def east_north_up(positions: Sequence[Position]) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Positions in metres east, north and up of the first one, (N, 3), and that one.
-
-    EXIF altitudes are above the sea, not above the ellipsoid; both are taken for one, which moves all alike. A photo
-    without altitude is taken to be at the median altitude of the others.
-    """
-    latitude, longitude = (np.array([position[i] for position in positions], dtype=np.float64) for i in (0, 1))
-    known = [position[2] for position in positions if position[2] is not None]
-    middle = float(np.median(known)) if known else 0.0
-    height = np.array([middle if position[2] is None else position[2] for position in positions])
-    earth = ecef(latitude, longitude, height)
-    lat, lon = np.radians(latitude[0]), np.radians(longitude[0])
-    enu_from_ecef = np.array(
-        [
-            [-np.sin(lon), np.cos(lon), 0.0],
-            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
-            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
-        ]
-    )
-    reference = (float(latitude[0]), float(longitude[0]), float(height[0]))
-    return (earth - earth[0]) @ enu_from_ecef.T, reference
 
 
 def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -> GpsFit:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from nerfcli.field.background import SphereBackground
 from nerfcli.fit.adam import Adam
+from nerfcli.photos.psnr import psnr_of
 
 PAINT_RATE, PAINT_STEPS = 0.3, 30
 # Vertices per axis, where few pixels have to tell: with 32, noise costs a sky of one colour 6 dB.
@@ -58,5 +59,5 @@ def explained_by_direction(directions: Tensor, colours: Tensor, photos: Tensor) 
         paint(background, lambda: (directions[tells], colours[tells]))
     with torch.no_grad():
         told = (one, background(directions[~tells]))
-    one_psnr, painted = (-10.0 * math.log10(float((c - colours[~tells]).square().mean()) + 1e-9) for c in told)
+    one_psnr, painted = (psnr_of(float((c - colours[~tells]).square().mean())) for c in told)
     return one_psnr, painted

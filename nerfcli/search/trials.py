@@ -25,6 +25,7 @@ from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.point_depth import PointDepths, PointRays
 from nerfcli.photos.loading import Photo
 from nerfcli.photos.pool import PixelPool
+from nerfcli.photos.psnr import psnr_of
 from nerfcli.photos.storage import IN_MEMORY, Room
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
@@ -68,7 +69,7 @@ class Trial:
     @property
     def psnr(self) -> float:
         """In dB over all judged pixels."""
-        return -10.0 * math.log10(max(float(self.errors.sum() / self.counts.sum()), 1e-12))
+        return psnr_of(float(self.errors.sum() / self.counts.sum()))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """A quick look at held-out pixels during training; the full numbers are the business of `evaluate`."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +11,7 @@ from nerfcli.field.exposure import exposed
 from nerfcli.fit.losses import over_background
 from nerfcli.photos.loading import Photo
 from nerfcli.photos.pool import PixelPool
+from nerfcli.photos.psnr import psnr_of
 from nerfcli.photos.storage import IN_MEMORY, Room
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import render_rays
@@ -67,4 +67,4 @@ class HeldoutPixels:
         if log_gains.any():
             rendered = exposed(rendered, torch.as_tensor(log_gains).to(rendered)[self.photos])
         error = (rendered.clamp(0.0, 1.0) - wanted).square().mean().item()
-        return -10.0 * math.log10(max(error, 1e-12))
+        return psnr_of(error)

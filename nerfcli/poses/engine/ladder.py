@@ -12,6 +12,7 @@ from typing import Any
 
 import pycolmap
 
+from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.mapped import Mapped
@@ -24,7 +25,6 @@ from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.localise import left_out, localise
 from nerfcli.poses.model.merging import merge_models
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
-from nerfcli.poses.model.view_graph import parts
 
 # Registered shares below which the mapper gets another chance; a photo or two missing is often the photo's own fault.
 _GOOD_SHARE = 0.9
@@ -187,7 +187,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
 
 def _other_starts(ladder: _Ladder, job: Job) -> None:
     """Other ways to begin, until nearly all photos are placed that matches hold together."""
-    candidates = len(parts(job.image_ids, [(one, other) for _, one, other in _strong_pairs(job)])[0])
+    candidates = len(connected_groups(job.image_ids, [(one, other) for _, one, other in _strong_pairs(job)])[0])
     steps: list[Callable[[], None]] = [
         lambda: ladder.attempt("start from a smaller baseline", job, SMALLER_BASELINE),
         lambda: _from_left_out(ladder, job),

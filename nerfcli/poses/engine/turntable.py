@@ -21,7 +21,7 @@ from PIL import Image
 from nerfcli.errors import UserError
 from nerfcli.media.images import image_size, read_image
 from nerfcli.media.masks import read_mask
-from nerfcli.multiview.mutual_matches import mutual_matches
+from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, Stationary, motions, together
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input import background as still
@@ -181,7 +181,7 @@ class _Features:
         (x, one, size), (y, other, other_size) = self.of(first), self.of(second)
         if size != other_size:
             return None
-        a, b = mutual_matches(one, other)
+        a, b = mutual_matches(one, other, ratio=LOOSE_RATIO)
         return Compared(first, second, x[a] / size, motions(x[a], y[b], size))
 
 

@@ -11,6 +11,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from nerfcli.errors import UserError
+from nerfcli.media.geodesy import east_north_up
 from nerfcli.poses.input.photos import Photo
 
 # What may be asked for. "auto" is one of the others, by the number of photos and what is known of them.
@@ -29,7 +30,6 @@ _NEAREST = 20
 _SPATIAL_NEIGHBOURS = 5
 # Neighbours that are all nearer than this look no different to a phone's GPS.
 _GPS_ERROR_METRES = 10.0
-_EARTH_RADIUS_METRES = 6_371_000.0
 # From one photo to the next, where the order of times is an order of places.
 _WALKING_PACE_SECONDS = 30.0
 
@@ -145,10 +145,7 @@ def _positions(photos: Sequence[Photo]) -> np.ndarray:
             f"--pairing spatial: {len(without)} of {len(photos)} photos have no GPS position ({without[0]})",
             "choose --pairing retrieval or auto",
         )
-    degrees = np.array([place[:2] for place in places if place is not None])  # latitude, longitude
-    latitude = np.radians(degrees[:, 0].mean())
-    east = (degrees[:, 1] - degrees[0, 1] + 180) % 360 - 180
-    return np.radians(np.column_stack([east * np.cos(latitude), degrees[:, 0]])) * _EARTH_RADIUS_METRES
+    return east_north_up([(*place[:2], None) for place in places if place is not None])[0][:, :2]
 
 
 def _rising(i: int, j: int) -> tuple[int, int]:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
+from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.model.two_views import Agreement, VerifiedPair, agreements
-from nerfcli.poses.model.view_graph import Bottlenecks, parts
+from nerfcli.poses.model.view_graph import Bottlenecks
 
 # A pair with fewer may be mistaken even if no other joins its photos: measured, up to 81 between unlike walls.
 _CERTAIN_MATCHES = 100
@@ -56,7 +57,9 @@ def leave_out_contradicting(
     if not contradicting and not far:
         return model, {}
     sound = _spanning_tree(placed, found)
-    _, *sides = parts(placed, [(a.one, a.other) for a in sound if not a.contradicts]) if contradicting else [placed]
+    _, *sides = (
+        connected_groups(placed, [(a.one, a.other) for a in sound if not a.contradicts]) if contradicting else [placed]
+    )
     reasons = dict(far)
     for photo in (photo for side in sides for photo in side if photo not in far):
         pair = next((c for c in contradicting if model.image(photo).name in (c.one, c.other)), None)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pycolmap
 
+from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict, judge, nothing_placed
 from nerfcli.poses.judge.checks import Checks
@@ -18,7 +19,6 @@ from nerfcli.poses.model.intrinsics import Lenses, choose_lenses
 from nerfcli.poses.model.localise import shared_pairs
 from nerfcli.poses.model.reasons import FEW_MATCHES
 from nerfcli.poses.model.two_views import read_verified_pairs
-from nerfcli.poses.model.view_graph import parts
 
 # From here on the covariance of all poses together takes minutes.
 _MOST_PHOTOS_FOR_BLUR = 500
@@ -65,7 +65,7 @@ def examine(
     sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
     strong = [pair for pair in pairs if pair.matches >= FEW_MATCHES]
     turn = checks.run("parallax", lambda: best_turn(strong, sizes), otherwise=None)
-    joined = parts(job.image_ids, [(pair.one, pair.other) for pair in strong])
+    joined = connected_groups(job.image_ids, [(pair.one, pair.other) for pair in strong])
     details: dict[str, Any] = {"parts": [len(part) for part in joined if len(part) > 1]}
     if not models:
         return Examined(None, nothing_placed(turn), {}, {}, details | {"not_computed": checks.not_computed})

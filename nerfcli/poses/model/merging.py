@@ -13,6 +13,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from nerfcli.cameras.alignment import align as similarity
+from nerfcli.cameras.rigid import Similarity
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
 
@@ -118,30 +120,19 @@ def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) ->
     best = np.zeros(count, dtype=bool)
     for _ in range(_TRIALS):
         sample = rng.choice(count, 3, replace=False)
-        fits = _fits(first, common, _similarity(common.second[sample], common.first[sample]))
+        if not np.ptp(common.second[sample], axis=0).any():  # one point, seen in three photos
+            continue
+        fits = _fits(first, common, similarity(common.second[sample], common.first[sample]))
         if fits.sum() > best.sum():
             best = fits
     if best.sum() < _LEAST_COMMON:
         return None
-    scale, rotation, translation = _similarity(common.second[best], common.first[best])
-    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), translation)
+    found = similarity(common.second[best], common.first[best])
+    return pycolmap.Sim3d(found.scale, pycolmap.Rotation3d(found.rotation), found.translation)
 
 
-def _similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """scale, rotation, translation with target = scale * rotation @ source + translation (Umeyama 1991)."""
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    u, sizes, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
-    rotation = (u * signs) @ vt
-    scale = (sizes * signs).sum() / max(((source - source_mean) ** 2).sum(), 1e-300)
-    return float(scale), rotation, target_mean - scale * rotation @ source_mean
-
-
-def _fits(
-    first: pycolmap.Reconstruction, common: CommonPoints, similarity: tuple[float, Array, Array]
-) -> NDArray[np.bool_]:
-    scale, rotation, translation = similarity
-    moved = scale * common.second @ rotation.T + translation
+def _fits(first: pycolmap.Reconstruction, common: CommonPoints, first_from_second: Similarity) -> NDArray[np.bool_]:
+    moved = first_from_second.apply(common.second)
     fits = np.zeros(len(moved), dtype=bool)
     for photo in np.unique(common.photos):
         rows = np.flatnonzero(common.photos == photo)

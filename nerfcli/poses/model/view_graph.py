@@ -34,21 +34,6 @@ class Bottlenecks:
         return float(self._strengths[self._index[one], self._index[other]])
 
 
-def parts(photos: Sequence[int], joins: Iterable[tuple[int, int]]) -> list[list[int]]:
-    """Photos that chains of joins hold together, the largest part first, each in the order of `photos`."""
-    groups = {photo: [photo] for photo in photos}
-    for one, other in joins:
-        first, second = groups[one], groups[other]
-        if first is second:
-            continue
-        first.extend(second)
-        for photo in second:
-            groups[photo] = first
-    order = {photo: index for index, photo in enumerate(photos)}
-    unique = {id(group): sorted(group, key=order.__getitem__) for group in groups.values()}
-    return sorted(unique.values(), key=lambda group: (-len(group), order[group[0]]))
-
-
 def consistent_groups(photos: Sequence[int], joins: Iterable[Join]) -> list[list[int]]:
     """Divide photos into groups that the strongest evidence allows.
 

@@ -1,0 +1,93 @@
+"""SIFT features of a photo, and which features of two photos show the same thing.
+
+Nothing of the cameras needs to be known: training, `doctor` and `convert --detect` look for features here.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+# A match is kept if it is nearer than the second-best feature by this factor. Source: Lowe 2004, section 7.1.
+RATIO = 0.75
+# Where the geometry of the pair is estimated next and sorts out what is wrong.
+LOOSE_RATIO = 0.8
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of a photo, in the order in which SIFT finds them.
+
+    Args:
+        pixels: (N, 2) in the photo, pixel centres at 0.5.
+        sizes: (N,) float32, diameter of what was found, in pixels of the reduced photo.
+        responses: (N,) float32, contrast.
+        descriptors: (N, 128) float32, whole numbers from 0 to 255.
+    """
+
+    pixels: np.ndarray
+    sizes: np.ndarray
+    responses: np.ndarray
+    descriptors: np.ndarray
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Features that two photos have in common; some matches are wrong.
+
+    Args:
+        photos: their numbers.
+        pixels: (N, 2) of each, centres at 0.5.
+    """
+
+    photos: tuple[int, int]
+    pixels: tuple[np.ndarray, np.ndarray]
+
+
+def find_features(grey: np.ndarray, *, longer_side_px: int, most: int, used: np.ndarray | None = None) -> Features:
+    """Find SIFT features in a grey photo (H, W), reduced until its longer side is at most `longer_side_px`.
+
+    Args:
+        grey: uint8.
+        longer_side_px: smaller photos stay as they are.
+        most: features, those of the highest contrast; at equal contrast there may be a few more.
+        used: (H, W) bool, where features are looked for; None for everywhere.
+    """
+    height, width = grey.shape
+    scale = min(1.0, longer_side_px / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+    mask = None if used is None else cv2.resize(used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    # Without the precise upscaling, OpenCV's keypoints lie a quarter of a pixel off.
+    sift = cv2.SIFT.create(nfeatures=most, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(small, mask)
+    if descriptors is None:
+        keypoints, descriptors = [], np.zeros((0, 128), dtype=np.float32)
+    # OpenCV's positions have pixel centres at whole numbers.
+    found = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
+    return Features(
+        found * (width / size[0], height / size[1]),
+        np.array([keypoint.size for keypoint in keypoints], dtype=np.float32),
+        np.array([keypoint.response for keypoint in keypoints], dtype=np.float32),
+        descriptors,
+    )
+
+
+def mutual_matches(one: np.ndarray, other: np.ndarray, *, ratio: float = RATIO) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of features that are each other's nearest, and nearer by `ratio` than the second nearest.
+
+    Args:
+        one, other: descriptors (N, 128) and (M, 128); squared distances of SIFT's are exact in float32.
+    """
+    if min(len(one), len(other)) < 2:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    a, b = (descriptors.astype(np.float32) for descriptors in (one, other))
+    distances = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)  # squared; (one, other)
+    back = distances.argmin(axis=0)
+    rows = np.arange(len(a))
+    nearest = distances.argmin(axis=1)
+    best = distances[rows, nearest].copy()
+    distances[rows, nearest] = np.inf
+    clear = best < ratio**2 * distances.min(axis=1)
+    kept = clear & (back[nearest] == rows)
+    return rows[kept], nearest[kept]
