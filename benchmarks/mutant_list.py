@@ -96,6 +96,73 @@ GROUPS: tuple[Group, ...] = (
             ),
             Mutant("< march.max_optical_depth\n", "< 2 * march.max_optical_depth\n"),
             Mutant("(1, 0))[offsets]", "(0, 1))[offsets]"),
+            Mutant(
+                "self._encoded(samples, medium, widths=widths, sink=sink)",
+                "self._encoded(samples, medium, widths=None, sink=sink)",
+            ),
+            Mutant(
+                "self._encoded(samples, medium, widths=widths, sink=sink)",
+                "self._encoded(samples, medium, widths=widths, sink=None)",
+            ),
+            Mutant(
+                "self._networks(encoded, rays.directions, index, medium)",
+                "self._networks(encoded, -rays.directions, index, medium)",
+            ),
+            Mutant(
+                "self._networks(encoded, rays.directions, index, medium)",
+                "self._networks(encoded.flip(0), rays.directions, index, medium)",
+            ),
+            Mutant(
+                "density, rgb = medium.radiance(samples.coordinates,",
+                "density, rgb = medium.radiance(samples.coordinates.flip(0),",
+            ),
+            Mutant(
+                "ends - starts, offsets=offsets, background=background",
+                "ends - starts, offsets=offsets, background=0.0 * background",
+            ),
+            Mutant(
+                "ends - starts, offsets=offsets, background=background",
+                "(ends - starts).flip(0), offsets=offsets, background=background",
+            ),
+            Mutant("rgb, distance=starts", "rgb, distance=ends"),
+            Mutant("rgb, distance=starts", "rgb, distance=2 * starts"),
+            Mutant("rays.origins.requires_grad or rays.directions", "rays.origins.requires_grad and rays.directions"),
+            Mutant("apart, off, offsets[-1])", "apart, off, offsets[0])"),
+            Mutant(
+                "background=background.expand(len(rays.origins), 3)",
+                "background=0.0 * background.expand(len(rays.origins), 3)",
+            ),
+            Mutant("rays.directions, index[seen], medium)[1]", "rays.directions, index[: len(seen)], medium)[1]"),
+            Mutant("rays.directions, index[seen])[1]", "rays.directions, index[: len(seen)])[1]"),
+            Mutant("cones=rays.cones,", "cones=2.0 * rays.cones,"),
+            Mutant("transmittance * behind, 0.0)", "transmittance, 0.0)"),
+        ),
+    ),
+    Group(
+        "kernels/numba_cpu/backend.py",
+        ("tests/test_backends.py",),
+        "",
+        (),
+        (
+            Mutant("known=samples.encoded, widths=widths", "known=samples.encoded, widths=None"),
+            Mutant("spherical_harmonics(directions, grid.view_degree)", "spherical_harmonics(directions, 0)"),
+            Mutant("resolutions, sink, known, widths)", "resolutions, None, known, widths)"),
+            Mutant("known=None, widths=None, sink=sink", "known=None, widths=None, sink=None"),
+        ),
+    ),
+    Group(
+        "kernels/reference/backend.py",
+        ("tests/test_backends.py",),
+        "",
+        (),
+        (
+            Mutant("sink.add_(given.grad)", "sink.copy_(given.grad)"),
+            Mutant(
+                "samples.coordinates, grid.table, grid.resolutions, widths=widths",
+                "samples.coordinates, grid.table, grid.resolutions, widths=None",
+            ),
+            Mutant("spherical_harmonics(directions, grid.view_degree)", "spherical_harmonics(directions, 0)"),
+            Mutant('self.deterministic = device.type == "cpu"', "self.deterministic = True"),
         ),
     ),
     Group(
@@ -377,35 +444,10 @@ GROUPS: tuple[Group, ...] = (
     ),
     Group(
         "render/sampling.py",
-        ("tests/test_sampling.py", "tests/test_selftest.py"),
+        ("tests/test_sampling.py",),
         "",
         (),
-        (
-            Mutant("distance * max(1.0, distance)", "distance"),
-            Mutant("((strata + uniform) / count)", "(strata / count)"),
-            Mutant("(right - 1).clamp_min(0), last)", "right, last)"),
-            Mutant(
-                "torch.minimum((right - 1).clamp_min(0), last)",
-                "(right - 1).clamp_min(0).clamp_max(weights.shape[-1] - 1)",
-            ),
-            Mutant(
-                "- low, 1.0)).clamp(0.0, 1.0)",
-                "- low, 1.0))",
-                "the last cumulated share is 1 exactly, so that draws up to 1 give shares in [0, 1]",
-            ),
-            Mutant("uniform.contiguous(), right=True)", "uniform.contiguous(), right=False)"),
-            Mutant("weights / torch.where(largest > 0, largest, 1.0)", "weights"),
-        ),
-    ),
-    Group(
-        "render/transmission.py",
-        ("tests/test_worked_examples.py", "tests/test_selftest.py"),
-        "",
-        (),
-        (
-            Mutant("attenuation * lengths, offsets", "attenuation, offsets"),
-            Mutant("torch.exp(-integral)", "torch.exp(integral)"),
-        ),
+        (Mutant("distance * max(1.0, distance)", "distance"),),
     ),
     Group(
         "kernels/harmonics.py",

@@ -71,7 +71,7 @@ MAY_IMPORT = {
         "media",
         "pages",
     },
-    "selftest": {"render", "field", "kernels", "cameras"},
+    "selftest": {"kernels"},
     "report": {"runs", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},
     "workflows": {
         *("ablate", "report", "export", "evaluate", "train", "runs", "photos", "doctor", "poses"),

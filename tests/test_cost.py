@@ -10,7 +10,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from nerfcli import kernels
 from nerfcli.errors import UserError
 from nerfcli.field.comparison import described_cost, others_of_equal_storage
-from nerfcli.field.cost import dense_grid_bytes, field_bytes, optimiser_bytes, parameter_bytes, work
+from nerfcli.field.cost import field_bytes, optimiser_bytes, parameter_bytes, work
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
@@ -77,7 +77,7 @@ def test_dense_grids_by_the_worked_example():
     """A 128^3 grid: 8 MiB for one number, 32 MiB for density and colour; twice the side is eight times as much."""
     grey = VoxelFieldSettings(contraction="none", view_degree=0, log2_vertices=21)
     assert grey.resolution == 127  # between 128^3 vertices
-    assert parameter_bytes(work(grey).parameters) == dense_grid_bytes(128, 4) == 32 * MIB
+    assert parameter_bytes(work(grey).parameters) == 4 * 128**3 * 4 == 32 * MIB
     assert work(replace(grey, log2_vertices=24)).parameters == 8 * work(grey).parameters
     # One million numbers are four million bytes, and three times that again in training.
     assert (parameter_bytes(10**6), optimiser_bytes(10**6)) == (4_000_000, 12_000_000)

@@ -9,10 +9,8 @@ import pytest
 from captures import CAMERAS, ring
 from corruption import assert_refused_or_sound, corrupted_binary, corrupted_text
 
-from nerfcli.cameras import rigid
-from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap_write import write_colmap_binary
-from nerfcli.cameras.formats.ply import losses_ply, read_ply_points, write_camera_ply, write_ply
+from nerfcli.cameras.formats.ply import losses_ply, read_ply_points, write_ply
 from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError
 
@@ -96,43 +94,6 @@ def edges_of(data: bytes, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
     start = data.index(b"end_header\n") + 11
     vertices = np.frombuffer(data, "<f8", 3 * num_vertices, start).reshape(-1, 5, 3)
     return vertices, np.frombuffer(data, "<i4", offset=start + 24 * num_vertices).reshape(-1, 8, 2)
-
-
-def test_frusta_of_cameras(tmp_path):
-    """A pinhole's frustum by hand; every camera's corners on the rays of its picture's corners."""
-    camera = Camera.pinhole(600, 400, 300.0)
-    pose = rigid.from_parts(np.eye(3), np.array([10.0, 20.0, 30.0]))
-    frame = replace(ring(camera, num_frames=1).frames[0], world_from_cam=pose)
-    write_camera_ply(Capture((frame,), np.zeros((0, 3)), (), None, "x"), tmp_path / "a.ply", depth=np.sqrt(22.0))
-    vertices, edges = edges_of((tmp_path / "a.ply").read_bytes(), 5)
-    expected = [[0, 0, 0], [-3, -2, 3], [3, -2, 3], [3, 2, 3], [-3, 2, 3]]
-    np.testing.assert_allclose(vertices[0] - frame.centre, expected, rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(edges[0], [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
-
-    capture = ring(*CAMERAS.values(), num_frames=len(CAMERAS))
-    write_camera_ply(capture, tmp_path / "b.ply")
-    vertices, edges = edges_of((tmp_path / "b.ply").read_bytes(), 5 * len(CAMERAS))
-    np.testing.assert_array_equal(edges // 5, np.broadcast_to(np.arange(len(CAMERAS))[:, None, None], edges.shape))
-    np.testing.assert_array_equal(read_ply_points(tmp_path / "b.ply")[0], vertices.reshape(-1, 3))
-    for frame, corners in zip(capture.frames, vertices, strict=True):
-        np.testing.assert_array_equal(corners[0], frame.centre)
-        if frame.camera.is_spherical:
-            continue
-        pixels, valid = frame.camera.project(rigid.apply(rigid.inverse(frame.world_from_cam), corners[1:]))
-        assert valid.all()
-        np.testing.assert_allclose(pixels, [[0, 0], [640, 0], [640, 480], [0, 480]], rtol=0, atol=1e-8)
-
-
-def test_frusta_of_a_lens_that_does_not_see_the_corners(tmp_path):
-    camera = Camera("OPENCV_FISHEYE", 640, 480, (100.0, 100.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
-    assert not camera.bearings(np.zeros((1, 2)))[1].any()
-    capture = ring(camera, num_frames=1)
-    write_camera_ply(capture, tmp_path / "a.ply")
-    vertices, _ = edges_of((tmp_path / "a.ply").read_bytes(), 5)
-    pixels, valid = camera.project(rigid.apply(rigid.inverse(capture.frames[0].world_from_cam), vertices[0, 1:]))
-    assert valid.all()
-    offsets = pixels - [320, 240]
-    np.testing.assert_allclose(offsets[:, 0] * [-1, 1, 1, -1] * 240, offsets[:, 1] * [-1, -1, 1, 1] * 320, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from corruption import assert_refused_or_sound, corrupted_binary, corrupted_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.blender import losses_blender, parse_blender, write_blender
 from nerfcli.cameras.formats.transforms import (
-    ignored_transforms,
     losses_transforms,
     parse_transforms,
     read_transforms,
@@ -121,7 +120,7 @@ def test_images_masks_splits_and_cameras_per_image(tmp_path):
         assert (again.mask is None) == (frame.mask is None)
 
 
-def test_poses_stay_in_the_files_world_and_what_is_ignored_is_listed(tmp_path):
+def test_poses_stay_in_the_files_world(tmp_path):
     applied = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 5.0], [0.0, -1.0, 0.0, 0.0]]
     frames = [{"file_path": f"{i}.jpg", "transform_matrix": OPENGL_POSE, "sharpness": 3} for i in range(2)]
     path = write_json(
@@ -136,7 +135,6 @@ def test_poses_stay_in_the_files_world_and_what_is_ignored_is_listed(tmp_path):
     )
     capture = parse_transforms(path)
     np.testing.assert_array_equal(capture.frames[0].world_from_cam, OPENCV_POSE)
-    assert ignored_transforms(path) == ("aabb_scale", "applied_transform", "offset", "sharpness of 2 frames")
 
 
 def test_names_and_sizes_without_the_photos(tmp_path):

@@ -22,7 +22,6 @@ from nerfcli.media.images import (
     downscale,
     image_size,
     list_images,
-    read_downscaled,
     read_exif,
     read_image,
     write_png,
@@ -369,13 +368,6 @@ def test_downscale_refuses_to_enlarge():
     for factor in (0.5, 0, -1, math.nan):
         with pytest.raises(ValueError, match="factor must be at least 1"):
             downscale(noise(6, 9), factor)
-
-
-def test_read_downscaled_is_reading_then_downscaling(tmp_path):
-    path = tmp_path / "photo.png"
-    Image.fromarray(noise(12, 31, 4)).save(path, exif=exif_with({ExifTags.Base.Orientation: 8}))
-    np.testing.assert_array_equal(read_downscaled(path, 2.5), downscale(read_image(path), 2.5))
-    assert read_downscaled(path, 2.5).shape == (12, 5, 4)
 
 
 def test_exif_of_a_phone(tmp_path):

@@ -136,7 +136,7 @@ def test_rotations_about_one_axis_add_up_and_the_log_turns_with_the_frame(seed):
 
 @given(seed=seeds, angle=angles)
 @examples(100)
-def test_exp_of_a_twist_is_the_matrix_exponential_and_log_its_inverse(seed, angle):
+def test_exp_of_a_twist_is_the_matrix_exponential(seed, angle):
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     twist = np.concatenate([rng.normal(size=3), angle * axis / np.linalg.norm(axis)])
@@ -145,10 +145,6 @@ def test_exp_of_a_twist_is_the_matrix_exponential_and_log_its_inverse(seed, angl
     generator[:3, 3] = twist[:3]
     transform = rigid.transform_from_twist(twist)
     np.testing.assert_allclose(transform, expm(generator), rtol=0, atol=1e-13)
-    back = rigid.twist_from_transform(transform)
-    if angle < np.pi - 1e-12:
-        np.testing.assert_allclose(back, twist, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(rigid.transform_from_twist(back), transform, rtol=0, atol=1e-13)
 
 
 @given(seed=seeds)
@@ -158,7 +154,6 @@ def test_half_a_screw_twice_is_the_whole_and_batches_are_single_twists(seed):
     half, whole = rigid.transform_from_twist(twists / 2), rigid.transform_from_twist(twists)
     np.testing.assert_allclose(half @ half, whole, rtol=0, atol=1e-14)
     np.testing.assert_array_equal(whole[1, 2], rigid.transform_from_twist(twists[1, 2]))
-    np.testing.assert_array_equal(rigid.twist_from_transform(whole)[1, 2], rigid.twist_from_transform(whole[1, 2]))
     np.testing.assert_allclose(rigid.transform_from_twist(-twists), rigid.inverse(whole), rtol=0, atol=1e-14)
 
 

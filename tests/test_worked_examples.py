@@ -8,11 +8,9 @@ import torch
 from kernel_parts import parts_for
 
 from nerfcli.cameras.camera import Camera
-from nerfcli.field.cost import dense_grid_bytes, field_queries, parameter_bytes
 from nerfcli.field.encodings import fourier_features
 from nerfcli.kernels import LightEnds
 from nerfcli.kernels.reference import depth
-from nerfcli.render import sampling, transmission
 from nerfcli.render.depth import DepthRequest, requested
 
 DTYPES = [torch.float64, torch.float32]
@@ -144,27 +142,3 @@ def test_fourier_features(dtype):
     torch.testing.assert_close(
         at_quarter[4:], torch.tensor([0, -1], dtype=dtype), rtol=0, atol=4 * torch.finfo(dtype).eps
     )
-
-
-def test_inverse_cdf(dtype):
-    edges = torch.tensor([[0.0, 1.0, 2.0, 3.0]], dtype=dtype)
-    weights = torch.tensor([[0.5, 0.25, 0.25]], dtype=dtype)
-    close(sampling.inverse_cdf(edges, weights, uniform=torch.tensor([[0.7]], dtype=dtype)), [[1.8]], dtype)
-
-
-def test_storage_and_work():
-    assert parameter_bytes(1_000_000) == 4_000_000
-    assert 128**3 == 2_097_152
-    assert dense_grid_bytes(128, 1) == 8 * 2**20
-    assert dense_grid_bytes(128, 4) == 32 * 2**20
-    assert dense_grid_bytes(256, 1) == 8 * dense_grid_bytes(128, 1)
-    assert field_queries(256, 256, 64) == 4_194_304
-
-
-def test_transmission(dtype):
-    mu = torch.tensor([0.5, 0.25, 2.0], dtype=dtype)
-    lengths = torch.tensor([2.0, 4.0, 0.5], dtype=dtype)
-    integral = transmission.line_integral(mu, lengths, OFFSETS)
-    close(integral, [3.0], dtype)
-    close(transmission.transmitted(20000.0, integral), [20000.0 * math.exp(-3)], dtype)
-    close(-torch.log(transmission.transmitted(1.0, integral)), integral, dtype)

@@ -121,23 +121,6 @@ def transform_from_twist(twist: np.ndarray) -> np.ndarray:
     return from_parts(rotation_from_vector(w), u + b * turned + c * np.cross(w, turned))
 
 
-def twist_from_transform(b_from_a: np.ndarray) -> np.ndarray:
-    """log of SE(3): the twists (..., 6) of rigid motions (..., 4, 4), the inverse of `transform_from_twist`.
-
-    u = V^-1 t with V^-1 = 1 - W / 2 + d W^2, d = (1 - (a / 2) cot(a / 2)) / a^2; the angle a is in [0, pi].
-    """
-    b_from_a = np.asarray(b_from_a, dtype=np.float64)
-    w, translation = vector_from_rotation(b_from_a[..., :3, :3]), b_from_a[..., :3, 3]
-    angle = np.linalg.norm(w, axis=-1, keepdims=True)
-    small = angle < SERIES_BELOW
-    safe = np.where(small, 1.0, angle)
-    d = np.where(
-        small, _series(angle, (12, 720, 30240, 1209600, 47900160)), (1 - safe / (2 * np.tan(safe / 2))) / safe**2
-    )
-    turned = np.cross(w, translation)
-    return np.concatenate([translation - turned / 2 + d * np.cross(w, turned), w], axis=-1)
-
-
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """The rotation (..., 3, 3) nearest in the Frobenius norm to a matrix that rounding has bent a little."""
     u, _, vt = np.linalg.svd(matrix)

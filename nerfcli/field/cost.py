@@ -38,16 +38,6 @@ def field_bytes(field: nn.Module) -> int:
     return sum(parameter_bytes(p.numel(), bytes_per_value=p.element_size()) for p in field.parameters())
 
 
-def dense_grid_bytes(side: int, channels: int, *, bytes_per_value: int = FLOAT_BYTES) -> int:
-    """Bytes of a dense grid of side^3 cells with `channels` values each."""
-    return parameter_bytes(side**3 * channels, bytes_per_value=bytes_per_value)
-
-
-def field_queries(width: int, height: int, samples_per_ray: float) -> int:
-    """Field evaluations for one picture without skipping and early stop."""
-    return round(width * height * samples_per_ray)
-
-
 @dataclass(frozen=True)
 class Work:
     """What asking a field costs, per sample, forward.

@@ -138,16 +138,6 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return pixels if transpose is None else np.array(Image.fromarray(pixels).transpose(transpose))
 
 
-def read_downscaled(path: Path, factor: float) -> np.ndarray:
-    """`read_image`, then `downscale`; the pixels at full size are freed before it returns.
-
-    Raises:
-        UserError: see `read_image`.
-        ValueError: factor < 1.
-    """
-    return downscale(read_image(path), factor)
-
-
 def downscale(image: np.ndarray, factor: float) -> np.ndarray:
     """A smaller picture; each pixel is the mean of the area that it covers, fractions of pixels included.
 

@@ -1,13 +1,11 @@
 """What every source of scale gives, and a capture in metres."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from nerfcli.cameras.frame import Capture
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.cameras.world import transformed
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,3 @@ class ScaleEstimate:
             "source": self.source,
             "details": self.details,
         }
-
-
-def in_metres(capture: Capture, estimate: ScaleEstimate) -> Capture:
-    """The capture scaled about its origin so that its unit is the metre."""
-    return replace(transformed(capture, estimate.similarity), unit="metre")

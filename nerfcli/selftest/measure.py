@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nerfcli.kernels import reference
 
-MET, NOT_MET, NOT_HERE = "met", "not met", "does not occur"
+MET, NOT_MET = "met", "not met"
 
 
 @dataclass(frozen=True)
@@ -66,25 +66,23 @@ class Row:
     """One hard case in one precision.
 
     Args:
-        hard_cases: numbers in the list of known hard cases; () for one that is not in it.
         case: what is hard.
         operation: which operation it is tried on.
         precision: name of the arithmetic.
-        errors: of the program; None where the case does not occur in it.
+        errors: of the program.
         bounds: what they may be.
-        reason: where the bounds come from, or why the case does not occur.
+        reason: where the bounds come from.
         formula: what textbooks do; "" where there is none.
         textbook: its errors on the same numbers; None also for the compiled kernels, whose float32 has its own row.
         seconds: one run of the operation, forward and backward.
         no_gradient: why an operation that others take the gradient of has none here.
     """
 
-    hard_cases: tuple[int, ...]
     case: str
     operation: str
     precision: str
-    errors: Errors | None
-    bounds: Errors | None
+    errors: Errors
+    bounds: Errors
     reason: str
     formula: str = ""
     textbook: Errors | None = None
@@ -94,13 +92,10 @@ class Row:
     @property
     def verdict(self) -> str:
         """Whether the bounds are met; NaN meets none."""
-        if self.errors is None:
-            return NOT_HERE
         return MET if self.holds(self.errors) else NOT_MET
 
     def holds(self, errors: Errors) -> bool:
         """Whether errors are within the bounds of this row."""
-        assert self.bounds is not None
         pairs = ((errors.value, self.bounds.value), (errors.gradient, self.bounds.gradient))
         return all(error <= bound for error, bound in pairs if error is not None and bound is not None)
 
@@ -133,17 +128,16 @@ def by_formula(rows: Sequence[Row]) -> list[Row]:
 def _beyond(row: Row) -> float:
     """How many times its bounds the textbook's errors are."""
     assert row.textbook is not None
-    assert row.bounds is not None
     pairs = ((row.textbook.value, row.bounds.value), (row.textbook.gradient, row.bounds.gradient))
     known = [(error, bound) for error, bound in pairs if error is not None and bound is not None]
     return max(error / bound if bound else math.inf * error if error else 0.0 for error, bound in known)
 
 
-def largest_error(values: Any, wanted: Sequence[Any], *, tiny: float, scale: Sequence[Any] | None = None) -> float:
+def largest_error(values: Any, wanted: Any, *, tiny: float, scale: Any = None) -> float:
     """The largest |value - wanted| / max(|wanted|, tiny).
 
     Args:
-        values: tensor or array.
+        values: tensor, array or numbers, as all that follow.
         wanted: the answers; NaN where undefined.
         tiny: below, errors are relative to it.
         scale: what errors are relative to, in place of |wanted|.
@@ -151,12 +145,16 @@ def largest_error(values: Any, wanted: Sequence[Any], *, tiny: float, scale: Seq
     Returns:
         0 for nothing at all; infinite where only one of the two is a number.
     """
-    got = values.detach().to("cpu", torch.float64).numpy() if isinstance(values, Tensor) else np.asarray(values, float)
-    want = np.asarray(wanted, dtype=np.float64).reshape(got.shape)
+    got = _plain(values)
+    want = _plain(wanted).reshape(got.shape)
     if got.size == 0:
         return 0.0
-    size = np.abs(want if scale is None else np.asarray(scale, dtype=np.float64).reshape(got.shape))
+    size = np.abs(want if scale is None else _plain(scale).reshape(got.shape))
     with np.errstate(invalid="ignore", over="ignore"):
         error = np.abs(got - want) / np.maximum(size, tiny)
     error = np.where(np.isnan(got) & np.isnan(want), 0.0, np.where(got == want, 0.0, error))
     return float(np.where(np.isnan(error), np.inf, error).max())
+
+
+def _plain(values: Any) -> np.ndarray:
+    return values.detach().to("cpu", torch.float64).numpy() if isinstance(values, Tensor) else np.asarray(values, float)

@@ -25,7 +25,8 @@ def composite(
     return colour + (1.0 - opacity)[:, None] * background, 1.0 - opacity, weights
 
 
-def _weights(density: Tensor, lengths: Tensor) -> Tensor:
+def weights_of_ray(density: Tensor, lengths: Tensor) -> Tensor:
+    """Weights of one ray."""
     alpha = 1.0 - torch.exp(-density * lengths)
     passing = torch.cumprod(torch.cat([torch.ones_like(alpha[:1]), 1.0 - alpha + EPS]), dim=0)
     return alpha * passing[:-1]
@@ -54,20 +55,8 @@ def optical_depth_before(density: Tensor, lengths: Tensor, *, offsets: Tensor) -
     return torch.cat([(d * n).cumsum(0) - d * n for d, n in _split(offsets, density, lengths)])
 
 
-def line_integral(attenuation: Tensor, lengths: Tensor, *, offsets: Tensor) -> Tensor:
-    """-log of the product of exp(-attenuation length), as one takes it from a picture of what has passed."""
-    return torch.stack([-torch.exp(-d * n).prod().log() for d, n in _split(offsets, attenuation, lengths)])
-
-
-def gradient_by_subtraction(density: Tensor, lengths: Tensor, values: Tensor, colour: Tensor) -> Tensor:
-    """d colour / d density of one ray: what lies behind a sample taken as the colour less the running sum."""
-    weights = _weights(density, lengths)
-    after = torch.exp(-(density * lengths).cumsum(0))
-    return lengths * (after * values - (colour - (weights * values).cumsum(0)))
-
-
-def distortion(weights: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-    """Of one ray: 2 sum w_i (m_i W_i - M_i) + sum w_i^2 length_i / 3, a difference of running sums."""
+def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+    """Of a single ray: 2 sum w_i (m_i W_i - M_i) + sum w_i^2 length_i / 3, a difference of running sums."""
     middles = (starts + ends) / 2
     before, moment = (x.cumsum(0) - x for x in (weights, weights * middles))
     return (2 * weights * (middles * before - moment) + weights.square() * (ends - starts) / 3).sum()
@@ -79,25 +68,10 @@ def contract(points: Tensor) -> Tensor:
     return torch.where(norm <= 1.0, points, (2.0 - 1.0 / norm) * points / norm)
 
 
-def inverse_cdf(edges: Tensor, weights: Tensor, *, uniform: Tensor) -> Tensor:
-    """Weights padded by 1e-5, the bins searched in their cumulative sum, the last edge beyond it.
-
-    Source: Mildenhall et al. 2020, its published code, sample_pdf.
-    """
-    pdf = (weights + 1e-5) / (weights + 1e-5).sum(-1, keepdim=True)
-    cdf = torch.cat([torch.zeros_like(pdf[:, :1]), pdf.cumsum(-1)], dim=-1)
-    right = torch.searchsorted(cdf, uniform.contiguous(), right=True)
-    low, high = (right - 1).clamp_min(0), right.clamp_max(cdf.shape[-1] - 1)
-    below, above = cdf.gather(-1, low), cdf.gather(-1, high)
-    share = (uniform - below) / torch.where(above - below < 1e-5, 1.0, above - below)
-    left = edges.gather(-1, low)
-    return left + share * (edges.gather(-1, high) - left)
-
-
 def _split(offsets: Tensor, *packed: Tensor) -> Iterator[tuple[Tensor, ...]]:
     counts = offsets.diff().tolist()
     return zip(*(values.split(counts) for values in packed), strict=True)
 
 
 def _weights_of_all(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
-    return torch.cat([_weights(*of_ray) for of_ray in _split(offsets, density, lengths)])
+    return torch.cat([weights_of_ray(*of_ray) for of_ray in _split(offsets, density, lengths)])

@@ -1,4 +1,4 @@
-"""PLY files: the points of a capture with their colours, and its cameras as frusta to look at.
+"""PLY files: the points of a capture with their colours.
 
 Read in all three encodings, with the properties of a vertex in any order; written in binary, little endian, positions
 as float64. Source: Greg Turk, "The PLY Polygon File Format", 1994.
@@ -8,11 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from nerfcli.atomic import atomic_path
-from nerfcli.cameras import rigid
-from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.limits import plausible
 from nerfcli.cameras.formats.losses import lost_parts
 from nerfcli.cameras.frame import Capture
@@ -34,9 +31,6 @@ _TYPES = {
 }
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-
-# A frustum is as deep as this part of the distance between typical neighbours, so that they do not hide each other.
-_FRUSTUM_PART = 0.5
 
 
 @dataclass(frozen=True)
@@ -92,39 +86,6 @@ def write_ply(capture: Capture, path: Path) -> None:
         for channel, name in enumerate(_COLOURS[0]):
             vertices[name] = capture.colours[:, channel]
     _write(path, {"vertex": vertices})
-
-
-def write_camera_ply(capture: Capture, path: Path, *, depth: float | None = None) -> None:
-    """Write the cameras of a capture as frusta: five vertices and eight edges each, atomically.
-
-    The first vertex of five is the camera's centre; the next ones are seen in the picture's corners, from the top left
-    one clockwise, through the true lens model. A corner that the lens does not see is moved towards the middle. Of a
-    spherical picture the frustum covers 90 degrees around the forward axis.
-
-    Args:
-        capture: whose cameras are drawn.
-        path: of the file.
-        depth: distance from the centre to the corners in scene units; None makes it half the distance between typical
-            neighbouring cameras.
-
-    Raises:
-        UserError: the file cannot be written.
-    """
-    centres = np.array([frame.centre for frame in capture.frames]).reshape(-1, 3)
-    length = _typical_gap(centres) * _FRUSTUM_PART if depth is None else depth
-    corners = {camera: _corner_directions(camera) for camera in {frame.camera for frame in capture.frames}}
-    positions = np.empty((len(centres), 5, 3))
-    for index, frame in enumerate(capture.frames):
-        positions[index, 0] = centres[index]
-        positions[index, 1:] = rigid.apply(frame.world_from_cam, length * corners[frame.camera])
-    vertices = np.zeros(5 * len(centres), np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8")]))
-    for axis, name in enumerate("xyz"):
-        vertices[name] = positions[..., axis].ravel()
-    pairs = np.array([(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)])
-    pairs = (5 * np.arange(len(centres))[:, None, None] + pairs).reshape(-1, 2)
-    edges = np.zeros(len(pairs), np.dtype([("vertex1", "<i4"), ("vertex2", "<i4")]))
-    edges["vertex1"], edges["vertex2"] = pairs.T
-    _write(path, {"vertex": vertices, "edge": edges})
 
 
 def _write(path: Path, elements: dict[str, np.ndarray]) -> None:
@@ -225,26 +186,3 @@ def _as_bytes(channel: np.ndarray, kind: str) -> np.ndarray:
     if kind not in ("u1", "f4", "f8") or not ((channel >= 0) & (channel <= most)).all():
         raise ValueError(f"its colours are no numbers from 0 to {most:g}")
     return np.round(channel.astype(np.float64) * (255.0 / most)).astype(np.uint8)
-
-
-def _corner_directions(camera: Camera) -> np.ndarray:
-    """Unit directions (4, 3) of the picture's corners in camera axes."""
-    if camera.is_spherical:
-        corners = np.array([(-1.0, -1.0, 1.0), (1.0, -1.0, 1.0), (1.0, 1.0, 1.0), (-1.0, 1.0, 1.0)])
-        return corners / np.sqrt(3.0)
-    middle = np.array(camera.principal_point)
-    size = np.array([camera.width, camera.height])
-    corners = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) * size
-    directions = np.tile((0.0, 0.0, 1.0), (4, 1))
-    for part in np.linspace(0.05, 1.0, 20):  # the last valid one stays
-        seen, valid = camera.bearings(middle + part * (corners - middle))
-        directions[valid] = seen[valid]
-    return directions
-
-
-def _typical_gap(centres: np.ndarray) -> float:
-    """Median distance from a camera to its nearest neighbour; 1 where all stand in one place."""
-    if len(centres) < 2:
-        return 1.0
-    gap = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1]))
-    return gap if gap > 0 else 1.0

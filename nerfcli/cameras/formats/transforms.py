@@ -21,7 +21,6 @@ from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts
 from nerfcli.cameras.formats.ply import read_ply_points, write_ply
 from nerfcli.cameras.formats.poses import rigid_poses
 from nerfcli.cameras.formats.transforms_cameras import (
-    CAMERA_KEYS,
     camera_of_record,
     given_size,
     lost_to_transforms,
@@ -35,9 +34,6 @@ SPLITS = ("train", "val", "test")
 
 # Tried in this order where a file_path has no suffix, as in the Blender captures.
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
-
-_FRAME_KEYS = CAMERA_KEYS | {"file_path", "transform_matrix", "mask_path"}
-_FILE_KEYS = CAMERA_KEYS | {"frames", "ply_file_path", *(f"{split}_filenames" for split in SPLITS)}
 
 
 def read_transforms(path: Path, measure: Measure) -> Capture:
@@ -64,7 +60,7 @@ def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
 
     Poses and points stay in the file's own world. nerfstudio's applied_transform and applied_scale say how that world
     came from the one of the poses' first home (COLMAP's); they are not undone, which would part the cameras from every
-    field that was trained on the file. `ignored_transforms` lists them, with all else that no capture holds.
+    field that was trained on the file.
 
     Args:
         path: the JSON file; paths in it are relative to its folder.
@@ -80,18 +76,6 @@ def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
     refuse_twins(path, frames)
     points, colours = _points_beside(path, content)
     return Capture(tuple(frames), points, (), None, "transforms", colours=colours)
-
-
-def ignored_transforms(path: Path) -> tuple[str, ...]:
-    """The keys of a transforms.json that no capture holds, such as "aabb_scale" or "sharpness of 50 frames".
-
-    Raises:
-        UserError: the file is malformed.
-    """
-    content = read_json_object(path)
-    keys = sorted(set(content) - _FILE_KEYS)
-    counts = Counter(key for record in records_of(path, content) for key in record if key not in _FRAME_KEYS)
-    return (*keys, *(f"{key} of {count} frames" for key, count in sorted(counts.items())))
 
 
 def losses_transforms(capture: Capture) -> tuple[str, ...]:

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -82,8 +81,3 @@ def _is_plain(path: Path, photo: Photo) -> bool:
     with Image.open(path) as image:
         known = (image.format, path.suffix.lower()) in _PLAIN and image.mode in ("L", "RGB")
     return known and photo.exif.orientation == 1
-
-
-def original_names(photos: Iterable[str], laid_out: Iterable[LaidOut]) -> dict[int, str]:
-    """The photos' own names by their ids in pycolmap's database, where ids start at 1."""
-    return {int(Path(found.file).stem) + 1: name for name, found in zip(photos, laid_out, strict=True)}

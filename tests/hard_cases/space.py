@@ -16,11 +16,10 @@ from nerfcli.field.contraction import uncontract
 from nerfcli.kernels import HashGrid, March, Rays, reference
 from nerfcli.render.rays import frame_rays
 from nerfcli.selftest import textbook
+from nerfcli.selftest.cases import CONTRACTED, DIRECTIONS
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
 GIVEN = (1.0, 0.5, 0.25)
-# Unit directions with coordinates that every precision holds, up to their length, which need not be 1.
-DIRECTIONS = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.5, -0.75, 1.0), (-1.0, 0.25, 2.0**-10))
 WORLD = 1e6
 
 
@@ -50,11 +49,7 @@ def _contracted(point: tuple[float, ...]) -> tuple[list[float], list[float], lis
 
 def _contraction_rows(precision: Precision) -> Iterator[Row]:
     zero = (0.0, 0.0, 0.0)
-    groups = (
-        ((11,), "contraction at its centre and its border", (0.0, 2.0**-100, 2.0**-10, 0.5, 1.0, 1.25, 2.0)),
-        ((12,), "contraction far away, radius 1e3 to 1e37", (2.0**10, 2.0**33, 2.0**60, 2.0**66, 2.0**122)),
-    )
-    for cases, name, radii in groups:
+    for name, radii in CONTRACTED:
         points = [tuple(r * x for x in d) for r in radii for d in DIRECTIONS] + ([zero] if 0.0 in radii else [])
         wanted = [_contracted(point) for point in points]
 
@@ -72,7 +67,6 @@ def _contraction_rows(precision: Precision) -> Iterator[Row]:
 
         ours, seconds = errors(kernels.contract)
         yield Row(
-            hard_cases=cases,
             case=name,
             operation="contract",
             precision=precision.name,
@@ -91,7 +85,6 @@ def _contraction_rows(precision: Precision) -> Iterator[Row]:
     seconds = time.perf_counter() - start
     beyond = uncontract(kernels.contract(precision.tensor([[2.0**30, 0.0, 0.0]])))
     yield Row(
-        hard_cases=(12,),
         case="contraction and back, to where rays end (300)",
         operation="uncontract",
         precision=precision.name,
@@ -115,7 +108,6 @@ def _axis_row(precision: Precision) -> Row:
     chords = reference.sum_along_rays(ends - starts, offsets)
     near = [(side - o) / d if d else (side - o) / 0.0 if side != o else math.nan for side, o, d in ((-1.0, -1.0, 0.0),)]
     return Row(
-        hard_cases=(18,),
         case="rays along axes, and in the plane of a side",
         operation="visible_samples",
         precision=precision.name,
@@ -142,7 +134,6 @@ def _empty_row(precision: Precision) -> Row:
     got = torch.cat([colour.flatten(), passing, light.opacity, light.mean, light.quantiles.flatten()])
     wanted = [0.25, 0.5, 1.0] * 3 + [1.0] * 3 + [0.0] * 3 + [math.nan] * 6
     return Row(
-        hard_cases=(20,),
         case="empty occupancy: every ray without samples",
         operation="visible_samples, composite, light_ends",
         precision=precision.name,
@@ -189,7 +180,6 @@ def _world_rows() -> Iterator[Row]:
         return largest_error(path.double().diff(dim=0).norm(dim=1), steps.tolist(), tiny=1e-30)
 
     yield Row(
-        hard_cases=(17,),
         case="world coordinates of 1e6: steps of rays",
         operation="frame_rays",
         precision="float32",
@@ -207,7 +197,6 @@ def _world_rows() -> Iterator[Row]:
     seconds = time.perf_counter() - start
     lost = there.astype(np.float32).astype(np.float64)
     yield Row(
-        hard_cases=(17,),
         case="world coordinates of 1e6: to the frame and back",
         operation="Similarity",
         precision="float64",

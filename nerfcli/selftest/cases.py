@@ -1,4 +1,6 @@
-"""Rays that are hard for rounding, as data: thin and opaque, empty and dense, short and very long.
+"""Hard cases as data, for `nerfcli selftest` and for the tests.
+
+Rays are hard for rounding: thin and opaque, empty and dense, short and very long. Points are on borders and far away.
 
 Densities of `Group`s and lengths of their intervals are numbers of bfloat16, so that the same rays go into every
 precision, and an error is one of the arithmetic alone.
@@ -40,12 +42,10 @@ class Group:
     """Rays that are hard for the same reason.
 
     Args:
-        hard_cases: their numbers in the list of known hard cases; () for one that is not in it.
         name: what is hard about them.
         rays: the rays.
     """
 
-    hard_cases: tuple[int, ...]
     name: str
     rays: tuple[Intervals, ...]
 
@@ -66,13 +66,12 @@ def groups() -> tuple[Group, ...]:
     counts = (1, 2, 64, 1024, 4096)
     return (
         *(
-            Group((2, 3, 4), f"optical depth {x:g} per interval, 1 to 4096", tuple(fog(x, n) for n in counts))
+            Group(f"optical depth {x:g} per interval, 1 to 4096", tuple(fog(x, n) for n in counts))
             for x in (1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6)
         ),
-        Group((), "no intervals", (Intervals((), ()), Intervals((), ()))),
-        Group((), "zero weights: empty intervals", (Intervals((0.0,) * 5, (0.5,) * 5), Intervals((0.0,), (4.0,)))),
+        Group("no intervals", (Intervals((), ()), Intervals((), ()))),
+        Group("zero weights: empty intervals", (Intervals((0.0,) * 5, (0.5,) * 5), Intervals((0.0,), (4.0,)))),
         Group(
-            (),
             "duplicate edges: intervals of length 0",
             (
                 Intervals((1.0, 2.0, 4.0), (0.0, 0.5, 0.0)),
@@ -81,12 +80,10 @@ def groups() -> tuple[Group, ...]:
             ),
         ),
         Group(
-            (),
             "first interval opaque",
             (Intervals((2.0**20, 1.0, 2.0), (1.0, 0.5, 0.5)), Intervals((2.0**100, 0.0, 2.0**100), (1.0, 1.0, 1.0))),
         ),
         Group(
-            (4, 23),
             "thin fog, then an opaque interval",
             (
                 Intervals((2.0**-30,) * 64 + (2.0**20,), (2.0**-6,) * 65),
@@ -94,7 +91,6 @@ def groups() -> tuple[Group, ...]:
             ),
         ),
         Group(
-            (23,),
             "last interval very long, up to 1e38",
             (
                 Intervals((0.5, 2.0**-40), (1.0, 2.0**40)),
@@ -104,7 +100,6 @@ def groups() -> tuple[Group, ...]:
             ),
         ),
         Group(
-            (1, 3),
             "densities at overflow, product beyond float32",
             (
                 Intervals((LARGEST,), (2.0**-6,)),
@@ -114,7 +109,6 @@ def groups() -> tuple[Group, ...]:
             ),
         ),
         Group(
-            (),
             "two surfaces, shells and slabs",
             (
                 Intervals((44.5, 0.0, 2.0**14), (2.0**-6, 4.0, 2.0**-6)),
@@ -162,3 +156,64 @@ def depth_rays() -> list[Ray]:
         even("ever denser, 1e-9 to 1e5", [10.0**e for e in range(-9, 6)], 0.25, 0.125),
         even("far: fog of 1 from 200 to 300", [0.01] * 100, 200.0, 1.0),
     ]
+
+
+# Pixels of two rays each: what hits something and what does not, near and far, thin and opaque.
+PIXELS: tuple[tuple[Ray, Ray], ...] = (
+    (even("wall", [2.0**20], 1.0, 0.5), even("wall", [2.0**20], 3.0, 0.5)),
+    (even("fog", [0.125] * 8, 1.0, 0.125), Ray("nothing", [], [], [])),
+    (even("shell", [2.0**27], 3.0, 2.0**-13), even("thin fog", [0.25] * 256, 1.0, 0.015625)),
+    (even("far fog", [0.015625] * 100, 200.0, 1.0), even("far wall", [2.0**10], 250.0, 1.0)),
+    (even("thick", [64.0, 0.0, 64.0], 0.25, 0.25), even("empty", [0.0] * 3, 0.25, 0.25)),
+)
+PIXEL_SHARES = (0.04, 0.25, 0.75)
+
+
+def thick_and_thin(precision: Precision) -> list[Intervals]:
+    """Fog in as many intervals as the precision can add up, and a wall between thin fogs."""
+    counts = (1, 16) if precision.dtype == torch.bfloat16 else (1, 16, 1024, 4096)
+    walls = [Intervals((2.0**-10, 2.0**27, 1.0), (1.0,) * 3), Intervals((2.0**-30, 2.0**-30, 2.0**40), (1.0, 0.0, 1.0))]
+    return [fog(x, n) for x in (1e-12, 1e-3, 1.0, 1e6) for n in counts] + [*walls, Intervals((), ())]
+
+
+# Light of a surface far away: all of it within 1e-3 at 0.98 of the way to infinity.
+FAR_SURFACE = {
+    "starts": [0.984375 + k * 2.0**-16 for k in range(64)],
+    "ends": [0.984375 + (k + 1) * 2.0**-16 for k in range(64)],
+    "weights": [(k % 7 + 1) / 256 for k in range(64)],
+}
+
+Point = tuple[float, float, float]
+# Places on borders and corners of cells and outside the cube; times a power of two, all are exact in float32.
+BORDERS: tuple[Point, ...] = (
+    *((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.5), (-0.5, 2.0, 0.3125), (0.25, 0.5, 0.75)),
+    *((1 - 2.0**-24, 2.0**-30, 2.0**-100), (0.5, 0.5 - 2.0**-12, 0.5 + 2.0**-12), (-(2.0**-100), 2.0**100, 0.0)),
+)
+BETWEEN: tuple[Point, ...] = tuple(((k * 0.37) % 1, (k * 0.61 + 0.2) % 1, (k * 0.83 + 0.4) % 1) for k in range(64))
+# Cells per axis of the levels of hash grids.
+EXACT_GRIDS, FINE_GRIDS = (4, 16, 64, 1024), (5, 41, 700, 2048)
+ROWS, FEATURES = 512, 4
+# What the loss gains by each feature: half precision rounds the last to nothing.
+GAINS = (1.0, 2.0**-6, -(2.0**-12), 2.0**-26)
+
+
+def hash_table(levels: int) -> list[list[list[float]]]:
+    """Features of many sizes in either sign, down to 2^-14, which half precision holds as well."""
+    return [
+        [
+            [((7 * row + 3 * j) % 17 - 8) * 2.0 ** -(3 + (row + level) % 12) for j in range(FEATURES)]
+            for row in range(ROWS)
+        ]
+        for level in range(levels)
+    ]
+
+
+# Unit directions with coordinates that every precision holds, up to their length, which need not be 1.
+DIRECTIONS = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.5, -0.75, 1.0), (-1.0, 0.25, 2.0**-10))
+CONTRACTED = (
+    ("contraction at its centre and its border", (0.0, 2.0**-100, 2.0**-10, 0.5, 1.0, 1.25, 2.0)),
+    ("contraction far away, radius 1e3 to 1e37", (2.0**10, 2.0**33, 2.0**60, 2.0**66, 2.0**122)),
+)
+# Numbers of bfloat16, to beyond where exp overflows in every precision.
+LOGARITHMS = (-1000.0, -89.0, -15.0, -1.0, 2.0**-20, 1.0, 14.5, 15.0, 16.0, 89.0, 720.0, 3e38)
+GRADIENTS = tuple(10.0**e for e in (-17, -15, -12, -8, -4, 0, 4, 10))

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from itertools import pairwise
 
-from nerfcli.selftest.exact import DIGITS
-from nerfcli.selftest.rays import Ray
+from hard_cases.exact import DIGITS
+from nerfcli.selftest.cases import Ray
 
 SHARES = (0.5, 0.05, 0.95)
 # Below these, sixty digits are not enough for the closed forms: of mean and variance, and of the variance's slope.

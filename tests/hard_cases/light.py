@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nerfcli.selftest import exact, textbook
-from nerfcli.selftest.exact import Composited
+from hard_cases import exact
+from hard_cases.exact import Composited
+from nerfcli.selftest import textbook
+from nerfcli.selftest.cases import FAR_SURFACE, MEANINGLESS, Group, Intervals, groups, lit
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
-from nerfcli.selftest.rays import MEANINGLESS, Group, Intervals, groups, lit
 
 # In bfloat16 a sum of more terms than this has no digits left.
 MOST_IN_BFLOAT16 = 16
@@ -111,7 +112,6 @@ def _composite_row(group: Group, answers: list[Composited], precision: Precision
     if bounds.value > MEANINGLESS:
         return
     yield Row(
-        hard_cases=group.hard_cases,
         case=group.name,
         operation="composite",
         precision=precision.name,
@@ -183,14 +183,13 @@ def _subtraction_rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
         seconds = time.perf_counter() - start
         assert density.grad is not None
         with torch.no_grad():
-            subtracted = textbook.gradient_by_subtraction(density, lengths, rgb[:, 0], colour[0, 0])
+            subtracted = _gradient_by_subtraction(density, lengths, rgb[:, 0], colour[0, 0])
 
         def error(gradient: Tensor, tiny: float = precision.tiny) -> float:
             return largest_error(gradient, wanted.density_gradient, tiny=tiny, scale=wanted.density_gradient_size)
 
         bounds, reason = _bounds([ray], precision)
         yield Row(
-            hard_cases=(4,),
             case="gradient where hardly any light is left",
             operation="composite",
             precision=precision.name,
@@ -204,11 +203,9 @@ def _subtraction_rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
 
 
 def _distortion_row(precision: Precision) -> Row:
-    """Light of a surface far away: all of it within 1e-3 at 0.98 of the way to infinity."""
-    count = 64
-    starts = [0.984375 + k * 2.0**-16 for k in range(count)]
-    ends = [start + 2.0**-16 for start in starts]
-    values = [(k % 7 + 1) / 256 for k in range(count)]
+    """Light of a surface far away."""
+    starts, ends, values = FAR_SURFACE.values()
+    count = len(values)
     wanted, wanted_gradient = exact.distortion(values, starts, ends)
     module = precision.parts
     first, last, offsets = precision.tensor(starts), precision.tensor(ends), torch.tensor([0, count])
@@ -218,7 +215,7 @@ def _distortion_row(precision: Precision) -> Row:
     answer.sum().backward()
     seconds = time.perf_counter() - start
     plain = precision.tensor(values).requires_grad_()
-    of_textbook = textbook.distortion(plain, first, last)
+    of_textbook = textbook.distortion(plain, first, last, offsets)
     of_textbook.backward()
 
     def errors(value: Tensor, gradient: Tensor | None) -> Errors:
@@ -229,7 +226,6 @@ def _distortion_row(precision: Precision) -> Row:
 
     bound = precision.unit * (8 if precision.compiled else 3 * count)
     return Row(
-        hard_cases=(),
         case="distortion of a far, thin surface",
         operation="distortion",
         precision=precision.name,
@@ -240,3 +236,10 @@ def _distortion_row(precision: Precision) -> Row:
         textbook=None if precision.compiled else errors(of_textbook, plain.grad),
         seconds=seconds,
     )
+
+
+def _gradient_by_subtraction(density: Tensor, lengths: Tensor, values: Tensor, colour: Tensor) -> Tensor:
+    """d colour / d density of one ray: what lies behind a sample taken as the colour less the running sum."""
+    weights = textbook.weights_of_ray(density, lengths)
+    after = torch.exp(-(density * lengths).cumsum(0))
+    return lengths * (after * values - (colour - (weights * values).cumsum(0)))

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hard_cases import exact, exact_depths
+from hard_cases.exact_depths import SHARES, quantile_name
 from nerfcli.kernels import LightEnds
 from nerfcli.kernels.reference.depth import BISECTIONS
-from nerfcli.render.transmission import line_integral
-from nerfcli.selftest import exact, exact_depths, textbook
-from nerfcli.selftest.exact_depths import SHARES, quantile_name
+from nerfcli.selftest import textbook
+from nerfcli.selftest.cases import MEANINGLESS, PIXEL_SHARES, PIXELS, Intervals, Ray, depth_rays, lit, thick_and_thin
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
-from nerfcli.selftest.rays import MEANINGLESS, Intervals, Ray, depth_rays, even, fog, lit
 
 # Rays of the depths are either cut a few times or finely.
 FEW = 15
@@ -28,23 +28,20 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
     """Rows of everything about depth."""
     for precision in precisions:
         yield _before_row(precision)
-        if not precision.compiled:
-            yield _integral_row(precision)
         rays = [_rounded(ray, precision) for ray in depth_rays()]
         yield from _depth_rows([ray for ray in rays if len(ray.density) <= FEW], precision, cut="1 to 15")
         yield from _depth_rows([ray for ray in rays if len(ray.density) > FEW], precision, cut="100 or 256")
         yield _mixture_row(precision)
 
 
-# The depths, by what is hard about them: name of the group, cases, columns.
-_DEPTHS: tuple[tuple[str, tuple[int, ...], tuple[str, ...]], ...] = (
-    ("opacity and transmittance from 1e-12 to opaque", (2, 3), ("opacity", "transmittance")),
-    ("mean depth, of next to no light and of none", (5, 23), ("conditional",)),
-    ("spread of depth, of shells and fog", (23,), ("spread",)),
-    ("mean depth of the interval that stops most light", (5,), ("max-weight",)),
+# The depths, by what is hard about them: name of the group, columns.
+_DEPTHS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("opacity and transmittance from 1e-12 to opaque", ("opacity", "transmittance")),
+    ("mean depth, of next to no light and of none", ("conditional",)),
+    ("spread of depth, of shells and fog", ("spread",)),
+    ("mean depth of the interval that stops most light", ("max-weight",)),
     (
         "median and quantiles, not reached and inside intervals (no gradient where they jump over a gap)",
-        (6,),
         tuple(quantile_name(share) for share in SHARES),
     ),
 )
@@ -74,7 +71,7 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
     plain = textbook.depth(density, starts, ends, offsets=offsets)
     plain_slopes = _gradients(plain, density)
 
-    for name, cases, columns in _DEPTHS:
+    for name, columns in _DEPTHS:
 
         def nearest(
             values: dict[str, Tensor], slopes: dict[str, Tensor], columns: tuple[str, ...] = columns
@@ -85,7 +82,6 @@ def _depth_rows(rays: list[Ray], precision: Precision, *, cut: str) -> Iterator[
 
         ours = nearest(seen, slopes)
         yield Row(
-            hard_cases=cases,
             case=f"{name}; {cut} intervals",
             operation="light_ends",
             precision=precision.name,
@@ -180,34 +176,22 @@ def _rounded(ray: Ray, precision: Precision) -> Ray:
     return Ray(ray.name, *columns)
 
 
-# Pixels of two rays each: what hits something and what does not, near and far, thin and opaque.
-_PIXELS: tuple[tuple[Ray, Ray], ...] = (
-    (even("wall", [2.0**20], 1.0, 0.5), even("wall", [2.0**20], 3.0, 0.5)),
-    (even("fog", [0.125] * 8, 1.0, 0.125), Ray("nothing", [], [], [])),
-    (even("shell", [2.0**27], 3.0, 2.0**-13), even("thin fog", [0.25] * 256, 1.0, 0.015625)),
-    (even("far fog", [0.015625] * 100, 200.0, 1.0), even("far wall", [2.0**10], 250.0, 1.0)),
-    (even("thick", [64.0, 0.0, 64.0], 0.25, 0.25), even("empty", [0.0] * 3, 0.25, 0.25)),
-)
-_PIXEL_SHARES = (0.04, 0.25, 0.75)
-
-
 def _mixture_row(precision: Precision) -> Row:
     """Quantiles of the light of two rays together; no share lies where the light of one has ended and none begins."""
-    rays = [_rounded(ray, precision) for pixel in _PIXELS for ray in pixel]
+    rays = [_rounded(ray, precision) for pixel in PIXELS for ray in pixel]
     density, starts, ends, offsets = _packed(rays, precision)
     module = precision.parts
     got, means, wanted = [], [], []
     start = time.perf_counter()
-    for share in _PIXEL_SHARES:
+    for share in PIXEL_SHARES:
         pixels = {"offsets": offsets, "rays_per_pixel": 2, "share": share}
         got.append(module.mixture_quantile(density, starts, ends, **pixels))
     seconds = time.perf_counter() - start
-    for share in _PIXEL_SHARES:
+    for share in PIXEL_SHARES:
         alone = module.light_ends(density, starts, ends, offsets=offsets, shares=(share,)).quantiles
         means.append(alone.view(-1, 2).mean(1))
         wanted += [exact.mixture_quantile(rays[i : i + 2], share) for i in range(0, len(rays), 2)]
     return Row(
-        hard_cases=(6,),
         case="quantiles of several rays of a pixel, of which some hit nothing",
         operation="mixture_quantile",
         precision=precision.name,
@@ -227,13 +211,6 @@ def _farthest(rays: list[Ray], wanted: list[float]) -> float:
     return max(ends[i % len(ends)] / place for i, place in enumerate(wanted) if not math.isnan(place))
 
 
-def _thick_and_thin(precision: Precision) -> list[Intervals]:
-    """Fog in as many intervals as the precision can add up, and a wall between thin fogs."""
-    counts = (1, 16) if precision.dtype == torch.bfloat16 else (1, 16, 1024, 4096)
-    walls = [Intervals((2.0**-10, 2.0**27, 1.0), (1.0,) * 3), Intervals((2.0**-30, 2.0**-30, 2.0**40), (1.0, 0.0, 1.0))]
-    return [fog(x, n) for x in (1e-12, 1e-3, 1.0, 1e6) for n in counts] + [*walls, Intervals((), ())]
-
-
 def _flat(rays: list[Intervals], precision: Precision) -> tuple[Tensor, Tensor, Tensor]:
     """Density, lengths and offsets."""
     density = precision.tensor([x for ray in rays for x in ray.density])
@@ -250,7 +227,7 @@ def _by_density(answers: Tensor, density: Tensor, upstream: list[float]) -> Tens
 
 
 def _before_row(precision: Precision) -> Row:
-    rays = _thick_and_thin(precision)
+    rays = thick_and_thin(precision)
     wanted = [x for ray in rays for x in exact.optical_depths(ray)[:-1]]
     upstream = [(k % 3 + 1) / 4 for ray in rays for k in range(len(ray.density))]
     density, lengths, offsets = _flat(rays, precision)
@@ -275,7 +252,6 @@ def _before_row(precision: Precision) -> Row:
 
     bound = precision.unit * (2 if precision.compiled else max(len(ray.density) for ray in rays) + 1)
     return Row(
-        hard_cases=(3, 4),
         case="optical depth in front of an interval that is 1e11 times as thick, 1 to 4096",
         operation="optical_depth_before",
         precision=precision.name,
@@ -285,36 +261,5 @@ def _before_row(precision: Precision) -> Row:
         no_gradient=VALUE_ONLY if precision.compiled else "",
         formula="cumulative sum less the own part",
         textbook=None if precision.compiled else errors(plain, _by_density(plain, density, upstream)),
-        seconds=seconds,
-    )
-
-
-def _integral_row(precision: Precision) -> Row:
-    """What a transmission picture measures; the same code runs with and without the compiled kernels."""
-    rays = _thick_and_thin(precision)
-    wanted = [exact.optical_depths(ray)[-1] for ray in rays]
-    attenuation, lengths, offsets = _flat(rays, precision)
-    attenuation.requires_grad_()
-    start = time.perf_counter()
-    got = line_integral(attenuation, lengths, offsets)
-    slope = _by_density(got, attenuation, [1.0] * len(rays))
-    seconds = time.perf_counter() - start
-    plain = textbook.line_integral(attenuation, lengths, offsets=offsets)
-
-    def errors(values: Tensor, slope: Tensor | None) -> Errors:
-        slopes = [length for ray in rays for length in ray.lengths]
-        tiny = precision.tiny
-        return Errors(largest_error(values, wanted, tiny=tiny), largest_error(slope, slopes, tiny=tiny))
-
-    return Row(
-        hard_cases=(2, 3),
-        case="line integral of what lets all or nothing pass, 0 to 4096 intervals",
-        operation="line_integral",
-        precision=precision.name,
-        errors=errors(got, slope),
-        bounds=Errors(precision.unit * (max(len(ray.density) for ray in rays) + 1), precision.unit),
-        reason="(n + 1) u: sums of n terms that are all positive; the gradient is the length",
-        formula="-log of the product of what each interval lets pass",
-        textbook=errors(plain, _by_density(plain, attenuation, [1.0] * len(rays))),
         seconds=seconds,
     )

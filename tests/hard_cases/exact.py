@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from itertools import accumulate
 
-from nerfcli.selftest.rays import Intervals, Ray
+from nerfcli.selftest.cases import Intervals, Ray
 
 DIGITS = 60
 

@@ -13,22 +13,23 @@ from torch import Tensor
 
 from nerfcli import kernels
 from nerfcli.kernels import PixelTable, reference
+from nerfcli.selftest.cases import (
+    BETWEEN,
+    BORDERS,
+    EXACT_GRIDS,
+    FEATURES,
+    FINE_GRIDS,
+    GAINS,
+    ROWS,
+    Point,
+    hash_table,
+)
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
-ROWS, FEATURES = 512, 4
-Point = tuple[float, float, float]
-
-# Places on borders and corners of cells and outside the cube; times a power of two, all are exact in float32.
-_BORDERS: tuple[Point, ...] = (
-    *((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.5), (-0.5, 2.0, 0.3125), (0.25, 0.5, 0.75)),
-    *((1 - 2.0**-24, 2.0**-30, 2.0**-100), (0.5, 0.5 - 2.0**-12, 0.5 + 2.0**-12), (-(2.0**-100), 2.0**100, 0.0)),
-)
-_BETWEEN: tuple[Point, ...] = tuple(((k * 0.37) % 1, (k * 0.61 + 0.2) % 1, (k * 0.83 + 0.4) % 1) for k in range(64))
 # Samples in one cell of the grid, 256 of each: sums of gradients are far larger than any of their terms.
-_CROWD: tuple[Point, ...] = tuple((0.5 + 2.0**-9 * (k % 8), 0.25, 0.125 * (1 + k // 8)) for k in range(16))
+CROWD: tuple[Point, ...] = tuple((0.5 + 2.0**-9 * (k % 8), 0.25, 0.125 * (1 + k // 8)) for k in range(16))
 CROWD_SIZE = 256
-# What the loss gains by each feature: half precision rounds the last to nothing.
-_GAINS = (1.0, 2.0**-6, -(2.0**-12), 2.0**-26)
+HALF_GRIDS = (4, 16)
 
 
 def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
@@ -38,8 +39,8 @@ def rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
             yield _half_row(torch.bfloat16, precision.device)
             yield _half_row(torch.float16, precision.device)
             continue
-        yield _encode_row("hash grid on borders and corners of cells, and outside", _BORDERS, precision, grids=EXACT)
-        yield _encode_row("hash grid of up to 2048 cells, between vertices", _BETWEEN, precision, grids=FINE)
+        yield _encode_row("hash grid on borders and corners of cells, and outside", BORDERS, precision, grids=EXACT)
+        yield _encode_row("hash grid of up to 2048 cells, between vertices", BETWEEN, precision, grids=FINE)
         yield _pixel_row(precision)
 
 
@@ -51,7 +52,7 @@ class _Grids:
     rounded: int
 
 
-EXACT, FINE = _Grids((4, 16, 64, 1024), 0), _Grids((5, 41, 700, 2048), 1)
+EXACT, FINE = _Grids(EXACT_GRIDS, 0), _Grids(FINE_GRIDS, 1)
 
 
 @dataclass(frozen=True)
@@ -64,20 +65,9 @@ class _Encoded:
     gradient_size: list[list[list[float]]]
 
 
-def _table(levels: int) -> list[list[list[float]]]:
-    """Features of many sizes in either sign, down to 2^-14, which half precision holds as well."""
-    return [
-        [
-            [((7 * row + 3 * j) % 17 - 8) * 2.0 ** -(3 + (row + level) % 12) for j in range(FEATURES)]
-            for row in range(ROWS)
-        ]
-        for level in range(levels)
-    ]
-
-
 def _exact(points: tuple[Point, ...], grids: _Grids, *, times: int) -> _Encoded:
     """Trilinear interpolation in fractions, and the gradient if every point comes a number of times."""
-    table = _table(len(grids.resolutions))
+    table = hash_table(len(grids.resolutions))
     largest = [max(abs(value) for row in level for value in row) for level in table]
     sums = [[[Fraction(0)] * 2 for _ in range(ROWS)] for _ in table]
     features: list[list[float]] = []
@@ -96,7 +86,7 @@ def _exact(points: tuple[Point, ...], grids: _Grids, *, times: int) -> _Encoded:
                 sums[level][row][0] += times * weight
                 sums[level][row][1] += times * (weight + blur)
     gradient, gradient_size = (
-        [[[float(row[k]) * (gain if k == 0 else abs(gain)) for gain in _GAINS] for row in level] for level in sums]
+        [[[float(row[k]) * (gain if k == 0 else abs(gain)) for gain in GAINS] for row in level] for level in sums]
         for k in (0, 1)
     )
     return _Encoded(features, sizes, gradient, gradient_size)
@@ -128,7 +118,7 @@ def _in_half(
     """Features and gradient, all in half precision."""
     given = table.detach().to(half).requires_grad_()
     encoded = reference.hash_encode(points.to(half), given, resolutions)
-    (encoded.view(len(points), -1, FEATURES) * torch.tensor(_GAINS, dtype=half, device=points.device)).sum().backward()
+    (encoded.view(len(points), -1, FEATURES) * torch.tensor(GAINS, dtype=half, device=points.device)).sum().backward()
     assert given.grad is not None
     return encoded, given.grad
 
@@ -137,17 +127,16 @@ def _encode_row(case: str, points: tuple[Point, ...], precision: Precision, *, g
     points = tuple(tuple(torch.tensor(point).tolist()) for point in points)  # the numbers that float32 holds
     wanted = _exact(points, grids, times=1)
     module = precision.parts
-    places, table = precision.tensor(points), precision.tensor(_table(len(grids.resolutions))).requires_grad_()
+    places, table = precision.tensor(points), precision.tensor(hash_table(len(grids.resolutions))).requires_grad_()
     start = time.perf_counter()
     encoded = module.hash_encode(places, table, grids.resolutions)
-    (encoded.view(len(points), -1, FEATURES) * precision.tensor(_GAINS)).sum().backward()
+    (encoded.view(len(points), -1, FEATURES) * precision.tensor(GAINS)).sum().backward()
     seconds = time.perf_counter() - start
     bound = (16 + len(points)) * precision.unit
     half = None
     if not precision.compiled:
         half = _errors(*_in_half(places, table, grids.resolutions, half=torch.float16), wanted, tiny=precision.tiny)
     return Row(
-        hard_cases=(),
         case=case,
         operation="hash_encode",
         precision=precision.name,
@@ -164,19 +153,18 @@ def _encode_row(case: str, points: tuple[Point, ...], precision: Precision, *, g
 def _half_row(half: torch.dtype, device: str) -> Row:
     """A table of half precision that learns through a float32 sink, as training does."""
     single = Precision("float32", torch.float32, device)
-    grids = _Grids((4, 16), 0)
-    wanted = _exact(_CROWD, grids, times=CROWD_SIZE)
-    points = single.tensor(_CROWD).repeat(CROWD_SIZE, 1)
-    table = single.tensor(_table(2)).to(half).requires_grad_()
+    grids = _Grids(HALF_GRIDS, 0)
+    wanted = _exact(CROWD, grids, times=CROWD_SIZE)
+    points = single.tensor(CROWD).repeat(CROWD_SIZE, 1)
+    table = single.tensor(hash_table(2)).to(half).requires_grad_()
     sink = torch.zeros_like(table, dtype=torch.float32)
     start = time.perf_counter()
     backend = kernels.backend_for(table.device, half)
     encoded = backend.hash_encode(points, table, grids.resolutions, sink=sink)
-    (encoded.view(len(points), -1, FEATURES) * single.tensor(_GAINS)).sum().backward()
+    (encoded.view(len(points), -1, FEATURES) * single.tensor(GAINS)).sum().backward()
     seconds = time.perf_counter() - start
     plain = _in_half(points, table, grids.resolutions, half=half)
     return Row(
-        hard_cases=(9,),
         case=f"table in half precision, {len(points)} gradients of 1 to 1e-8 in a cell",
         operation="hash_encode",
         precision=str(half).removeprefix("torch."),
@@ -235,7 +223,6 @@ def _pixel_row(precision: Precision) -> Row:
     if not precision.compiled:
         plain = Errors(error(module.pixel_rays(chosen.float().long().to(precision.device), pixels)))
     return Row(
-        hard_cases=(),
         case="pixels beyond number 2^24, first, last and only ones of their photos",
         operation="pixel_rays",
         precision=precision.name,

@@ -1,0 +1,216 @@
+"""The table of hard cases: operation, inputs, bounds and the textbook's formula of each.
+
+The answers are those of the definitions in float64, on the very numbers that the tested precision holds. The tests hold
+the definitions themselves against answers in 60 digits.
+"""
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from types import ModuleType
+
+import torch
+
+from nerfcli import kernels
+from nerfcli.kernels import reference
+from nerfcli.kernels.reference.depth import BISECTIONS
+from nerfcli.selftest import cases, operations, textbook
+from nerfcli.selftest.measure import Errors, Precision, Row
+
+SINGLE, HALF, COMPILED = "float32", "bfloat16", "compiled"
+VALUE_ONLY = "value only: where a gradient is wanted, plain torch gives both"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One hard case of one operation.
+
+    Args:
+        case: what is hard.
+        operation: its name.
+        inputs: the numbers in a precision, rounded to it.
+        run: the operation of a module on them.
+        bound: of values and gradients in a precision.
+        reason: where the bounds come from.
+        precisions: that it is tried in.
+        formula: what textbooks do; "" where there is none.
+        textbook: the operation by that formula.
+        no_gradient: why the compiled operation has none.
+    """
+
+    case: str
+    operation: str
+    inputs: Callable[[Precision], operations.Inputs]
+    run: Callable[[ModuleType, operations.Inputs], operations.Answer]
+    bound: Callable[[Precision], Errors]
+    reason: str
+    precisions: tuple[str, ...] = (SINGLE, HALF, COMPILED)
+    formula: str = ""
+    textbook: Callable[[operations.Inputs], operations.Answer] | None = None
+    no_gradient: str = ""
+
+
+def row_of(check: Check, precision: Precision) -> Row:
+    """Measure one operation on one hard case in one precision."""
+    inputs = check.inputs(precision)
+    wanted = check.run(reference, {name: operations.exact(given) for name, given in inputs.items()})
+    start = time.perf_counter()
+    got = check.run(precision.parts, inputs)
+    seconds = time.perf_counter() - start
+    plain = None
+    if check.textbook is not None and not precision.compiled:
+        plain = operations.errors(check.textbook(inputs), wanted, tiny=precision.tiny)
+    return Row(
+        case=check.case,
+        operation=check.operation,
+        precision=precision.name,
+        errors=operations.errors(got, wanted, tiny=precision.tiny),
+        bounds=check.bound(precision),
+        reason=check.reason,
+        formula=check.formula,
+        textbook=plain,
+        seconds=seconds,
+        no_gradient=check.no_gradient if precision.compiled else "",
+    )
+
+
+def checks() -> Iterator[Check]:
+    """Every hard case."""
+    for group in cases.groups():
+        yield Check(
+            group.name,
+            "composite",
+            functools.partial(operations.light_inputs, group.rays),
+            operations.composite,
+            lambda precision, rays=group.rays: operations.light_bound(rays, precision),
+            "u (8 + (n + 2) (1 + tau)), n and tau as far as light comes, compiled 8 u; twice for a gradient, relative "
+            "to its terms",
+            formula="1 - exp, cumulative product, 1 - sum of weights",
+            textbook=functools.partial(operations.composite, textbook),
+        )
+    yield Check(
+        "optical depth in front of an interval that is 1e11 times as thick, 1 to 4096",
+        "optical_depth_before",
+        lambda precision: operations.intervals(cases.thick_and_thin(precision), precision),
+        operations.before,
+        lambda precision: operations.both(
+            2 if precision.compiled else 17 if precision.name == HALF else 4097, precision
+        ),
+        "(n + 1) u: sums of n terms that are all positive, 16 in bfloat16; compiled 2 u: sums in float64",
+        formula="cumulative sum less the own part",
+        textbook=functools.partial(operations.before, textbook),
+        no_gradient=VALUE_ONLY,
+    )
+    yield Check(
+        "distortion of a far, thin surface",
+        "distortion",
+        operations.surface_inputs,
+        operations.distortion,
+        lambda precision: operations.both(8 if precision.compiled else 192, precision),
+        "3 n u: sums of n terms that are all positive; compiled 8 u: sums in float64",
+        (SINGLE, COMPILED),
+        formula="difference of running sums",
+        textbook=functools.partial(operations.distortion, textbook),
+    )
+    for cut, thick in (("thin", False), ("thick", True)):
+        rays = [ray for ray in cases.depth_rays() if (operations.optical_depth(ray) > 1) is thick]
+        for name, columns in (
+            ("opacity and transmittance", ("opacity", "transmittance")),
+            ("mean depth, of next to no light and of none", ("conditional",)),
+            ("spread of depth, of shells and fog", ("spread",)),
+            ("mean depth of the interval that stops most light", ("max-weight",)),
+            ("median and quantiles, not reached and inside intervals", ("median", "0.05", "0.95")),
+        ):
+            yield Check(
+                f"{name}; {cut} rays",
+                "light_ends",
+                lambda precision, rays=rays: operations.depth_inputs(operations.meaningful(rays, precision), precision),
+                functools.partial(operations.light_ends, columns),
+                functools.partial(operations.depths_bound, rays, 4 if columns == ("spread",) else 1),
+                "u (16 + (n + 2) (1 + tau)), compiled 16 u; of a spread 4 times that; 16 times for a gradient, "
+                "relative to the largest of its ray",
+                formula="weights by 1 - exp at midpoints, their sum clamped at 1e-10",
+                textbook=functools.partial(operations.depth_by_textbook, columns),
+                no_gradient=VALUE_ONLY,
+            )
+    yield Check(
+        "quantiles of several rays of a pixel, of which some hit nothing",
+        "mixture_quantile",
+        functools.partial(operations.depth_inputs, [ray for pixel in cases.PIXELS for ray in pixel]),
+        operations.mixture,
+        lambda precision: Errors(4 * precision.unit + 2.0 ** (9 - BISECTIONS)),
+        "4 u, and the last bracket of the bisection over the smallest answer",
+        formula="mean of the rays' quantiles",
+        textbook=operations.mixture_by_mean,
+    )
+    for name, points, grids, rounded in (
+        ("hash grid on borders and corners of cells, and outside", cases.BORDERS, cases.EXACT_GRIDS, 0),
+        ("hash grid of up to 2048 cells, between vertices", cases.BETWEEN, cases.FINE_GRIDS, 1),
+    ):
+        yield Check(
+            name,
+            "hash_encode",
+            functools.partial(operations.grid_inputs, points, len(grids)),
+            functools.partial(operations.encode, grids, rounded),
+            lambda precision, n=len(points): Errors(16 * precision.unit, (16 + n) * precision.unit),
+            "16 u, of a gradient 16 + n, relative to the largest of the level; where places are rounded as they are "
+            "counted in cells, times the resolution",
+            (SINGLE, COMPILED),
+            formula="places, table and sums in float16",
+            textbook=functools.partial(operations.encode_in_half, grids),
+        )
+    yield Check(
+        "pixels beyond number 2^24, first, last and only ones of their photos",
+        "pixel_rays",
+        operations.pixel_inputs,
+        operations.pixel_rays,
+        lambda precision: Errors(4 * precision.unit),
+        "4 u: a sum of three products, relative to its terms",
+        (SINGLE, COMPILED),
+        formula="numbers of pixels in float32",
+        textbook=lambda given: operations.pixel_rays(reference, {**given, "chosen": given["chosen"].float().long()}),
+    )
+    yield Check(
+        "density of a logarithm from -1000 to 3e38",
+        "density_from_log",
+        lambda precision: {"logarithms": precision.tensor(cases.LOGARITHMS)},
+        operations.density,
+        lambda precision: operations.both(8, precision),
+        "8 u: exp within 15; constant beyond, with a gradient that does not vanish",
+        formula="exp",
+        textbook=lambda given: operations.gradients_of(torch.exp, given["logarithms"]),
+    )
+    yield Check(
+        "Adam's first step, gradients 1e-17 to 1e10",
+        "adam_rows",
+        lambda precision: {"gradients": precision.tensor([[g, -g, g / 2, g] for g in cases.GRADIENTS])},
+        operations.adam,
+        lambda precision: Errors(16 / (1 - operations.BETAS[1]) * precision.unit),
+        "16 u / (1 - beta2): 1 - beta2 of a rounded beta2; eps = 1e-15 counts, as the state is float32",
+        (SINGLE, COMPILED),
+        formula="state in float16",
+        textbook=operations.adam_in_half,
+    )
+    for name, radii in cases.CONTRACTED:
+        yield Check(
+            name,
+            "contract",
+            functools.partial(operations.contract_inputs, radii),
+            lambda module, given: operations.gradients_of(kernels.contract, given["points"]),
+            lambda precision: Errors(8 * precision.unit, 64 * precision.unit),
+            "8 roundings u; of the gradient 64, relative to the largest of its point",
+            (SINGLE, HALF),
+            formula="where(|x| <= 1, x, (2 - 1 / |x|) x / |x|)",
+            textbook=lambda given: operations.gradients_of(textbook.contract, given["points"]),
+        )
+    for name, full in (("rays along axes, and in the plane of a side", True), ("empty occupancy", False)):
+        yield Check(
+            name,
+            "visible_samples",
+            functools.partial(operations.march_inputs, full),
+            operations.chords,
+            lambda precision: Errors(0.0),
+            "exact: steps of 2^-7 are kept or not by their middles; nothing is divided by a direction",
+            (SINGLE, COMPILED),
+        )
