@@ -1,7 +1,8 @@
 """nerfcli: from a folder of photos to a radiance field, its renders, depth maps and videos.
 
-What the commands do, for Python programs: `estimate_poses`, `train_scene`, `evaluate_run`, `render_run`; and
-`load_scene`, `load_run` for what these write. They are imported when they are first used: `import nerfcli` is quick.
+What the commands do, for Python programs: `estimate_poses`, `train_scene`, `evaluate_run`, `render_run`, `export_run`;
+and `load_scene`, `load_run` for what these write. They are imported when they are first used, so that `import nerfcli`
+is quick.
 """
 
 # Before any module of this package can import pycolmap: its wheel exports zlib's functions, and where Python's zlib is
@@ -9,13 +10,14 @@ What the commands do, for Python programs: `estimate_poses`, `train_scene`, `eva
 import zlib  # noqa: F401
 
 __version__ = "0.1.0"
-__all__ = ["estimate_poses", "evaluate_run", "load_run", "load_scene", "render_run", "train_scene"]
+__all__ = ["estimate_poses", "evaluate_run", "export_run", "load_run", "load_scene", "render_run", "train_scene"]
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from nerfcli.runs.run import load_run
     from nerfcli.scene import load as load_scene
     from nerfcli.workflows.evaluate import evaluate_run
+    from nerfcli.workflows.export import export_run
     from nerfcli.workflows.poses import estimate_poses
     from nerfcli.workflows.render import render_run
     from nerfcli.workflows.train import train_scene
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "estimate_poses": "nerfcli.workflows.poses",
     "evaluate_run": "nerfcli.workflows.evaluate",
+    "export_run": "nerfcli.workflows.export",
     "load_run": "nerfcli.runs.run",
     "load_scene": "nerfcli.scene",
     "render_run": "nerfcli.workflows.render",

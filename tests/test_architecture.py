@@ -75,16 +75,18 @@ MAY_IMPORT = {
     "report": {"runs", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},
     "workflows": {
         *("ablate", "report", "export", "evaluate", "train", "runs", "photos", "doctor", "poses"),
+        *("surface", "viewer"),
         *("poses.model", "poses.input", "convert", "render", "field", "scene", "cameras", "media"),
         "pages",
     },
-    "viewer": {"render", "field", "scene", "cameras", "media"},
+    "viewer": {"photos", "render", "field", "kernels", "cameras", "media", "pages"},
+    "surface": {"photos", "render", "kernels", "cameras", "media"},
 }
 # Libraries that are heavy, or whose ways must not spread, and the parts that may use them.
 CONFINED = {
     "torch": {
         *("kernels", "field", "render", "runs", "train", "search", "fit", "evaluate", "export"),
-        *("selftest", "bench", "workflows", "cli", "photos"),
+        *("selftest", "bench", "workflows", "cli", "photos", "surface", "viewer"),
     },
     "safetensors": {"field"},
     "numba": {"kernels"},

@@ -5,7 +5,21 @@ import os
 import typer
 
 from nerfcli import __version__
-from nerfcli.cli import ablate, bench, convert, doctor, evaluate, info, poses, render, report, run, selftest, train
+from nerfcli.cli import (
+    ablate,
+    bench,
+    convert,
+    doctor,
+    evaluate,
+    export,
+    info,
+    poses,
+    render,
+    report,
+    run,
+    selftest,
+    train,
+)
 from nerfcli.interrupts import hear_signals
 
 app = typer.Typer(
@@ -14,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for _module in (doctor, poses, train, evaluate, render, report, run, info, convert, selftest, bench, ablate):
+for _module in (doctor, poses, train, evaluate, render, export, report, run, info, convert, selftest, bench, ablate):
     _name = _module.__name__.rsplit(".", 1)[-1]
     app.command(_name)(getattr(_module, _name))
 

@@ -1,0 +1,134 @@
+"""Depths of a field as the cameras of its photos see them: what surfaces and points are made from."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.photos.undistorted import pinhole_of
+from nerfcli.render.depth import DepthRequest
+from nerfcli.render.model import Model
+from nerfcli.render.pictures import render_picture
+
+# Neighbours whose depths differ by more than this share of them are not on one surface: there is no normal.
+_STEP = 0.1
+# The depth of half of all light: it does not move with what little of it ends before or behind a surface.
+DEPTH = DepthRequest("median", "z")
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """What a pinhole camera sees of a field: (H, W) float32, scene units along the optical axis, NaN where undefined.
+
+    Args:
+        frame: the camera and its pose.
+        rgb: (H, W, 3) sRGB on the background.
+        opacity: of each pixel, in [0, 1].
+        depth: the median, where at least half of the light ends.
+        spread, disagreement: as `Picture` has them.
+        normals: (H, W, 3) unit, towards the camera, in its axes; NaN where the depths around are no surface.
+    """
+
+    frame: Frame
+    rgb: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    spread: np.ndarray
+    disagreement: np.ndarray
+    normals: np.ndarray
+
+    def points(self) -> np.ndarray:
+        """(H, W, 3) in the scene's frame; NaN where there is no depth."""
+        pose = self.frame.world_from_cam
+        return (plane_rays(self.frame.camera) * self.depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+
+    def cosines(self) -> np.ndarray:
+        """(H, W) between the surface's normal and the way to the camera; 0 where there is no normal."""
+        rays = plane_rays(self.frame.camera)
+        return np.nan_to_num(-(self.normals * rays).sum(-1) / np.linalg.norm(rays, axis=-1)).clip(0.0, 1.0)
+
+
+def depth_views(
+    model: Model,
+    frames: Sequence[Frame],
+    *,
+    max_size: int,
+    depth: DepthRequest = DEPTH,
+    on_share: Callable[[float], None] = lambda share: None,
+) -> list[DepthView]:
+    """Render what the pinhole cameras of frames see.
+
+    Args:
+        model: the trained model.
+        frames: as the photos have them.
+        max_size: longer side of the pictures at most, pixels.
+        depth: which depth, along the optical axis.
+        on_share: called with how much is done.
+    """
+    views = []
+    for frame in frames:
+        small = replace(frame, camera=small_pinhole(frame.camera, max_size))
+        seen = render_picture(model, small, background=model.background, depth=depth)
+        assert seen.depth is not None
+        assert seen.spread is not None
+        assert seen.disagreement is not None
+        normals = normals_of(seen.depth, small.camera)
+        views.append(DepthView(small, seen.rgb, seen.opacity, seen.depth, seen.spread, seen.disagreement, normals))
+        on_share(len(views) / len(frames))
+    return views
+
+
+def small_pinhole(camera: Camera, max_size: int) -> Camera:
+    """The pinhole camera of a lens, with a longer side of `max_size` pixels at most."""
+    factor = max(1.0, max(camera.width, camera.height) / max_size)
+    pinhole = pinhole_of(camera)
+    return pinhole.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
+
+
+def spread_frames(frames: Sequence[Frame], count: int) -> list[Frame]:
+    """At most `count` frames, evenly spread in their order."""
+    if len(frames) <= count:
+        return list(frames)
+    return [frames[index] for index in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
+
+
+def plane_rays(camera: Camera) -> np.ndarray:
+    """(H, W, 3) directions of a pinhole camera's pixel centres with z = 1, in its axes."""
+    fx, fy, cx, cy = camera.params
+    x, y = (np.arange(camera.width) + 0.5 - cx) / fx, (np.arange(camera.height) + 0.5 - cy) / fy
+    return np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=-1)
+
+
+def normals_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """Unit normals (H, W, 3) of a depth map along the optical axis, towards the camera, in its axes.
+
+    Cross product of the differences between the neighbours on both sides; of that to one neighbour where the other is
+    missing or on another surface. NaN where both are, and where there is no depth.
+    """
+    points = plane_rays(camera) * depth[..., None]
+    across, down = _slope(points, depth, axis=1), _slope(points, depth, axis=0)
+    normals = np.cross(down, across)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = np.divide(normals, length, out=np.full_like(normals, np.nan), where=length > 0)
+    # z grows away from the camera: what faces it has a normal against the ray.
+    away = (normals * points).sum(-1) > 0
+    return np.where(away[..., None], -normals, normals).astype(np.float32)
+
+
+def _slope(points: np.ndarray, depth: np.ndarray, *, axis: int) -> np.ndarray:
+    """Change of the points per pixel along an axis, NaN where neither neighbour is on the same surface."""
+    missing = np.full_like(np.take(points, [0], axis), np.nan)
+    steps = np.diff(points, axis=axis)
+    jump = np.abs(np.diff(depth, axis=axis)) > _STEP * np.minimum(*_sides(depth, axis))
+    steps[jump] = np.nan
+    after, before = np.concatenate([steps, missing], axis), np.concatenate([missing, steps], axis)
+    both = (after + before) / 2
+    return np.where(np.isnan(both), np.where(np.isnan(after), before, after), both)
+
+
+def _sides(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """The values without the last and without the first along an axis."""
+    count = values.shape[axis]
+    return np.take(values, range(count - 1), axis), np.take(values, range(1, count), axis)

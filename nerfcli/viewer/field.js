@@ -1,0 +1,103 @@
+// The page's data: decoded, checked, and put where the shader finds them.
+"use strict";
+
+const MAPS = ["colour", "opacity", "conditional", "median", "max-weight", "moment", "background", "quantile", "spread",
+  "disagreement"];
+const ROWS = "RGBA16I";
+
+/** The bytes of a base64 element. Throws where it is missing or damaged. */
+function bytesOf(id, expected) {
+  const element = document.getElementById(id);
+  if (!element) throw new Error(`this file is incomplete: it lacks "${id}"`);
+  let text;
+  try {
+    text = atob(element.textContent.trim());
+  } catch {
+    throw new Error(`this file is damaged: "${id}" is not base64`);
+  }
+  if (expected !== undefined && text.length !== expected) {
+    throw new Error(`this file is damaged: "${id}" has ${text.length} bytes, expected ${expected}`);
+  }
+  const bytes = new Uint8Array(text.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = text.charCodeAt(i);
+  return bytes;
+}
+
+/** All that the page was made with. */
+function readScene() {
+  const element = document.getElementById("scene");
+  if (!element) throw new Error('this file is incomplete: it lacks "scene"');
+  let scene;
+  try {
+    scene = JSON.parse(element.textContent);
+  } catch {
+    throw new Error('this file is damaged: "scene" is not JSON');
+  }
+  if (scene.format !== "nerfcli page 1") throw new Error(`this file has the format ${scene.format}`);
+  const { field, march } = scene;
+  scene.table = new Int16Array(bytesOf("table", 8 * field.rows).buffer);
+  scene.networks = new Float32Array(bytesOf("networks", 64 * field.networks).buffer);
+  scene.cuts = new Float32Array(bytesOf("cuts", 4 * (march.intervals + 1)).buffer);
+  scene.cells = cellsOf(bytesOf("occupied", Math.ceil(march.side ** 3 / 8)), march.side);
+  scene.sky = field.sky ? new Int16Array(bytesOf("sky", 6 * field.sky.side ** 3).buffer) : null;
+  scene.colours = bytesOf("colours", 768);
+  scene.expected = new Float32Array(bytesOf("expected").buffer);
+  return scene;
+}
+
+/** One byte per cell of packed bits, the lowest bit first. */
+function cellsOf(bits, side) {
+  const cells = new Uint8Array(side ** 3);
+  for (let i = 0; i < cells.length; i++) cells[i] = (bits[i >> 3] >> (i & 7)) & 1;
+  return cells;
+}
+
+/** One byte per block of 4^3 cells: whether it or a neighbour holds something. */
+function blocksOf(cells, side) {
+  const count = Math.ceil(side / 4), own = new Uint8Array(count ** 3), near = new Uint8Array(count ** 3);
+  for (let i = 0; i < cells.length; i++) {
+    if (!cells[i]) continue;
+    const x = i % side, y = Math.floor(i / side) % side, z = Math.floor(i / side / side);
+    own[((z >> 2) * count + (y >> 2)) * count + (x >> 2)] = 1;
+  }
+  for (let z = 0; z < count; z++) for (let y = 0; y < count; y++) for (let x = 0; x < count; x++) {
+    if (!own[(z * count + y) * count + x]) continue;
+    for (let c = Math.max(z - 1, 0); c <= Math.min(z + 1, count - 1); c++)
+      for (let b = Math.max(y - 1, 0); b <= Math.min(y + 1, count - 1); b++)
+        for (let a = Math.max(x - 1, 0); a <= Math.min(x + 1, count - 1); a++) near[(c * count + b) * count + a] = 1;
+  }
+  return { count, near };
+}
+
+/** A number as GLSL writes floats, with all digits of a float32. */
+function glslFloat(value) {
+  const text = Math.fround(value).toPrecision(9);
+  return /[.e]/.test(text) ? text : `${text}.0`;
+}
+
+/** The fragment shader for a field of this size. */
+function shaderSource(scene, body, tableBits) {
+  const { field, march } = scene, hidden = field.width / 4, levels = field.resolutions.length;
+  const start = { W1: 0, W2: hidden * levels };
+  start.C1 = start.W2 + 4 * hidden;
+  start.C2 = start.C1 + 8 * hidden;
+  start.C3 = start.C2 + hidden * hidden;
+  const defines = {
+    LEVELS: levels, HIDDEN: Math.max(1, hidden), NETWORKS: Math.max(1, field.networks), ...start,
+    HASH: field.kind === "hash" ? 1 : 0, HARMONICS: field.harmonics, ANTIALIAS: field.antialias ? 1 : 0,
+    CONTRACTION: field.contraction, SIDE: march.side, INTERVALS: march.intervals,
+    REACH: glslFloat((4 / march.side) * (field.contraction === 0 ? 4 : 7.8)),
+    LARGEST_DENSE: field.largestDense, ROW_MASK: `${field.rowMask}u`,
+    TABLE_BITS: tableBits, TABLE_WIDTH: 2 ** tableBits,
+    SKY_SIDE: field.sky ? field.sky.side : 0, SKY_SCALE: glslFloat(field.sky ? field.sky.scale : 1),
+    RESOLUTIONS: field.resolutions.join(","), FIRST_ROWS: field.firstRows.join(","),
+    SCALES: field.scales.map(glslFloat).join(","),
+  };
+  return glslHead("isampler2D", "usampler3D", "isampler3D")
+    + Object.entries(defines).map(([name, value]) => `#define ${name} ${value}`).join("\n") + "\n" + body;
+}
+
+function glslHead(...samplers) {
+  return "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\n"
+    + samplers.map(name => `precision highp ${name};\n`).join("");
+}

@@ -1,0 +1,125 @@
+"""The numbers of a field as the page holds them: rows as 16-bit levels, weights as blocks of 4 x 4, cells as bits.
+
+A level is the largest number of its grid divided by 32,767; vertices that a grid does not have are left out.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.errors import UserError
+from nerfcli.field.background import SphereBackground
+from nerfcli.field.hash_field import GEOMETRY, HARMONICS, HashField
+from nerfcli.field.voxel_field import VoxelField
+from nerfcli.kernels import CONTRACTIONS
+from nerfcli.render.model import Model
+from nerfcli.render.tracing import uniform_cuts
+
+# Numbers in a texel of the table, and neurons in a block of the networks.
+FOUR = 4
+LEVELS = 32767
+# What every device that draws WebGL2 has room for in a block of uniforms: 16 KiB of 64 bytes each.
+MOST_BLOCKS = 256
+
+
+@dataclass(frozen=True)
+class Packed:
+    """A field ready for the page.
+
+    Args:
+        field, march: what the shader is made from, plain values.
+        arrays: by the name of its element, in the byte order of browsers (little endian).
+    """
+
+    field: dict[str, Any]
+    march: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+def pack_model(model: Model) -> Packed:
+    """Return the field of a model with all that rendering needs.
+
+    Raises:
+        UserError: a kind or a size of field that the page cannot draw.
+    """
+    resolutions, table, networks, more = _numbers(model)
+    rows = table.shape[1]
+    kept = [min(rows, (side + 1) ** 3) if side else 0 for side in resolutions]
+    levels = [quantised(table[index, :count].numpy()) for index, count in enumerate(kept)]
+    cuts = uniform_cuts(model.marching).to(torch.float32).numpy()
+    behind = model.background
+    sky = quantised(behind.logits.detach().cpu().numpy()) if isinstance(behind, SphereBackground) else None
+    occupied = model.occupied.cpu().numpy()
+    field = {
+        **more,
+        "contraction": CONTRACTIONS.index(model.contraction),
+        "resolutions": list(resolutions),
+        "firstRows": np.cumsum([0, *kept[:-1]]).tolist(),
+        "scales": [scale for _, scale in levels],
+        "rows": sum(kept),
+        "rowMask": rows - 1,
+        "largestDense": max((side for side in resolutions if (side + 1) ** 3 <= rows), default=0),
+        "networks": len(networks),
+        "background": [0.0, 0.0, 0.0] if isinstance(behind, SphereBackground) else list(behind),
+        "sky": None if sky is None else {"side": sky[0].shape[-1], "scale": sky[1]},
+    }
+    march = {"intervals": len(cuts) - 1, "side": len(occupied), "far": model.marching.far}
+    arrays = {
+        "table": np.concatenate([values for values, _ in levels]),
+        "networks": networks.astype("<f4"),
+        "cuts": cuts.astype("<f4"),
+        "occupied": np.packbits(occupied.ravel(), bitorder="little"),
+        **({} if sky is None else {"sky": sky[0]}),
+    }
+    return Packed(field, march, arrays)
+
+
+def quantised(values: np.ndarray) -> tuple[np.ndarray, float]:
+    """16-bit levels of numbers, and what a level is worth; off by half a level at most."""
+    scale = float(np.abs(values).max(initial=0.0)) / LEVELS or 1.0
+    return np.rint(values / scale).astype("<i2"), scale
+
+
+def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[str, Any]]:
+    """Cells per axis of each grid, their rows, the blocks of the networks, and what the shader is told of the kind."""
+    field = model.field
+    if isinstance(field, HashField):
+        settings = field.settings
+        _refuse_sizes(settings.features, settings.width)
+        layers = [layer.detach().cpu().numpy().astype(np.float32) for layer in field.weights]
+        # Harmonics above the degree have no part in colours.
+        layers[2] = layers[2].copy()
+        layers[2][:, GEOMETRY + (settings.view_degree + 1) ** 2 :] = 0.0
+        layers[4] = np.pad(layers[4], ((0, FOUR - len(layers[4])), (0, 0)))
+        networks = np.concatenate([blocks_of(layer) for layer in layers])
+        if len(networks) > MOST_BLOCKS:
+            raise _too_large(f"its networks have {64 * len(networks)} bytes, expected {64 * MOST_BLOCKS} at most")
+        more = {"kind": "hash", "width": settings.width, "antialias": settings.antialias, "harmonics": HARMONICS}
+        return settings.resolutions, field.table.detach().cpu(), networks, more
+    if isinstance(field, VoxelField):
+        sizes = field.settings
+        more = {"kind": "voxels", "width": 0, "antialias": False, "harmonics": sizes.harmonics}
+        networks = np.zeros((0, FOUR, FOUR), np.float32)
+        return (sizes.resolution,) * sizes.layers, field.table.detach().cpu(), networks, more
+    raise UserError(
+        f"the page cannot draw a field of the kind {field.settings.kind}: its network is too large for a shader",
+        "train with --field hash or --field voxels, or render pictures and videos: nerfcli render RUN",
+    )
+
+
+def blocks_of(layer: np.ndarray) -> np.ndarray:
+    """(blocks, 4, 4) of a layer (outputs, inputs): four inputs of four outputs each, as columns; outputs go slowest."""
+    outputs, inputs = (size // FOUR for size in layer.shape)
+    return layer.reshape(outputs, FOUR, inputs, FOUR).transpose(0, 2, 3, 1).reshape(-1, FOUR, FOUR)
+
+
+def _refuse_sizes(features: int, width: int) -> None:
+    if features != FOUR or width % FOUR:
+        raise _too_large(f"it has {features} features a row and {width} neurons, expected {FOUR} and a multiple of it")
+
+
+def _too_large(what: str) -> UserError:
+    return UserError(f"the page cannot draw this field: {what}", "train one of the usual size: nerfcli train SCENE")

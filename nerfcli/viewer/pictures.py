@@ -1,0 +1,122 @@
+"""The photos of a run for its page: cameras of all, pictures of as many and as large as there is room for."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import centres_of
+from nerfcli.pages.pictures import data_uri, jpeg_bytes
+from nerfcli.photos.held_out_exposure import log_gains_of
+from nerfcli.photos.loading import load_photo
+from nerfcli.photos.undistorted import pinhole_of, undistorted
+from nerfcli.render.model import Model
+
+# Longer sides that are tried, in pixels, and the quality of the JPEG.
+LONGEST_PX = (800, 640, 480, 360, 280, 200, 140)
+QUALITY = 80
+# More cameras than these have no pictures; they are drawn all the same.
+MOST_PICTURES = 200
+# Photos whose size decides on that of all.
+_SAMPLE = 4
+_WHITE = 255.0
+
+
+@dataclass(frozen=True)
+class PagePhotos:
+    """What the page holds of photos.
+
+    Args:
+        entries: of each frame, plain values for the page.
+        longest_px: of the pictures; 0 where there are none.
+        missing: how many photos are not where the run looks for them.
+    """
+
+    entries: list[dict[str, Any]]
+    longest_px: int
+    missing: int
+
+
+def page_photos(
+    model: Model,
+    train: Sequence[Frame],
+    test: Sequence[Frame],
+    *,
+    room_bytes: int,
+    on_share: Callable[[float], None] = lambda share: None,
+) -> PagePhotos:
+    """Return the photos of a run, as pinhole cameras took them, in the order of their names.
+
+    Args:
+        model: whose exposures of photos are given.
+        train, test: the frames.
+        room_bytes: for the pictures in all, as text of the page.
+        on_share: called with how much is done.
+    """
+    frames = sorted([*((frame, "train") for frame in train), *((frame, "test") for frame in test)], key=_name)
+    gains = log_gains_of([frame for frame, _ in frames], model)
+    there = [index for index, (frame, _) in enumerate(frames) if frame.image is not None and frame.image.exists()]
+    shown = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST_PICTURES)).astype(int))]
+    longest = _longest(frames, shown, room_bytes)
+    pictures = {}
+    if longest:
+        for count, index in enumerate(shown):
+            pictures[index] = data_uri(_jpeg(frames[index][0], longest), "jpeg")
+            on_share((count + 1) / len(shown))
+    entries = [
+        {**_entry(frame), "split": split, "log_gains": gains[index].tolist(), "picture": pictures.get(index)}
+        for index, (frame, split) in enumerate(frames)
+    ]
+    return PagePhotos(entries, longest, len(frames) - len(there))
+
+
+def frustum_depth(frames: Sequence[Frame], size: float) -> float:
+    """Return how deep frusta are drawn: half the distance between typical neighbours, a tenth of the scene at most."""
+    centres = centres_of(frames)
+    gap = float(np.median(KDTree(centres).query(centres, k=2)[0][:, 1])) if len(frames) > 1 else size
+    return min(0.5 * gap, 0.1 * size) or 0.1 * size
+
+
+def view_of(frame: Frame) -> dict[str, Any]:
+    """Return place, turn and lens of a pinhole frame as the page has them."""
+    return {
+        "place": frame.centre.tolist(),
+        "turn": frame.world_from_cam[:3, :3].tolist(),
+        "lens": list(frame.camera.params),
+        "width": frame.camera.width,
+        "height": frame.camera.height,
+    }
+
+
+def _entry(frame: Frame) -> dict[str, Any]:
+    return {"name": frame.name, **view_of(replace(frame, camera=pinhole_of(frame.camera)))}
+
+
+def _name(entry: tuple[Frame, str]) -> str:
+    return entry[0].name
+
+
+def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_bytes: int) -> int:
+    """The largest size at which all pictures fit, judged by a few; 0 where none does."""
+    if not shown:
+        return 0
+    sample = shown[:: max(1, len(shown) // _SAMPLE)][:_SAMPLE]
+    for longest in LONGEST_PX:
+        mean = np.mean([4 * len(_jpeg(frames[index][0], longest)) / 3 for index in sample])
+        if 1.1 * mean * len(shown) <= room_bytes:
+            return longest
+    return 0
+
+
+def _jpeg(frame: Frame, longest_px: int) -> bytes:
+    factor = max(1.0, max(frame.camera.width, frame.camera.height) / longest_px)
+    photo = load_photo(frame, factor, "ignore")
+    small = photo.frame.camera
+    pixels, _ = undistorted(photo.pixels, small, pinhole_of(small))
+    if pixels.shape[-1] == 4:
+        alpha = pixels[..., 3:] / _WHITE
+        pixels = np.rint(pixels[..., :3] * alpha + _WHITE * (1 - alpha)).astype(np.uint8)
+    return jpeg_bytes(pixels, quality=QUALITY)

@@ -1,0 +1,141 @@
+"""From a run to files that other programs open: a page, a mesh, points, a volume, COLMAP's dense folder."""
+
+from pathlib import Path
+
+import torch
+
+from nerfcli.atomic import cannot_write
+from nerfcli.errors import UserError
+from nerfcli.pages.page import write_page
+from nerfcli.photos.undistorted import pinhole_frame
+from nerfcli.render.model import Model
+from nerfcli.runs.run import Run
+from nerfcli.surface.extent import scene_box
+from nerfcli.surface.grid import check_box
+from nerfcli.surface.settings import SurfaceSettings
+from nerfcli.viewer.packing import pack_model
+from nerfcli.viewer.page import page_html
+from nerfcli.viewer.pictures import page_photos
+from nerfcli.viewer.proof import make_proof
+from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+
+# What a page may take in all; what the field leaves of it is for photos.
+PAGE_BYTES = 9_700_000
+# By what is exported: the suffixes of its file, the usual one first; "" is a folder.
+TARGETS = {"page": (".html",)}
+SURFACE = SurfaceSettings()
+
+
+def export_run(
+    run: str | Path,
+    target: str | Path | None = None,
+    *,
+    to: str,
+    settings: SurfaceSettings = SURFACE,
+    device: str = "auto",
+    threads: int = 0,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> Path:
+    """Export a run to a file, or a folder, that other programs open.
+
+    Example:
+        >>> import nerfcli
+        >>> nerfcli.export_run("photos-scene-run", to="page")
+
+    Args:
+        run: the folder that `train_scene` wrote.
+        target: the file to write, whose suffix chooses among the formats of `to`; beside the run by default.
+        to: one of `TARGETS`.
+        settings: where and how fine a geometry is.
+        device: "auto", "cpu" or "cuda".
+        threads: of the CPU; 0 for all.
+        overwrite: replace what stands at `target`.
+        notify: takes lines for the user.
+        progress: takes the share of the work that is done, and a few words.
+
+    Returns:
+        The path that was written.
+
+    Raises:
+        UserError: no such run, something stands at `target`, or the field has nothing of the kind.
+    """
+    trained, torch_device = Run(Path(run)), device_name(device)
+    path = Path(target) if target is not None else default_target(trained.path, to)
+    suffix = suffix_of(path, to)
+    if settings.box is not None:
+        check_box(settings.box)
+    _ = trained.config
+    refuse_existing(path, overwrite=overwrite, folder=not suffix)
+    torch.set_num_threads(thread_count(threads))
+    model = trained.model(torch_device)
+    progress(0.0, "")
+    match to:
+        case "page":
+            _export_page(trained, model, path, settings=settings, notify=notify, progress=progress)
+    return path
+
+
+def default_target(run: Path, to: str, suffix: str | None = None) -> Path:
+    """Return where an export goes if nobody says: beside the run, named after it."""
+    place = run.resolve()
+    name = place.name if to == "page" else f"{place.name}-{to}"
+    return (run if run.name not in ("", "..") else place).with_name(name + (suffix or TARGETS[to][0]))
+
+
+def suffix_of(path: Path, to: str) -> str:
+    """Return the suffix of a target, "" for a folder.
+
+    Raises:
+        UserError: it is none of the formats of `to`.
+    """
+    suffixes = TARGETS[to]
+    if "" in suffixes:
+        return ""
+    if path.suffix.lower() not in suffixes:
+        raise UserError(f"{path} has no suffix of a {to}", f"give it one of these: {', '.join(suffixes)}", exit_code=2)
+    return path.suffix.lower()
+
+
+def refuse_existing(path: Path, *, overwrite: bool, folder: bool) -> None:
+    """Refuse a place that is taken.
+
+    Raises:
+        UserError: something stands there that is not to be replaced.
+    """
+    if path.is_dir() and not folder:
+        raise UserError(f"{path} is a folder", "give the file's name with -o")
+    if path.exists() and not overwrite:
+        raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another place with -o")
+    if not path.resolve().parent.is_dir():
+        try:
+            path.resolve().parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise cannot_write(path, error) from error
+
+
+def _export_page(
+    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
+) -> None:
+    """Write the page."""
+    packed = pack_model(model)
+    cameras = run.cameras
+    frames = [pinhole_frame(frame) for frame in (*cameras.train, *cameras.test)]
+    box = settings.box or scene_box(model, frames)
+    proof = make_proof(model, frames)
+    progress(0.2, "photos")
+    text_bytes = sum(4 * array.nbytes // 3 for array in (*packed.arrays.values(), proof.expected))
+    photos = page_photos(
+        model,
+        cameras.train,
+        cameras.test,
+        room_bytes=PAGE_BYTES - text_bytes - 150_000,
+        on_share=lambda share: progress(0.2 + 0.8 * share, "photos"),
+    )
+    if photos.missing:
+        notify(f"{photos.missing} photos are not where the run looks for them: the page has their cameras alone")
+    if text_bytes > PAGE_BYTES:
+        notify(f"the field alone takes {text_bytes / 1e6:.0f} MB of text: the page is large, and has no photos")
+    write_page(page_html(model, packed, run=run.path, frames=frames, photos=photos, proof=proof, box=box), path)

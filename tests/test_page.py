@@ -1,0 +1,373 @@
+"""The page that renders a field by itself: its numbers by NumPy, and all of it in a browser where there is one."""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import Browser, find_browser
+from fog import SIDE
+from page_arithmetic import PageField, array, element
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.camera_path import read_path
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
+from nerfcli.errors import UserError
+from nerfcli.field.background import SphereBackground
+from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
+from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.field.interface import Field
+from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.render.depth import DepthRequest
+from nerfcli.render.model import Marching, Model
+from nerfcli.render.pictures import render_picture
+from nerfcli.viewer.packing import pack_model, quantised
+from nerfcli.viewer.page import page_html
+from nerfcli.viewer.pictures import PagePhotos
+from nerfcli.viewer.proof import HEIGHT, WIDTH, make_proof
+from nerfcli.workflows.export import export_run
+
+# What 16-bit rows, single precision and the colours that neither side asks for change of a colour in [0, 1].
+COLOUR_BOUND = 2e-3
+# The share of pixels within the bound of depths: at edges a median jumps from one surface to another.
+AGREEING = 0.98
+SIMILARITY = Similarity(0.7, rotation_from_vector(np.array([0.2, -0.4, 0.9])), np.array([0.1, -0.2, 0.3]))
+
+
+def at(place: tuple[float, float, float]) -> Frame:
+    """A small camera of the scene that looks at what is the middle of the training frame."""
+    world = SIMILARITY.inverse()
+    pose = look_at(world.apply(np.array(place)), world.apply(np.zeros(3)), np.array([0.1, 0.2, 1.0]))
+    return Frame("a.png", Camera("PINHOLE", 16, 12, (11.0, 12.0, 8.5, 5.75)), pose)
+
+
+def rough(field: Field, *, sky: bool = False) -> Model:
+    """A model of random numbers: dense and thin places everywhere, in some cells only."""
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator) * (0.5 if parameter.dim() > 2 else 0.6))
+    background: SphereBackground | tuple[float, float, float] = (0.2, 0.4, 0.6)
+    if sky:
+        background = SphereBackground(8)
+        background.logits.data = torch.randn(background.logits.shape, generator=generator)
+    occupied = torch.rand(SIDE, SIDE, SIDE, generator=generator) < 0.4
+    return Model(field, occupied, Marching(0.05, 40.0, 0.05, 0.05), background, SIMILARITY, "metre")
+
+
+def page_of(model: Model, frames: list[Frame]) -> str:
+    photos = PagePhotos([], 0, 0)
+    proof = make_proof(model, frames)
+    box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
+    return page_html(model, pack_model(model), run=Path("a-run"), frames=frames, photos=photos, proof=proof, box=box)
+
+
+def hash_settings(contraction: str, *, antialias: bool = False, view_degree: int = 3) -> HashFieldSettings:
+    return HashFieldSettings(
+        contraction=contraction,
+        levels=3,
+        log2_rows=10,
+        coarsest=4,
+        finest=40,
+        width=16,
+        antialias=antialias,
+        view_degree=view_degree,
+    )
+
+
+@pytest.mark.parametrize(
+    ("field", "sky"),
+    [
+        (HashField(hash_settings("none")), False),
+        (HashField(hash_settings("l2")), True),
+        (HashField(hash_settings("linf", antialias=True, view_degree=1)), False),
+        (VoxelField(VoxelFieldSettings(contraction="l2", view_degree=2, log2_vertices=11)), True),
+    ],
+    ids=["none", "l2 with a sky", "linf, antialiased, degree 1", "voxels"],
+)
+def test_the_numbers_in_the_page_render_what_the_kernels_render(field, sky):
+    """An independent implementation of the shader, on the page's own text."""
+    model, frame = rough(field, sky=sky), at((1.6, -0.4, 0.8))
+    page = page_of(model, [frame])
+    pages_view = json.loads(element(page, "scene"))["home"]
+    traced = PageField(page).trace(pages_view)
+    request = DepthRequest("median", "ray", min_opacity=0.0)
+    picture = render_picture(model, frame, background=model.background, depth=request)
+    assert picture.depth is not None
+    assert picture.spread is not None
+    assert picture.rgb.std() > 0.02
+    np.testing.assert_allclose(traced.rgb.reshape(picture.rgb.shape), picture.rgb, atol=COLOUR_BOUND)
+    np.testing.assert_allclose(traced.opacity.reshape(picture.opacity.shape), picture.opacity, atol=COLOUR_BOUND)
+    for ours, kernels in ((traced.median, picture.depth), (traced.spread, picture.spread)):
+        mine = ours.reshape(kernels.shape) / SIMILARITY.scale
+        alike = np.isclose(mine, kernels, rtol=2e-3, atol=2e-3, equal_nan=True)
+        assert alike.mean() > AGREEING
+
+
+def test_levels_are_off_by_half_a_level_and_zero_stays_zero():
+    values = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    levels, scale = quantised(values)
+    assert np.abs(levels * scale - values).max() <= scale / 2 * (1 + 1e-6)
+    assert np.abs(levels).max() == 32767
+    assert not quantised(np.zeros(3))[0].any()
+
+
+def test_rows_that_no_vertex_has_are_left_out():
+    settings = hash_settings("none")
+    packed = pack_model(rough(HashField(settings)))
+    sides = [side + 1 for side in settings.resolutions]
+    assert packed.field["rows"] == sum(min(side**3, 2**10) for side in sides)
+    assert len(packed.arrays["table"]) == packed.field["rows"]
+
+
+def test_the_proof_holds_the_pictures_of_nerfcli_render():
+    model, frame = rough(HashField(hash_settings("l2"))), at((1.6, -0.4, 0.8))
+    page = page_of(model, [frame, at((0.2, 1.5, 0.1))])
+    described = json.loads(element(page, "scene"))["proof"]
+    expected = array(page, "expected", "<f4")
+    count = WIDTH * HEIGHT
+    assert len(expected) == 2 * count * (3 + len(described["maps"]))
+    lens = described["cameras"][0]["lens"]
+    small = replace(frame, camera=Camera("PINHOLE", WIDTH, HEIGHT, tuple(lens)))
+    picture = render_picture(model, small, background=model.background, depth=DepthRequest("median", "z"))
+    np.testing.assert_array_equal(expected[: 3 * count].reshape(HEIGHT, WIDTH, 3), picture.rgb)
+    first = 3 + described["maps"].index("median")
+    np.testing.assert_array_equal(expected[first * count : (first + 1) * count].reshape(HEIGHT, WIDTH), picture.depth)
+
+
+def test_a_network_without_a_table_is_refused_with_a_way_out():
+    field = FourierField(FourierFieldSettings(contraction="l2", width=16, octaves=4))
+    with pytest.raises(UserError, match="cannot draw a field of the kind") as caught:
+        pack_model(rough(field))
+    assert "nerfcli render" in caught.value.hint
+
+
+def test_networks_beyond_a_block_of_uniforms_are_refused():
+    with pytest.raises(UserError, match="its networks have"):
+        pack_model(rough(HashField(replace(hash_settings("l2"), width=64, levels=16))))
+
+
+def test_names_of_a_capture_stay_text():
+    model = rough(HashField(hash_settings("none")))
+    evil = "</script><script>alert(1)</script>"
+    page = page_html(
+        model,
+        pack_model(model),
+        run=Path("a-run"),
+        frames=[at((1, 1, 1))],
+        photos=PagePhotos([{"name": evil, "split": "train"}], 0, 0),
+        proof=make_proof(model, [at((1, 1, 1))]),
+        box=(0, 0, 0, 1, 1, 1),
+    )
+    assert evil not in page
+    assert json.loads(element(page, "scene"))["photos"][0]["name"] == evil
+
+
+def test_the_page_loads_nothing(spheres_page):
+    text = spheres_page.read_text(encoding="utf-8")
+    assert "default-src 'none'" in text
+    assert not re.search(r"""(src|href)\s*=\s*["']?https?:""", text)
+    assert len(text) < 10_000_000
+
+
+def test_what_stands_there_is_not_replaced_unasked(spheres_run, tmp_path):
+    target = tmp_path / "a.html"
+    target.write_text("mine")
+    with pytest.raises(UserError, match="exists") as caught:
+        export_run(spheres_run, target, to="page")
+    assert caught.value.exit_code == 3
+    assert target.read_text() == "mine"
+    with pytest.raises(UserError, match="no suffix of a page"):
+        export_run(spheres_run, tmp_path / "a.ply", to="page")
+
+
+# In a browser
+
+
+@pytest.fixture(scope="module")
+def spheres_page(spheres_run, tmp_path_factory) -> Path:
+    return export_run(spheres_run, tmp_path_factory.mktemp("page") / "spheres.html", to="page", threads=2)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory) -> Iterator[Browser]:
+    if find_browser() is None:
+        pytest.skip("there is no Chromium on this machine to open the page with")
+    with Browser(tmp_path_factory.mktemp("profile"), width=420, height=200) as opened:
+        yield opened
+
+
+def rested(browser: Browser) -> int:
+    return int(browser.run("Number(document.body.dataset.rested || 0)"))
+
+
+@pytest.fixture
+def opened(browser, spheres_page) -> Browser:
+    """The page of the spheres, drawn."""
+    browser.errors.clear()
+    browser.open(spheres_page)
+    assert browser.run("document.getElementById('trouble').textContent") == ""
+    browser.wait("document.body.dataset.rested > 0")
+    assert not browser.errors
+    return browser
+
+
+def test_the_browser_draws_what_nerfcli_renders(opened):
+    found = json.loads(
+        opened.run("(() => { nerfcliPage.check(); return document.getElementById('checked').dataset.found; })()")
+    )
+    assert found["colour"]["largest"] <= COLOUR_BOUND
+    assert found["opacity"]["largest"] <= COLOUR_BOUND
+    assert found["colour"]["rms"] <= 2e-4
+    for name, differences in found.items():
+        assert differences["numbers"] > 1000, name
+        assert differences["percentile_99"] <= 2e-3, name
+        assert differences["undefined_here"] + differences["undefined_there"] <= 3, name
+
+
+def test_keys_move_turn_and_choose_what_is_shown(opened):
+    place = opened.run("nerfcliPage.walk.place")
+    ahead = opened.run("nerfcliPage.walk.ahead()")
+    opened.run("document.getElementById('field').focus()")
+    opened.key("w", seconds=0.3)
+    moved = np.array(opened.run("nerfcliPage.walk.place")) - place
+    assert moved @ ahead > 0.9 * np.linalg.norm(moved) > 0
+    opened.key("ArrowRight", seconds=0.2)
+    assert np.dot(opened.run("nerfcliPage.walk.ahead()"), ahead) < 1 - 1e-4
+    opened.key("3")
+    assert opened.run("document.getElementById('map').value") == "conditional"
+    opened.wait("nerfcliPage.done")
+    assert "in units of the scene" in opened.run("document.getElementById('meaning').textContent")
+    low, high = (float(opened.run(f"document.getElementById('{name}').value")) for name in ("low", "high"))
+    assert 0 < low < high < 20
+
+
+def test_the_address_holds_the_view(opened, spheres_page):
+    opened.key("4")
+    opened.drag((60, 60), (80, 70))
+    opened.wait("nerfcliPage.done")
+    fragment = opened.run("location.hash")
+    place, turn = opened.run("nerfcliPage.walk.place"), opened.run("nerfcliPage.walk.turn")
+    opened.open(spheres_page, fragment)
+    np.testing.assert_allclose(opened.run("nerfcliPage.walk.place"), place, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(opened.run("nerfcliPage.walk.turn"), turn, atol=1e-5)
+    assert opened.run("document.getElementById('map').value") == "median"
+
+
+def test_a_photo_is_stood_at_wiped_over_and_subtracted(opened):
+    opened.key("]")
+    opened.wait("nerfcliPage.done")
+    photo = opened.run("nerfcliPage.scene.photos[0]")
+    assert opened.run("nerfcliPage.walk.place") == photo["place"]
+    assert not opened.run("document.getElementById('wipe').hidden")
+    box = opened.run("document.getElementById('photo').getBoundingClientRect().toJSON()")
+    assert box["width"] / box["height"] == pytest.approx(photo["width"] / photo["height"], rel=1e-3)
+    middle = (box["left"] + box["width"] / 2, box["top"] + box["height"] / 2)
+    opened.drag(middle, (middle[0] - box["width"] / 4, middle[1]))
+    assert opened.run("document.getElementById('wipe').getAttribute('aria-valuenow')") == "25"
+    assert "0px 75." in opened.run("document.getElementById('photo').style.clipPath")
+    opened.run(
+        "(() => { const c = document.getElementById('compare'); c.value = 'error';"
+        " c.dispatchEvent(new Event('change')); })()"
+    )
+    opened.wait("/ dB at/.test(document.getElementById('status').textContent)")
+    decibels = float(re.findall(r"([\d.]+) dB", opened.run("document.getElementById('status').textContent"))[0])
+    assert decibels > 15  # the training of the fixture is short; a picture beside its place has some 8
+    opened.key("w", seconds=0.1)
+    assert opened.run("document.getElementById('photo-name').textContent") == "none"
+
+
+def test_measuring_gives_the_distance_between_depths(opened):
+    opened.key("m")
+    width, height = opened.run("(s => [s.clientWidth, s.clientHeight])(document.getElementById('stage'))")
+    points = []
+    for x in (0.5 * width, 0.5 * width + 3):
+        opened.click(x, 0.5 * height)
+        points = opened.run("state.points.map(p => p.middle)")
+    assert len(points) == 2, opened.run("document.getElementById('distance').textContent")
+    words = opened.run("document.getElementById('distance').textContent")
+    apart, low, high = (float(number) for number in re.findall(r"[\d.]+(?:e-?\d+)?", words)[:3])
+    assert apart == pytest.approx(np.linalg.norm(np.subtract(*points)), rel=1e-3)
+    assert low <= apart <= high
+    opened.key("m")
+
+
+def test_the_crop_box_gives_the_command_and_crops_the_view(opened):
+    opened.key("b")
+    command = opened.run("document.getElementById('command').textContent")
+    assert re.fullmatch(r"nerfcli export spheres-run --to mesh --box=(-?[\d.e-]+,){5}-?[\d.e-]+", command)
+    before = opened.run("nerfcliPage.probe.colour.filter((_, i) => i % 4 === 3).reduce((a, b) => a + b)")
+    opened.run(
+        "(() => { const i = document.getElementById('numbers').children[3], b = state.box; i.value = b[0] + 1e-3;"
+        " i.dispatchEvent(new Event('change')); document.getElementById('clip').click(); })()"
+    )
+    opened.wait("nerfcliPage.done")
+    after = opened.run("nerfcliPage.probe.colour.filter((_, i) => i % 4 === 3).reduce((a, b) => a + b)")
+    assert after < 0.2 * before
+    opened.run("document.getElementById('clip').click()")
+
+
+def test_the_path_is_a_camera_path_that_render_reads(opened, tmp_path):
+    opened.key("p")
+    first = opened.run("[nerfcliPage.walk.place, nerfcliPage.walk.turn, nerfcliPage.walk.fov]")
+    opened.key("]")
+    opened.key("p")
+    text = opened.run("JSON.stringify(cameraPath(state.keyframes, {seconds: 1, fps: 10, width: 64, height: 48}))")
+    (tmp_path / "camera_path.json").write_text(text)
+    path = read_path(tmp_path / "camera_path.json")
+    assert path.fps == 10
+    assert len(path.frames) == 11
+    np.testing.assert_allclose(path.frames[0].world_from_cam[:3, 3], first[0], atol=1e-9)
+    np.testing.assert_allclose(path.frames[0].world_from_cam[:3, :3], first[1], atol=1e-6)
+    assert path.frames[0].camera.focal_px == pytest.approx(24 / np.tan(first[2] / 2))
+    again = opened.run(f"keyframesOf({json.dumps(text)}).map(k => k.place)")
+    np.testing.assert_allclose(again, opened.run("state.keyframes.map(k => k.place)"), atol=1e-9)
+    opened.key(" ")
+    assert opened.run("state.playing")
+    opened.key(" ")
+
+
+def test_a_lost_context_is_told_and_comes_back(opened):
+    count = rested(opened)
+    opened.run(
+        "globalThis.lose = nerfcliPage.renderer.gl.getExtension('WEBGL_lose_context'); globalThis.lose.loseContext()"
+    )
+    opened.wait("!document.getElementById('trouble').hidden")
+    assert "graphics device" in opened.run("document.getElementById('trouble').textContent")
+    opened.run("globalThis.lose.restoreContext()")
+    opened.wait("document.getElementById('trouble').hidden")
+    opened.wait(f"document.body.dataset.rested > {count}")
+    alpha = opened.run("nerfcliPage.probe.colour.filter((_, i) => i % 4 === 3).reduce((a, b) => Math.max(a, b))")
+    assert alpha > 0.5
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (lambda text: re.sub(r'(id="table">.{100})....', r"\1", text), "bytes, expected"),
+        (lambda text: re.sub(r'(id="table">.{100})....', r"\1!!!!", text), "not base64"),
+        (lambda text: text.replace('id="cuts"', 'id="cut"'), 'lacks "cuts"'),
+        (lambda text: re.sub(r'(id="scene">)', r"\1{", text), "not JSON"),
+    ],
+    ids=["short", "letters", "missing", "json"],
+)
+def test_a_damaged_page_says_so(damage, told, browser, spheres_page, tmp_path):
+    page = tmp_path / "damaged.html"
+    page.write_text(damage(spheres_page.read_text(encoding="utf-8")), encoding="utf-8")
+    browser.open(page)
+    assert browser.run("document.body.dataset.state") == "trouble"
+    assert told in browser.run("document.getElementById('trouble').textContent")
+
+
+def test_a_browser_without_webgl2_is_told(spheres_page, tmp_path):
+    if find_browser() is None:
+        pytest.skip("there is no Chromium on this machine to open the page with")
+    with Browser(tmp_path, flags=("--disable-3d-apis",)) as browser:
+        browser.open(spheres_page)
+        assert browser.run("document.body.dataset.state") == "trouble"
+        assert "no WebGL2" in browser.run("document.getElementById('trouble').textContent")
