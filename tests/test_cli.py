@@ -36,7 +36,8 @@ from nerfcli.workflows import poses as poses_workflow
 COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench")
 WITHOUT_INPUT = ("selftest",)
 USAGE = 2
-README = Path(__file__).parent.parent / "README.md"
+PROJECT = Path(__file__).parent.parent
+GUIDES = (PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md")))
 # Enough for a command that trains to do everything that it does.
 QUICK = ("--steps", "1", "--downscale", "8", "--threads", "2")
 
@@ -94,18 +95,35 @@ def test_version():
     assert nerfcli("--version").stdout.split() == ["nerfcli", "0.1.0"]
 
 
-def readme_lines() -> list[str]:
-    """The command lines of the README's fenced blocks, continued lines joined."""
-    blocks = re.findall(r"^```[a-z]*\n(.*?)^```", README.read_text(encoding="utf-8"), re.M | re.S)
+def command_lines(guide: Path) -> list[str]:
+    """The command lines of a guide's fenced blocks, continued lines joined."""
+    blocks = re.findall(r"^```[a-z]*\n(.*?)^```", guide.read_text(encoding="utf-8"), re.M | re.S)
     lines = "".join(blocks).replace("\\\n", " ").splitlines()
     return [line.strip().removeprefix("$ ") for line in lines if re.search(r"(^|\|)\s*(\$ )?nerfcli ", line)]
 
 
-def test_every_command_line_of_the_readme_parses():
-    lines = readme_lines()
-    assert {line.split("nerfcli ")[1].split()[0] for line in lines} >= {"poses", "train", "evaluate", "render", "run"}
-    for line in lines:
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.name)
+def test_every_command_line_of_a_guide_parses(guide):
+    for line in command_lines(guide):
         check_that_it_parses(line)
+
+
+def test_the_readme_is_short_and_has_an_example_of_every_command():
+    lines = command_lines(GUIDES[0])
+    assert {line.split("nerfcli ")[1].split()[0] for line in lines} >= {*COMMANDS, *WITHOUT_INPUT, "report", "ablate"}
+    assert len(GUIDES[0].read_text(encoding="utf-8").splitlines()) <= 150
+
+
+@pytest.mark.parametrize("guide", (*GUIDES, PROJECT / "CONTRIBUTING.md"), ids=lambda guide: guide.name)
+def test_links_of_a_guide_lead_to_files_and_headings_that_exist(guide):
+    for link in re.findall(r"\]\(([^)]+)\)", guide.read_text(encoding="utf-8")):
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = guide.parent / path if path else guide
+        assert target.exists(), link
+        headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.M) if anchor else []
+        assert not anchor or anchor in [re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in headings], link
 
 
 def test_a_line_that_does_not_parse_is_noticed():

@@ -133,7 +133,11 @@ def test_the_package_has_nothing_else():
         _ = nerfcli.train_scenes  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_the_example_of_the_readme_runs(capture, tmp_path, monkeypatch, capsys):
+def python_blocks(guide: Path) -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", guide.read_text("utf-8"), re.M | re.S)
+
+
+def test_the_examples_of_the_readme_and_the_guides_run(capture, tmp_path, monkeypatch, capsys):
     """As it stands, but for the budget. Structure from motion has its own tests: here it finds the known poses."""
 
     def known_poses(folder: Path, scene: Path, **settings: Any) -> SimpleNamespace:
@@ -142,12 +146,21 @@ def test_the_example_of_the_readme_runs(capture, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(structure_from_motion, "estimate_poses", known_poses)
     monkeypatch.chdir(tmp_path)
-    (code,) = re.findall(r"^```python\n(.*?)^```", (PROJECT / "README.md").read_text("utf-8"), re.M | re.S)
+    (code,) = python_blocks(PROJECT / "README.md")
     quick = code.replace("budget_seconds=120", "budget_seconds=None, steps=2, downscale=8")
     assert quick != code
     exec(compile(quick, "README.md", "exec"), {})
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "photos-scene: 5 of 5 photos registered in 1 s, mean reprojection error 0.50 px"
-    assert re.fullmatch(r"2 steps, \d+\.\d\d dB on photos that training never saw", said[1])
+    assert re.fullmatch(r"2 steps, \d+\.\d\d dB on held-out photos", said[1])
     assert "photos-scene-run/renders/test-conditional-z/depth" in said[2]
     assert (tmp_path / "photos-scene-run" / "renders" / "test-conditional-z" / "depth").is_dir()
+
+    # The guides go on with these folders.
+    for guide, names in (("python-api.md", 4), ("depth.md", 1)):
+        blocks = python_blocks(PROJECT / "docs" / guide)
+        assert len(blocks) == names
+        exec(compile("\n".join(blocks), guide, "exec"), {})
+    said = capsys.readouterr().out
+    assert "no-such-run" in said
+    assert "conditional z arbitrary" in said
