@@ -114,7 +114,7 @@ def test_the_readme_is_short_and_has_an_example_of_every_command():
     assert len(GUIDES[0].read_text(encoding="utf-8").splitlines()) <= 150
 
 
-@pytest.mark.parametrize("guide", (*GUIDES, PROJECT / "CONTRIBUTING.md"), ids=lambda guide: guide.name)
+@pytest.mark.parametrize("guide", [*GUIDES, PROJECT / "CONTRIBUTING.md"], ids=lambda guide: guide.name)
 def test_links_of_a_guide_lead_to_files_and_headings_that_exist(guide):
     for link in re.findall(r"\]\(([^)]+)\)", guide.read_text(encoding="utf-8")):
         if link.startswith("https://"):
@@ -123,7 +123,9 @@ def test_links_of_a_guide_lead_to_files_and_headings_that_exist(guide):
         target = guide.parent / path if path else guide
         assert target.exists(), link
         headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.M) if anchor else []
-        assert not anchor or anchor in [re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in headings], link
+        assert not anchor or anchor in [re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in headings], (
+            link
+        )
 
 
 def test_a_line_that_does_not_parse_is_noticed():
@@ -174,10 +176,10 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --min-opacity 1.5", "--min-opacity"),
         ("render x --colour-map jet", "'jet'; choose turbo, viridis or grey"),
         ("render x --video-format avi", "'avi'; choose mp4, h265, webm or gif"),
-        ("render x --video --crf 52", "52; mp4 ends at 51"),
-        ("render x --video-format gif --crf 5", "a gif has no scale of quality"),
-        ("render x --video-format gif --fps 60", "60; players show a gif at 50 at most"),
-        ("render x --video --loop 0", "0; a gif alone can be told to play for ever"),
+        ("render x --video --crf 52", "52; the maximum of mp4 is 51"),
+        ("render x --video-format gif --crf 5", "gif has no quality setting"),
+        ("render x --video-format gif --fps 60", "60; a gif plays at 50 frames per second at most"),
+        ("render x --video --loop 0", "0; only a gif can repeat forever"),
         ("render x --frames 200:100", "'200:100'; write START:STOP"),
         ("render x --max-size 0", "--max-size"),
         ("run x --budget -1", "'-1' is not a time"),
@@ -687,7 +689,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
         run / "report.html",
     ]
     assert first.exit_code == 0, first.stderr
-    assert f"everything about it, to look at: {run / 'report.html'}" in first.stderr
+    assert f"report with all results: {run / 'report.html'}" in first.stderr
     assert first.stdout.splitlines() == [str(path) for path in expected]
     assert all(path.exists() for path in expected)
     before = listing(run)

@@ -35,12 +35,12 @@ for _module in (doctor, poses, train, evaluate, render, export, report, run, inf
 
 @app.callback(invoke_without_command=True)
 def main_options(version: bool = typer.Option(False, "--version", help="Show the version and exit.")) -> None:
-    """From a folder of photos to a radiance field that people can trust: poses, novel views, depth maps, videos.
+    """Turn photos into a radiance field: camera poses, new views, depth maps, videos.
 
     \b
-    Everything in one go:
+    Everything at once:
       nerfcli run photos/
-    Before it, what an expert would say of the photos:
+    Check the photos first:
       nerfcli doctor photos/                       -> photos-doctor.html
     Step by step:
       nerfcli poses photos/                        -> photos-scene/
@@ -48,15 +48,15 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       nerfcli evaluate photos-scene-run/           -> photos-scene-run/metrics.json
       nerfcli render photos-scene-run/ --cameras orbit --depth conditional --video
       nerfcli report photos-scene-run/             -> photos-scene-run/report.html
-    What each component of the model is worth, for a paper or a doubt:
+    Measure what each component of the model contributes:
       nerfcli ablate photos-scene/                 -> photos-scene-ablation/
-    Cameras between formats, proved:
+    Convert cameras between formats:
       nerfcli convert photos-scene/ transforms.json --to transforms
     Many captures:
       ls -d captures/*/ | nerfcli poses - | nerfcli train - --budget 2m | nerfcli render -
 
     Exit codes: 0 done; 1 a bug; 2 wrong usage; 3 bad input; 4 too few photos registered; 5 numbers became
-    non-finite; 6 out of memory; 7 a quality gate not met; 130 interrupted; 143 ended by SIGTERM.
+    non-finite; 6 out of memory; 7 a quality gate not met or time limit reached; 130 interrupted; 143 ended by SIGTERM.
     """
     if version:
         typer.echo(f"nerfcli {__version__}")
@@ -64,7 +64,7 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
 
 
 def main() -> None:
-    """The console script."""
+    """Run the console script."""
     # OpenMP's threads wait for work in a busy loop, for long if nobody says otherwise. Two commands of a pipeline on
     # the same cores then wait for each other's waiting: 58 training steps in 10 s, where there are 245 with this.
     # libgomp reads it when torch is loaded.

@@ -1,4 +1,4 @@
-"""nerfcli ablate: what each component is worth on a scene."""
+"""nerfcli ablate: what each component of the model contributes on a scene."""
 
 from pathlib import Path
 from typing import Annotated
@@ -36,25 +36,28 @@ _STYLES = {"would help": "green", "needed: worse without it": "green", "not need
 
 @command
 def ablate(
-    scene: Annotated[str, typer.Argument(help="A scene folder, or - for scenes on standard input.")],
+    scene: Annotated[str, typer.Argument(help="Scene folder, or - to read paths from standard input.")],
     output: Output = None,
     budget: Annotated[
         str | None, typer.Option(help="Time of each training: 30s, 2m.  [default: 1m, or none with --steps]")
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Steps of each training; repeatable bit for bit.", min=1)] = None,
-    seeds: Annotated[int, typer.Option(help="Trainings of each model, from --seed on.", min=1)] = 3,
+    steps: Annotated[
+        int | None, typer.Option(help="Steps of each training; results repeat bit for bit on a CPU.", min=1)
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="Number of seeds per variant, starting at --seed.", min=1)] = 3,
     only: Annotated[
-        list[str] | None, typer.Option("--only", metavar="NAME", help="A component to vary; all. Repeatable.")
+        list[str] | None,
+        typer.Option("--only", metavar="NAME", help="Vary only this component. Repeatable.  [default: all]"),
     ] = None,
     include: Include = None,
     exclude: Exclude = None,
     whole: Annotated[
         bool,
-        typer.Option("--whole", help="Measure whole held-out photos as `evaluate` does, SSIM too, not random pixels."),
+        typer.Option(
+            "--whole", help="Measure whole held-out photos with SSIM, as `evaluate` does, instead of random pixels."
+        ),
     ] = False,
-    model: Annotated[
-        str, typer.Option(help="What is compared with: auto (what the scene decides on) or default.")
-    ] = "auto",
+    model: Annotated[str, typer.Option(help="Reference model: auto (selected for this scene) or default.")] = "auto",
     downscale: Downscale = "auto",
     holdout: Holdout = None,
     memory: Memory = None,
@@ -65,19 +68,19 @@ def ablate(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure what each component of the model is worth on a scene.
+    """Measure what each component of the model contributes on a scene.
 
-    Trainings with it and without it are compared on the held-out photos: the one that `train --model auto` chooses
-    beside models that have one component less, or one more: the same time or steps, the same seeds. Each difference
-    comes with its 95 % interval over the seeds and a verdict. This is a measurement: nothing is chosen by it. Masks are
-    not varied, as they change what is measured. Components are those of `nerfcli train --help`.
+    Trains the model that `train --model auto` selects, and variants with one component less or more, all for the same
+    time or number of steps and with the same seeds, and compares them on the held-out photos. Each difference comes
+    with its 95 % interval over the seeds and a verdict. Nothing is selected by it. Masks are not varied because they
+    change what is measured. For the components see `nerfcli train --help`.
 
-    PSNR is that of some 16,000 random pixels of the held-out photos: the same ones for all models of a seed, others for
-    each seed, so that the interval includes the choice of pixels. For a table of a paper add --whole: whole photos and
-    SSIM by the protocol of `nerfcli evaluate`, which takes longer than short trainings do.
+    PSNR is measured on about 16,000 random pixels of the held-out photos: the same pixels for all variants of a seed,
+    other pixels for each seed, so that the interval includes the choice of pixels. Add --whole for whole photos and
+    SSIM by the protocol of `nerfcli evaluate`, for example for a table in a paper; this takes longer.
 
-    Writes SCENE-ablation/ with ablation.csv, ablation.json and every run. When it was interrupted, the same command
-    goes on; with --whole it measures the trainings that are there anew.
+    Writes SCENE-ablation/ with ablation.csv, ablation.json and all runs. Run the same command again to resume an
+    interrupted one; with --whole, completed trainings are measured again.
 
     \b
     Examples:
@@ -127,7 +130,7 @@ def ablate(
             )
         rows = [Row(**row) for row in content["rows"]]
         console.table(COLUMNS, table_of(rows), styles=_STYLES)
-        console.note(f"measured by {rows[-1].protocol}; intervals of 95 % by Student's t over the seeds")
+        console.note(f"protocol: {rows[-1].protocol}; 95 % intervals from Student's t over the seeds")
         console.result(folder / "ablation.csv", content)
 
     for_each_input(scene, work)

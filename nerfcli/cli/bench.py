@@ -32,13 +32,15 @@ _STYLES = {"in it": "green"}
 
 @command
 def bench(
-    source: Annotated[str, typer.Argument(help="A run, or a scene to train first; - for such on standard input.")],
+    source: Annotated[
+        str, typer.Argument(help="Run folder, or a scene to train first; - to read paths from standard input.")
+    ],
     output: Output = None,
     budget: Annotated[
-        str, typer.Option(help="Time for everything: 8m, 1h. More time: more settings, longer trainings, more repeats.")
+        str, typer.Option(help="Total time: 8m, 1h. More time allows more settings, longer trainings and more repeats.")
     ] = "8m",
     sweep: Annotated[
-        str, typer.Option(help="both, render (settings of rendering alone) or train (of training alone).")
+        str, typer.Option(help="render (rendering settings only), train (training settings only) or both.")
     ] = "both",
     device: Device = "auto",
     seed: Seed = 0,
@@ -49,13 +51,13 @@ def bench(
 ) -> None:
     """Measure speed against error on this scene and machine.
 
-    Which settings are worth their time? Renders one trained field with many settings and trains with many settings.
-    Each has its time (median and quartiles of interleaved repeats), peak memory, size, error against the held-out
-    photos and, apart from that, against a converged rendering of the same field. Says which are in the Pareto set, what
-    makes the others pointless, and what to use. Nothing else should run meanwhile.
+    Renders one trained field with many settings and trains with many settings. Measures for each the time (median and
+    quartiles of interleaved repeats), peak memory, size, the error against the held-out photos and, separately, the
+    error against a converged rendering of the same field. Shows which settings are in the Pareto set, which setting
+    dominates the others, and recommends settings. Run nothing else meanwhile.
 
     Writes SOURCE-bench/ with bench.html (plots, and the pictures behind each point), bench.csv and bench.json. An
-    interrupted bench reports what it has; the same command goes on.
+    interrupted bench reports its results so far; run the same command again to continue.
 
     \b
     Examples:
@@ -67,7 +69,9 @@ def bench(
     one_of(sweep, _SWEEPS, "--sweep")
     seconds = seconds_from_text(budget)
     if seconds < _SHORTEST_SECONDS:
-        raise typer.BadParameter(f"{budget!r} is too short; at least {_SHORTEST_SECONDS:g}s", param_hint="--budget")
+        raise typer.BadParameter(
+            f"{budget!r} is too short; give at least {_SHORTEST_SECONDS:g}s", param_hint="--budget"
+        )
     console = Console(quiet=quiet, json_lines=json)
     from nerfcli.bench.measure import Wanted
 
@@ -108,9 +112,9 @@ def bench_one(
         discard(folder)
     records = open_bench(subject, folder, wanted)
     if records.last(COMPLETE) is not None:
-        console.note(f"{folder} is complete; --overwrite measures again")
+        console.note(f"{folder} is complete; add --overwrite to measure again")
     elif (folder / MEASURED).exists():
-        console.note(f"going on with {folder}: {len(records.all())} measurements are there")
+        console.note(f"resuming {folder} with {len(records.all())} measurements")
     interrupted = None
     with console.progress(f"bench {path.name}") as update:
         try:
@@ -122,7 +126,7 @@ def bench_one(
         raise interrupted
     _print(content, console)
     if interrupted is not None:
-        console.note(f"{page} tells what was measured so far; the same command goes on")
+        console.note(f"{page} shows the measurements so far; run the same command again to continue")
         raise interrupted
     return page, content
 
@@ -135,6 +139,6 @@ def _print(content: dict[str, Any], console: Console) -> None:
     if content["training"]:
         console.table(TRAINING_COLUMNS, training_rows(content["training"]), styles=_STYLES)
     if not content["rendering"] and not content["training"]:
-        raise UserError("nothing was measured yet", "give it more time (--budget), and let it go on")
+        raise UserError("nothing was measured yet", "give more time with --budget, or run the same command again")
     for sentence in sentences(content):
         console.note(sentence)

@@ -1,4 +1,4 @@
-"""nerfcli convert: from one format of captures to another, proved; and which convention a capture follows."""
+"""nerfcli convert: convert cameras between formats and verify the result; detect conventions."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -38,87 +38,105 @@ _AXES = "opencv (= rdf), opengl (= rub), llff (= drb), pytorch3d (= luf), ros (=
 
 @command
 def convert(
-    source: Annotated[str, typer.Argument(metavar="IN", help="A capture: file or folder, or - for paths on stdin.")],
+    source: Annotated[
+        str,
+        typer.Argument(metavar="IN", help="Capture to read: file or folder, or - to read paths from standard input."),
+    ],
     target: Annotated[
-        Path | None, typer.Argument(metavar="OUT", help="File or folder to write; with -, the folder of the results.")
+        Path | None,
+        typer.Argument(
+            metavar="OUT", help="File or folder to write; with -, the folder that will contain the results."
+        ),
     ] = None,
     to: Annotated[
-        str | None, typer.Option(help=f"{', '.join(FORMATS_WRITTEN)}; {' or '.join(PROGRAMS)} for transforms.")
+        str | None,
+        typer.Option(help=f"Output format: {', '.join(FORMATS_WRITTEN)}; {' or '.join(PROGRAMS)} for transforms."),
     ] = None,
-    detect: Annotated[bool, typer.Option("--detect", help="Write nothing; tell which convention IN follows.")] = False,
+    detect: Annotated[
+        bool, typer.Option("--detect", help="Write nothing; detect which convention IN follows.")
+    ] = False,
     axes: Annotated[str | None, typer.Option(help=f"Camera axes of the poses in OUT: {_AXES}.")] = None,
     pixel_center: Annotated[
-        str | None, typer.Option(help="Where cx, cy in OUT put the first pixel's centre: 0.5, or 0 as in OpenCV.")
+        str | None,
+        typer.Option(help="Pixel coordinates of the top-left pixel's centre in OUT: 0.5, or 0 as in OpenCV."),
     ] = None,
-    from_axes: Annotated[str | None, typer.Option(help="Camera axes of the poses in IN, if not its format's.")] = None,
+    from_axes: Annotated[
+        str | None, typer.Option(help="Camera axes of the poses in IN, if they differ from its format's.")
+    ] = None,
     from_inverted: Annotated[
-        bool, typer.Option("--from-inverted", help="The transforms in IN are the inverse of its format's.")
+        bool,
+        typer.Option(
+            "--from-inverted",
+            help="The transforms in IN are inverted (camera-from-world instead of world-from-camera, or vice versa).",
+        ),
     ] = False,
-    from_pixel_center: Annotated[str | None, typer.Option(help="As --pixel-center, of IN.")] = None,
+    from_pixel_center: Annotated[str | None, typer.Option(help="Like --pixel-center, for IN.")] = None,
     from_size: Annotated[
-        float, typer.Option(help="The intrinsics in IN are for pictures this many times as large as it says.", min=1e-3)
+        float, typer.Option(help="The intrinsics in IN refer to pictures larger than stated by this factor.", min=1e-3)
     ] = 1.0,
-    images: Annotated[Path | None, typer.Option(help="The folder of the photos, where IN does not find them.")] = None,
+    images: Annotated[Path | None, typer.Option(help="Folder of the photos, if IN does not point to them.")] = None,
     intrinsics: Annotated[
-        Path | None, typer.Option(help="The camera of tum and kitti: cameras.txt, a JSON camera, or a capture.")
+        Path | None,
+        typer.Option(help="File with the camera for tum and kitti: cameras.txt, a JSON camera, or a capture."),
     ] = None,
     world_up: Annotated[
-        str | None, typer.Option(help="Turn the world so that up is its x, y, z, -x, -y or -z axis.")
+        str | None, typer.Option(help="Rotate the world so that this axis points up: x, y, z, -x, -y or -z.")
     ] = None,
     origin: Annotated[
-        str | None, typer.Option(help="Move the world's origin to centre-of-cameras, focus, or x,y,z of IN.")
+        str | None, typer.Option(help="Move the world's origin to centre-of-cameras, focus, or a point x,y,z of IN.")
     ] = None,
     scale: Annotated[
-        str | None, typer.Option(help="Multiply lengths by a number; gps: to metres, by the photos' EXIF.")
+        str | None,
+        typer.Option(help="Multiply lengths by this number; gps: scale to metres by the GPS positions in EXIF."),
     ] = None,
     distance: Annotated[
         list[str] | None,
         typer.Option(
-            help='A known distance, to metres: "A B 1.25", A and B images or points x,y,z; many may be given.'
+            help='Scale to metres by a known distance: "A B 1.25", A and B images or points x,y,z. Repeatable.'
         ),
     ] = None,
     markers: Annotated[
         str | None,
         typer.Option(
-            help="To metres by ArUco markers in the photos, DICT_4X4_50:0.05 (their side), or a ChArUco board, "
-            "DICT_5X5_100:7x5:0.04:0.03 (squares, sides of square and marker; :legacy after it for OpenCV < 4.6)."
+            help="Scale to metres by ArUco markers, DICT_4X4_50:0.05 (side length), or a ChArUco board, "
+            "DICT_5X5_100:7x5:0.04:0.03 (squares, sides of square and marker; append :legacy for OpenCV < 4.6)."
         ),
     ] = None,
     pixels: Annotated[
         str | None,
         typer.Option(
-            help="Which pixels of photos with an EXIF orientation the cameras in OUT refer to: stored, as COLMAP, "
-            "nerfstudio and most programs read them, or upright.  [default: upright for nerfcli, else stored]"
+            help="For photos with an EXIF orientation, whether cameras in OUT refer to the pixels as stored (COLMAP, "
+            "nerfstudio and most programs) or upright.  [default: upright for nerfcli, else stored]"
         ),
     ] = None,
     allow_loss: Annotated[
-        bool, typer.Option("--allow-loss", help="Leave out what the format cannot hold (it is listed).")
+        bool, typer.Option("--allow-loss", help="Drop what the format cannot hold (it is listed).")
     ] = False,
-    verify: Annotated[bool, typer.Option(help="Read OUT back by other means and compare.")] = True,
-    tolerance: Annotated[float, typer.Option(help="The largest residual that passes, pixels.", min=0)] = 1e-6,
+    verify: Annotated[bool, typer.Option(help="Read OUT back with other code and compare.")] = True,
+    tolerance: Annotated[float, typer.Option(help="Maximum residual, in pixels.", min=0)] = 1e-6,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Convert a capture to another format, and prove it.
+    """Convert a capture to another format and verify the result.
 
-    What was written, cameras, poses and points, is read back by other programs' code (pycolmap, OpenCV, SciPy), every
-    3D point is projected by both, and the largest residual is told; above --tolerance the exit code is 7 and nothing is
-    kept. What the format cannot hold is listed, and refused without --allow-loss, but for 2D features. Photos are not
-    touched.
+    The written cameras, poses and points are read back with other code (pycolmap, OpenCV, SciPy), every 3D point is
+    projected with both, and the largest residual is reported; above --tolerance nothing is kept and the exit code is 7.
+    Anything that the format cannot hold is listed, and the conversion is refused without --allow-loss (2D features are
+    optional). Photos are not changed.
 
     \b
     Formats read:     nerfcli, colmap, transforms (nerfstudio, instant-ngp), blender, llff, opensfm, metashape,
-                      reality-capture, bundler, tum, kitti, npz, camera-path (of nerfstudio's viewer), run (what
-                      nerfcli train wrote, with refined cameras); recognised by their files
-    Formats written:  nerfcli (a scene folder as poses writes it), colmap, colmap-text, transforms (nerfstudio,
-                      instant-ngp), blender, llff, opensfm, tum, kitti, npz (all of it), ply (points)
+                      reality-capture, bundler, tum, kitti, npz, camera-path (nerfstudio's viewer), run (a folder
+                      written by nerfcli train, with its refined cameras); detected from the files
+    Formats written:  nerfcli (a scene folder), colmap, colmap-text, transforms (nerfstudio, instant-ngp), blender,
+                      llff, opensfm, tum, kitti, npz (everything), ply (points only)
 
     \b
-    Inside, camera axes are OpenCV's (x right, y down, z forward) and the first pixel's centre is (0.5, 0.5).
-    Each format has its own axes; --axes and --pixel-center are for programs that read a format their own way,
-    --from-axes, --from-inverted, --from-pixel-center and --from-size for files that were written so.
-    In doubt, --detect compares hypotheses with the photos and says which holds, by how much.
+    Internally, camera axes are OpenCV's (x right, y down, z forward) and the top-left pixel's centre is (0.5, 0.5).
+    Each format has its own axes. Use --axes and --pixel-center for programs that read a format differently, and
+    --from-axes, --from-inverted, --from-pixel-center and --from-size for files that were written differently.
+    If you are not sure, --detect compares the possible conventions with the photos.
 
     \b
     Examples:
@@ -131,7 +149,7 @@ def convert(
       nerfcli convert scene/ metric.npz --to npz --world-up z --origin focus --distance "a.jpg b.jpg 1.25"
       nerfcli convert colmap-project metric-scene --to nerfcli --distance "a.jpg b.jpg 1.25"
       nerfcli convert strange/ --detect
-      nerfcli convert strange/ mended.json --to transforms --from-axes opencv --from-inverted
+      nerfcli convert strange/ repaired.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
     from nerfcli.convert.conversion import Doubt, Wanted
@@ -149,7 +167,7 @@ def convert(
 
     if detect:
         if to is not None or target is not None:
-            raise typer.BadParameter("--detect writes nothing; leave OUT and --to out")
+            raise typer.BadParameter("--detect writes nothing; remove OUT and --to")
 
         def work(path: Path, one_of_many: bool) -> None:
             with console.progress(f"detect {path.name}") as update:
@@ -163,7 +181,7 @@ def convert(
         if to is None or to not in FORMATS_WRITTEN:
             raise typer.BadParameter(f"{to!r}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         if target is None:
-            raise typer.BadParameter("say where the result goes", param_hint="OUT")
+            raise typer.BadParameter("missing; give the file or folder to write", param_hint="OUT")
         one_of(pixels, ("stored", "upright"), "--pixels")
         world = WorldFrame(world_up, origin, scale, markers, tuple(distance or ()))
         wanted = Wanted(
@@ -198,11 +216,11 @@ def convert(
 def _print_verification(done: "Conversion", console: Console) -> None:
     checked = done.verification
     if checked is None:
-        console.warn(f"{done.path} was not verified")
+        console.warn(f"{done.path}: not verified")
         return
-    against = "what is left of the capture" if done.losses else "the capture"
+    against = "the remaining capture" if done.losses else "the capture"
     if not checked.num_projections:
-        console.note(f"{done.path}: read back, its {checked.num_points} points are those of {against}")
+        console.note(f"{done.path}: verified, its {checked.num_points} points equal those of {against}")
         return
     console.note(
         f"{done.path}: read back and compared with {against}: {checked.num_projections} projections of "
@@ -229,11 +247,11 @@ def _table(found: "Detection") -> list[str]:
                 )
                 lines.append(line.rstrip())
     if found.as_format_says:
-        lines.append("  Nothing speaks against the convention of the format.")
+        lines.append("  Nothing contradicts the convention of the format.")
     elif options := options_of(found):
-        lines.append(f"  To read it so: nerfcli convert IN OUT --to FORMAT {options}")
+        lines.append(f"  To read it this way: nerfcli convert IN OUT --to FORMAT {options}")
     else:
-        lines.append("  No hypothesis fits: poses, intrinsics and photos do not belong together in any of these ways.")
+        lines.append("  No hypothesis fits: poses, intrinsics and photos do not match under any of these conventions.")
     return lines
 
 
@@ -244,12 +262,12 @@ def _hypothesis(question: "Question", answer: "Answer") -> str:
         "image size": f"intrinsics for {convention.intrinsics_scale:g} x the size",
         "pixel centre": f"first pixel's centre at {convention.pixel_centre:g}",
     }[question.name]
-    return f"{text} (as its format says)" if answer.as_format_says else text
+    return f"{text} (the format's own)" if answer.as_format_says else text
 
 
 def _verdict(question: "Question") -> str:
     if question.verdict == "holds":
-        return f"holds, {question.ratio:.3g} times better than the next"
+        return f"fits, {question.ratio:.3g} times better than the next"
     return f"{question.verdict}: {question.reason}"
 
 

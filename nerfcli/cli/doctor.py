@@ -1,4 +1,4 @@
-"""nerfcli doctor: what to know of a capture before any long work."""
+"""nerfcli doctor: check photos before any long work."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,22 +21,24 @@ _STYLES = {"good": "green", "look": "yellow", "bad": "bold red"}
 
 @command
 def doctor(
-    capture: Annotated[str, typer.Argument(help="A folder of photos or a scene, or - for such on standard input.")],
+    capture: Annotated[
+        str, typer.Argument(help="Folder of photos or a scene, or - to read paths from standard input.")
+    ],
     output: Output = None,
     intrinsics: Intrinsics = None,
     require: Annotated[
-        str | None, typer.Option(help="good or look: end with exit code 7 if a finding is worse.", show_default=False)
+        str | None, typer.Option(help="good or look: exit code 7 if any finding is worse.", show_default=False)
     ] = None,
     threads: Threads = 0,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Tell what an expert would say of photos before any long work.
+    """Check photos for problems before any long work.
 
-    Blur, exposure, doubles, lenses, overlap, movement, moving things. Prints a table on stderr and writes a page with
-    thumbnails beside the capture, CAPTURE-doctor.html. Of a scene it judges the cameras too. Each finding is good, look
-    or bad, with its number, its threshold and what to do.
+    Checks blur, exposure, duplicates, lenses, overlap, camera movement and moving objects; for a scene, also its
+    cameras. Prints a table on stderr and writes a page with thumbnails next to the capture, CAPTURE-doctor.html. Each
+    finding is good, look or bad, with its number, its threshold and advice.
 
     \b
     Examples:

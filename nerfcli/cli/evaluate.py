@@ -26,16 +26,16 @@ _MEASURES = (("psnr", 2), ("ssim", 4), ("lpips", 4))
 
 @command
 def evaluate(
-    runs: Annotated[list[str], typer.Argument(help="Folders that train wrote, or - for such on standard input.")],
+    runs: Annotated[
+        list[str], typer.Argument(help="Run folders written by train, or - to read paths from standard input.")
+    ],
     align: Annotated[
         str | None,
-        typer.Option(help="pose: also from a pose refined on the left half of each photo, measured on the right."),
+        typer.Option(help="pose: also refine each pose on the left half of the photo and measure on the right half."),
     ] = None,
-    seeds: Annotated[
-        int, typer.Option(help="Train with this many seeds in all, and tell the spread of the numbers.", min=1)
-    ] = 1,
+    seeds: Annotated[int, typer.Option(help="Train with this many seeds in total and report the spread.", min=1)] = 1,
     save_predictions: Annotated[
-        str | None, typer.Option(help="png: keep what was compared in RUN/predictions; float: unrounded, too.")
+        str | None, typer.Option(help="png: save the compared pictures in RUN/predictions; float: also unrounded.")
     ] = None,
     require: Require = None,
     device: Device = "auto",
@@ -44,12 +44,12 @@ def evaluate(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure runs on the photos that training did not see.
+    """Evaluate runs on their held-out photos.
 
-    PSNR, SSIM and LPIPS, with training and render time beside them, go to RUN/metrics.json: the protocol's name, means
-    and values per photo of 8-bit and of unrounded pictures, after a correction of colours, how far each view is from
-    the nearest training view, and which stages have seen the held-out photos. With several runs of one scene, or with
-    --seeds, mean and spread over the runs are told, too.
+    Writes RUN/metrics.json: PSNR, SSIM and LPIPS per photo and their means, for 8-bit and for unrounded pictures and
+    after a colour correction; training and render time; the distance of each view from the nearest training view; and
+    which stages have used held-out photos. With several runs of one scene, or with --seeds, also prints mean and spread
+    over the runs.
 
     \b
     Examples:
@@ -67,9 +67,12 @@ def evaluate(
     one_of(align, ("pose",), "--align")
     one_of(save_predictions, KINDS, "--save-predictions")
     if STDIN in runs and (len(runs) > 1 or seeds > 1):
-        raise typer.BadParameter("- stands alone: runs on standard input are measured one by one", param_hint="RUNS")
+        raise typer.BadParameter(
+            "- cannot be combined with other runs or --seeds: runs on standard input are evaluated one by one",
+            param_hint="RUNS",
+        )
     if seeds > 1 and len(runs) > 1:
-        raise typer.BadParameter("--seeds is for one run, the runs of other seeds are made", param_hint="--seeds")
+        raise typer.BadParameter("--seeds takes a single run and trains the other seeds itself", param_hint="--seeds")
     console = Console(quiet=quiet, json_lines=json)
     requirements = requirements_of(require)
     cores, torch_device = thread_count(threads), device_name(device)
@@ -100,7 +103,7 @@ def evaluate(
     if seeds > 1:
         from nerfcli.workflows.train import train_other_seeds
 
-        with console.progress(f"train {seeds - 1} other seeds") as update:
+        with console.progress(f"train {seeds - 1} more seeds") as update:
             folders += train_other_seeds(
                 Run(folders[0]),
                 seeds - 1,

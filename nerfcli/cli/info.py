@@ -1,4 +1,4 @@
-"""nerfcli info: what a folder or a file is, and what is in it."""
+"""nerfcli info: show what a folder or a file contains."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,24 +14,19 @@ from nerfcli.cli.options import Json
 @command
 def info(
     path: Annotated[
-        str, typer.Argument(help="A scene, a run, renders, or one file of them; - for paths on standard input.")
+        str, typer.Argument(help="Scene, run, renders, or one of their files; - to read paths from standard input.")
     ],
     json: Json = False,
 ) -> None:
-    """Say what a scene, a run or one of their files holds.
-
-    Of a scene: cameras, photos, missing files, split, unit. Of a run: settings, time, numbers.
+    """Show what a scene, a run or one of their files contains.
 
     \b
-    Of a depth file (TIFF, EXR, NPZ, NPY, PNG), a picture, a video or a folder of renders: which depth it is, along
-    which axis, in which unit and how that is known, what stands for no value, which camera saw it, which run it is of,
-    and the range of its numbers. Of depth that another program wrote: what can be known, and what nobody states.
-    Of a failure that a training kept: which numbers became non-finite, where, and whether they do again.
-
-    \b
-    Of a run, by arithmetic: bytes of weights, optimiser (gradients and moments) and what a step keeps; operations and
-    memory traffic per sample and per picture, for its field and for the other kinds at equal storage. Where training
-    refined cameras: how far they moved, as median and maximum.
+    scene       cameras, photos, missing files, split, unit
+    run         settings, time, metrics, how far refined cameras moved; bytes of weights and optimizer, operations and
+                memory traffic per sample and picture, next to other types of field of the same size
+    depth file  (TIFF, EXR, NPZ, NPY, PNG; also pictures, videos and folders of renders) definition, axis, unit and its
+                source, invalid value, camera, run, range of values; for files of other programs, what is not stated
+    failure     (saved by train) which numbers became non-finite, where, and whether that repeats
 
     \b
     Examples:
@@ -54,7 +49,7 @@ def info(
             costs = content.pop("cost", {})
             lines = lines_of(content)
             if costs:
-                lines += [f"storage and work of the {next(iter(costs))} field, and of others of as many bytes:"]
+                lines += [f"storage and cost of the {next(iter(costs))} field, and of other types of the same size:"]
                 lines += [f"  {line}" for line in cost_lines(costs)]
             typer.echo("\n".join([str(folder), *(f"  {line}" for line in lines)]))
 

@@ -1,4 +1,4 @@
-"""Options that mean the same in every command, and the readers of their values."""
+"""Options shared by several commands, and the parsers of their values."""
 
 import re
 from collections.abc import Collection
@@ -12,63 +12,66 @@ Word = TypeVar("Word", str, str | None)
 Output = Annotated[
     Path | None,
     typer.Option(
-        "--output", "-o", help="Where the result goes; with several inputs, the folder that holds the results."
+        "--output", "-o", help="Output file or folder; with several inputs, the folder that will contain the results."
     ),
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
-Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0)]
-Threads = Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)]
-Downscale = Annotated[str, typer.Option(help="Average photos over squares: auto, 1, 2, 4 or 8.")]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.", min=0)]
+Threads = Annotated[int, typer.Option(help="Number of CPU threads; 0 uses all.", min=0)]
+Downscale = Annotated[str, typer.Option(help="Reduce photos by this factor: auto, 1, 2, 4 or 8.")]
 Include = Annotated[
     list[str] | None,
-    typer.Option("--with", metavar="NAME[=VALUE]", help="A component to switch on; see above. Repeatable."),
+    typer.Option("--with", metavar="NAME[=VALUE]", help="Enable a component, see above. Repeatable."),
 ]
 Exclude = Annotated[
     list[str] | None,
-    typer.Option("--without", metavar="NAME", help="A component to switch off; see above. Repeatable."),
+    typer.Option("--without", metavar="NAME", help="Disable a component, see above. Repeatable."),
 ]
 ModelChoice = Annotated[
     str,
     typer.Option(
-        "--model", help="auto: the scene decides on its components, in short trainings; default: what most scenes need."
+        "--model",
+        help="auto: select components for this scene with short trainings; default: use the default components.",
     ),
 ]
 Require = Annotated[
     str | None,
-    typer.Option(help="Numbers to reach, else exit code 7: psnr>=25,registered>=0.9.", show_default=False),
+    typer.Option(
+        help="Requirements such as psnr>=25,registered>=0.9; exit code 7 if one is not met.", show_default=False
+    ),
 ]
 Holdout = Annotated[
     str | None,
     typer.Option(
-        help="Photos to hold out: every:8, block:0.15 (the middle of the capture), or a file of names.",
+        help="Photos to hold out: every:8, block:0.15 (the middle of the capture), or a file with names.",
         show_default=False,
     ),
 ]
 Strict = Annotated[
     bool,
-    typer.Option("--strict", help="Poses without the held-out photos, which are placed afterwards, all else fixed."),
+    typer.Option("--strict", help="Estimate poses from training photos only; locate held-out photos afterwards."),
 ]
-FieldKind = Annotated[str, typer.Option("--field", help="What the field is made of: hash, voxels or mlp.")]
+FieldKind = Annotated[str, typer.Option("--field", help="Type of field: hash, voxels or mlp.")]
 FieldMemory = Annotated[
     str | None,
-    typer.Option(help="About what its numbers may take: 4MB, 64MB.  [default: hash 8MiB, voxels 64MiB, mlp 256KiB]"),
+    typer.Option(help="Approximate size of the parameters: 4MB, 64MB.  [default: hash 8MiB, voxels 64MiB, mlp 256KiB]"),
 ]
 Contraction = Annotated[
     str,
     typer.Option(
-        help="What is far away is drawn near into a ball (l2) or a cube (linf), or not (none); auto: none with alpha."
+        help="Map distant space into a ball (l2) or a cube (linf), or not at all (none); auto: none with alpha."
     ),
 ]
-Memory = Annotated[str | None, typer.Option(help="Memory it may use: 4GB, 500MB.  [default: 4/5 of the machine's]")]
-Json = Annotated[bool, typer.Option("--json", help="Results as JSON Lines on stdout instead of paths.")]
+Memory = Annotated[str | None, typer.Option(help="Memory limit: 4GB, 500MB.  [default: 4/5 of the machine's memory]")]
+Json = Annotated[bool, typer.Option("--json", help="Print results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No notes and no progress; warnings and errors stay.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show only warnings and errors.")]
 
 _SECONDS_PER_UNIT = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
 def one_of(value: Word, choices: Collection[str], option: str) -> Word:
-    """A word of an option, or None where it is not given.
+    """Return an option's value if it is one of the choices; None if it is not given.
 
     Raises:
         typer.BadParameter: it is none of the choices.
@@ -81,7 +84,7 @@ def one_of(value: Word, choices: Collection[str], option: str) -> Word:
 
 
 def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]:
-    """The words of a list with commas, each once.
+    """Return the items of a comma-separated list, without duplicates.
 
     Raises:
         typer.BadParameter: one of them is none of the choices.
@@ -93,10 +96,10 @@ def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]
 
 
 def seconds_from_text(text: str) -> float:
-    """90s, 5m, 1.5h or plain seconds.
+    """Parse 90s, 5m, 1.5h or plain seconds.
 
     Raises:
-        typer.BadParameter: anything else, or nothing left to spend.
+        typer.BadParameter: anything else, or zero.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     seconds = float(match[1]) * _SECONDS_PER_UNIT[match[2] or "s"] if match else 0.0
@@ -106,39 +109,39 @@ def seconds_from_text(text: str) -> float:
 
 
 def downscale_factor(downscale: str) -> int | None:
-    """1, 2, 4 or 8; None for auto."""
+    """Parse --downscale: 1, 2, 4 or 8; None for auto."""
     one_of(downscale, ("auto", "1", "2", "4", "8"), "--downscale")
     return None if downscale == "auto" else int(downscale)
 
 
 def field_kind(kind: str) -> str:
-    """One of the kinds of fields."""
+    """Check --field."""
     from nerfcli.field.kinds import KINDS
 
     return one_of(kind, KINDS, "--field")
 
 
 def model_name(model: str) -> str:
-    """auto or default."""
+    """Check --model: auto or default."""
     return one_of(model, ("auto", "default"), "--model")
 
 
 def named_components(included: list[str] | None, excluded: list[str] | None) -> tuple[str, ...]:
-    """The names in --with NAME[=VALUE] and --without NAME, each once."""
+    """Return the component names in --with NAME[=VALUE] and --without NAME, without duplicates."""
     return tuple(sorted({text.partition("=")[0] for text in (*(included or ()), *(excluded or ()))}))
 
 
 def contraction_name(contraction: str) -> str | None:
-    """none, l2 or linf; None for auto."""
+    """Parse --contraction: none, l2 or linf; None for auto."""
     one_of(contraction, ("auto", "none", "l2", "linf"), "--contraction")
     return None if contraction == "auto" else contraction
 
 
 def bytes_from_text(text: str) -> int:
-    """4GB, 500MB, 1.5GiB; a plain number is bytes.
+    """Parse 4GB, 500MB or 1.5GiB; a plain number is bytes.
 
     Raises:
-        typer.BadParameter: anything else, or nothing left to use.
+        typer.BadParameter: anything else, or zero.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:([kmgt])(i?)b?|b)?", text.strip().lower())
     if match is None or not (
@@ -149,7 +152,7 @@ def bytes_from_text(text: str) -> int:
 
 
 def holdout_rule(holdout: str | None) -> str | None:
-    """The rule of --holdout, with the path of a file made absolute; None where it is not given.
+    """Parse --holdout, with the path of a file made absolute; None if it is not given.
 
     Raises:
         typer.BadParameter: it is no rule, and no file.
@@ -163,7 +166,7 @@ def holdout_rule(holdout: str | None) -> str | None:
 
 
 def memory_limit(memory: str | None) -> int | None:
-    """The bytes of --memory; four fifths of the machine's where it is not given, None where nobody knows.
+    """Parse --memory to bytes; by default four fifths of the machine's memory, None if that is unknown.
 
     Raises:
         typer.BadParameter: not an amount of memory.
@@ -174,17 +177,17 @@ def memory_limit(memory: str | None) -> int | None:
 
 
 def thread_count(threads: int) -> int:
-    """The number of CPU threads of --threads; for 0 the processors this process may run on."""
+    """Return the number of threads for --threads; for 0, the processors this process may use."""
     from nerfcli.workflows import machine
 
     return machine.thread_count(threads)
 
 
 def device_name(device: str) -> str:
-    """The torch device of --device.
+    """Return the torch device for --device.
 
     Raises:
-        UserError: CUDA is wanted and not there, or the name is unknown.
+        UserError: CUDA is requested but not available, or the name is unknown.
     """
     from nerfcli.workflows import machine
 

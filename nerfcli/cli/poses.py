@@ -27,59 +27,66 @@ from nerfcli.cli.options import (
 # At least as many as structure from motion needs.
 Frames = Annotated[
     int | None,
-    typer.Option(help="Of a video, how many frames to use.  [default: 120, or all of a shorter one]", min=4),
+    typer.Option(help="Number of frames to use from a video.  [default: 120, or all of a shorter one]", min=4),
 ]
 Intrinsics = Annotated[
     Path | None,
-    typer.Option(help="A file with the photos' cameras: COLMAP's cameras.txt or .bin, a scene, transforms.json..."),
+    typer.Option(
+        help="File with the intrinsics of the cameras: COLMAP's cameras.txt or .bin, a scene, transforms.json..."
+    ),
 ]
 IntrinsicsAs = Annotated[
     str | None,
-    typer.Option(help="fixed: the intrinsics are exact; prior: the adjustment starts there.  [default: fixed]"),
+    typer.Option(help="fixed: keep the given intrinsics; prior: use them as initial values.  [default: fixed]"),
 ]
-Quality = Annotated[str, typer.Option(help="Of the poses: fast, default or best: sizes and numbers of features.")]
+Quality = Annotated[str, typer.Option(help="fast, default or best: image size and number of features.")]
 
 
 @command
 def poses(
-    photos: Annotated[str, typer.Argument(help="A folder of photos or a video, or - for such on standard input.")],
+    photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
     output: Output = None,
     frames: Frames = None,
     masks: Annotated[
-        Path | None, typer.Option(help="A folder of masks named after the photos; black is not used.")
+        Path | None, typer.Option(help="Folder of masks named after the photos; black is ignored.")
     ] = None,
     quality: Quality = "default",
     max_size: Annotated[
-        int | None, typer.Option(help="Longer side for feature extraction, pixels.  [default: by --quality]", min=100)
+        int | None,
+        typer.Option(help="Longer side of images for feature extraction, in pixels.  [default: by --quality]", min=100),
     ] = None,
     max_features: Annotated[
         int | None, typer.Option(help="SIFT features per photo.  [default: by --quality]", min=100)
     ] = None,
     pairing: Annotated[
-        str, typer.Option(help="Photos to compare: auto, exhaustive, sequential, retrieval or spatial.")
+        str, typer.Option(help="Which pairs of photos to match: auto, exhaustive, sequential, retrieval or spatial.")
     ] = "auto",
     pairs: Annotated[
-        Path | None, typer.Option(help="A file with the pairs to compare, two names per line.", dir_okay=False)
+        Path | None, typer.Option(help="File with the pairs of photos to match, two names per line.", dir_okay=False)
     ] = None,
-    camera_model: Annotated[str, typer.Option(help="auto, or a COLMAP model such as SIMPLE_RADIAL, OPENCV.")] = "auto",
+    camera_model: Annotated[
+        str, typer.Option(help="auto, or a COLMAP camera model such as SIMPLE_RADIAL or OPENCV.")
+    ] = "auto",
     intrinsics: Intrinsics = None,
     intrinsics_as: IntrinsicsAs = None,
     holdout: Holdout = None,
     strict: Strict = False,
-    min_registered: Annotated[float, typer.Option(help="Share of photos that must register.", min=0, max=1)] = 0.5,
+    min_registered: Annotated[float, typer.Option(help="Fraction of photos that must register.", min=0, max=1)] = 0.5,
     component: Annotated[
-        int, typer.Option(help="Which model becomes the scene if the photos form several: 1 is the largest.", min=1)
+        int, typer.Option(help="Which model to use if the photos form several; 1 is the largest.", min=1)
     ] = 1,
     accept_refused: Annotated[
         bool, typer.Option("--accept-refused", help="Write the scene even if the checks refuse the poses.")
     ] = False,
     memory: Memory = None,
     time_limit: Annotated[
-        str | None, typer.Option(help="Time it may take: 90s, 10m, 2h; then it ends, and a second call goes on.")
+        str | None, typer.Option(help="Stop after this time: 90s, 10m, 2h. Run the command again to continue.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and how long it takes.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show what would be done and how long it would take.")
+    ] = False,
     drop_database: Annotated[
-        bool, typer.Option("--drop-database", help="Delete features and matches once the scene is there.")
+        bool, typer.Option("--drop-database", help="Delete features and matches when the scene is complete.")
     ] = False,
     seed: Seed = 0,
     threads: Threads = 0,
@@ -87,14 +94,14 @@ def poses(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Find camera poses and intrinsics by structure from motion.
+    """Estimate camera poses and intrinsics by structure from motion.
 
-    With pycolmap. Writes PHOTOS-scene/ with a COLMAP model, scene.json and poses_report.json. The photos are neither
-    copied nor changed. Photos that do not register are listed with the reason. Of a video, the sharpest frames are
-    written to VIDEO-frames/ first; where the camera stands still it gives none.
+    Uses pycolmap. Writes PHOTOS-scene/ with a COLMAP model, scene.json and poses_report.json. Photos are neither
+    copied nor changed. Photos that do not register are listed with the reason. For a video, the sharpest frames are
+    first written to VIDEO-frames/; parts where the camera stands still are skipped.
 
-    A call that was interrupted is gone on from by the next one. database.db stays in the scene, so that with
-    --overwrite and another setting only what depends on it is done again.
+    Run the same command again to resume an interrupted one. database.db stays in the scene: with --overwrite and other
+    settings, only the steps that depend on them are repeated.
 
     \b
     Examples:
@@ -163,7 +170,7 @@ def poses(
             else:
                 typer.echo(f"{source}: {plan.describe()}")
             return
-        with console.progress(f"frames of {source.name}") as update:
+        with console.progress(f"extract frames of {source.name}") as update:
             folder = folder_of_photos(
                 source, scene, frames=frames, overwrite=overwrite, notify=console.note, progress=update
             )

@@ -1,4 +1,4 @@
-"""nerfcli render: pictures, depth maps and videos of a run."""
+"""nerfcli render: render pictures, depth maps and videos of a run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -41,31 +41,32 @@ DEFAULT_FPS = 24.0
 
 @command
 def render(
-    run: Annotated[str, typer.Argument(help="The folder that train wrote, or - for runs on standard input.")],
+    run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
     cameras: Annotated[
         str,
-        typer.Option(
-            help="test, train, orbit, ellipse, spiral, interpolate, or any file or folder that convert reads."
-        ),
+        typer.Option(help="test, train, orbit, ellipse, spiral, interpolate, or any capture that convert reads."),
     ] = "test",
     through: Annotated[
-        str | None, typer.Option(help="Photos a.jpg,b.jpg,... that the path is made from, in this order.")
+        str | None, typer.Option(help="Photos a.jpg,b.jpg,... that define the path, in this order.")
     ] = None,
     nerfstudio_frame: Annotated[
         Path | None,
-        typer.Option(help="The dataparser_transforms.json of the nerfstudio run in whose world --cameras FILE is."),
+        typer.Option(help="dataparser_transforms.json of the nerfstudio run whose coordinates --cameras FILE uses."),
     ] = None,
-    outputs: Annotated[str, typer.Option(help="Some of rgb,depth,opacity,spread,disagreement.")] = "rgb,depth,opacity",
+    outputs: Annotated[str, typer.Option(help="Any of rgb,depth,opacity,spread,disagreement.")] = "rgb,depth,opacity",
     depth: Annotated[
-        str, typer.Option(help="Which depth: conditional, moment, background, max-weight, median or quantile:0.05.")
+        str,
+        typer.Option(help="Definition of depth: conditional, moment, background, max-weight, median or quantile:0.05."),
     ] = "conditional",
     depth_axis: Annotated[
         str | None,
         typer.Option(help="ray: along the ray; z: along the optical axis.  [default: z, ray if equirectangular]"),
     ] = None,
-    min_opacity: Annotated[float, typer.Option(help="Less opaque pixels have no depth (NaN).", min=0, max=1)] = 0.5,
+    min_opacity: Annotated[
+        float, typer.Option(help="Pixels with less opacity have no depth (NaN).", min=0, max=1)
+    ] = 0.5,
     background_distance: Annotated[
-        float | None, typer.Option(help="What --depth background counts for light that passes, scene units.", min=0)
+        float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
     ] = None,
     depth_format: DepthFormat = "tiff",
     depth_scale: DepthScale = "auto",
@@ -73,56 +74,71 @@ def render(
     step: Step = 1.0,
     samples_per_pixel: SamplesPerPixel = 1,
     rgba: Rgba = False,
-    colour_map: Annotated[str, typer.Option(help="Of depth to look at: turbo, viridis or grey.")] = "turbo",
+    colour_map: Annotated[str, typer.Option(help="Colour map of depth previews: turbo, viridis or grey.")] = "turbo",
     colour_range: Annotated[
         str | None,
-        typer.Option(help="LOW:HIGH, the depths of the first and last colour.  [default: 1 % to 99 % of all pixels]"),
+        typer.Option(
+            help="LOW:HIGH, depths of the first and last colour.  [default: 1st to 99th percentile of all pixels]"
+        ),
     ] = None,
-    video: Annotated[bool, typer.Option("--video", help="A video of each output: --video-format mp4.")] = False,
+    video: Annotated[
+        bool, typer.Option("--video", help="Write a video of each output; same as --video-format mp4.")
+    ] = False,
     video_format: Annotated[
-        str | None, typer.Option(help="Some of mp4 (H.264), h265 (in mp4), webm (VP9), gif; implies --video.")
+        str | None, typer.Option(help="Any of mp4 (H.264), h265 (in mp4), webm (VP9), gif; implies --video.")
     ] = None,
     video_layout: Annotated[
-        str, typer.Option(help="separate: a video of each output; side-by-side: all outputs in one.")
+        str, typer.Option(help="separate: one video per output; side-by-side: all outputs in one video.")
     ] = "separate",
-    direction: Annotated[str, typer.Option(help="forward, reverse or ping-pong.")] = "forward",
+    direction: Annotated[str, typer.Option(help="Playing direction: forward, reverse or ping-pong.")] = "forward",
     crf: Annotated[
         int | None,
-        typer.Option(help="Constant quality of videos, 0 is best.  [default: mp4 16, h265 18, webm 20]", min=0),
+        typer.Option(help="Constant rate factor of videos, 0 is best.  [default: mp4 16, h265 18, webm 20]", min=0),
     ] = None,
     loop: Annotated[
-        int | None, typer.Option(help="Times a video plays; 0 is for ever, gif only.  [default: 1, gif 0]", min=0)
+        int | None,
+        typer.Option(help="How often a video repeats; 0 means forever (gif only).  [default: 1, gif 0]", min=0),
     ] = None,
-    count: Annotated[int, typer.Option(help="Views of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
+    count: Annotated[int, typer.Option(help="Number of views of orbit, ellipse, spiral and interpolate.", min=2)] = 60,
     fps: Annotated[
         float | None,
-        typer.Option(help="Frames per second of the video.  [default: 24, or what a camera path says]", min=1, max=240),
+        typer.Option(help="Frames per second of the video.  [default: 24, or that of a camera path]", min=1, max=240),
     ] = None,
     frames: Annotated[
         str | None,
-        typer.Option(help="START:STOP[:STEP]: render these views alone, counted from 0; assemble nothing."),
+        typer.Option(help="START:STOP[:STEP]: render only these views, counted from 0; write no videos."),
     ] = None,
     jobs: Annotated[
-        int, typer.Option(help="Processes that share the views, and --threads; 0 chooses by the work.", min=0)
+        int, typer.Option(help="Number of processes, which divide views and --threads; 0 chooses automatically.", min=0)
     ] = 0,
     cameras_only: Annotated[
         bool,
-        typer.Option("--cameras-only", help="Render nothing; write cameras.json and camera_path.json."),
+        typer.Option("--cameras-only", help="Render nothing; only write cameras.json and camera_path.json."),
     ] = False,
     max_size: Annotated[
-        int | None, typer.Option(help="Longer side of the pictures at most, pixels.  [default: as trained]", min=8)
+        int | None,
+        typer.Option(help="Maximum longer side of the pictures, in pixels.  [default: training resolution]", min=8),
     ] = None,
     width: Annotated[
-        int | None, typer.Option(help="Of the pictures, pixels; the lens is scaled with it.", min=1, max=65536)
+        int | None,
+        typer.Option(help="Width of the pictures in pixels; intrinsics are scaled accordingly.", min=1, max=65536),
     ] = None,
     height: Annotated[
-        int | None, typer.Option(help="As --width; with both, pictures are cut, never stretched.", min=1, max=65536)
+        int | None,
+        typer.Option(
+            help="Height of the pictures in pixels; with --width, pictures are cropped, never stretched.",
+            min=1,
+            max=65536,
+        ),
     ] = None,
     lens: Annotated[
-        str | None, typer.Option(help="pinhole, fisheye (equidistant) or equirectangular (360 degrees, 2:1).")
+        str | None,
+        typer.Option(help="Lens model: pinhole, fisheye (equidistant) or equirectangular (360 degrees, 2:1)."),
     ] = None,
-    fov: Annotated[float | None, typer.Option(help="Of --lens, degrees between the left and right edge.")] = None,
-    crop: Annotated[str | None, typer.Option(help="Render the part X,Y,WIDTH,HEIGHT of the pictures, pixels.")] = None,
+    fov: Annotated[float | None, typer.Option(help="Horizontal field of view of --lens, in degrees.")] = None,
+    crop: Annotated[
+        str | None, typer.Option(help="Render only the window X,Y,WIDTH,HEIGHT of the pictures, in pixels.")
+    ] = None,
     output: Output = None,
     device: Device = "auto",
     threads: Threads = 0,
@@ -130,21 +146,23 @@ def render(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render a trained run: colours, depths, opacity, videos.
+    """Render views of a run: colour, depth, opacity, videos.
 
     \b
-    The depths of a ray, exact inside each interval; less opaque pixels than --min-opacity have none (NaN):
-      conditional    mean distance of where light ends, given that it ends
+    Definitions of depth (pixels with less opacity than --min-opacity have none, NaN):
+      conditional    mean distance at which light is absorbed, given that it is
       moment         the same, not divided by the opacity                  (every pixel)
-      background     mean, with what passes at --background-distance       (every pixel)
-      max-weight     mean inside the interval that stops most light
-      median         where half of all light has ended                     (NaN if less than half ends)
-      quantile:0.05  where that share of all light has ended               (NaN if less ends)
-    spread is the standard deviation of where light ends, disagreement |median - conditional|: both are large where no
-    single depth is right (edges, glass, fog). Every file says what its numbers mean: nerfcli info FILE.
-    Writes RUN/renders/CAMERAS/. A command that was interrupted goes on with the missing views when it is given again.
-    Other videos and colours of views that are there are made without rendering (--overwrite where they replace some).
-    A cluster renders --frames 0:100, --frames 100:200, ... at a time; without --frames the same command then assembles.
+      background     mean, with light that passes at --background-distance (every pixel)
+      max-weight     mean distance inside the interval that absorbs most light
+      median         distance at which half of all light is absorbed       (NaN if less than half is)
+      quantile:0.05  distance at which 5 % of all light is absorbed        (NaN if less is)
+    spread is the standard deviation of that distance, disagreement |median - conditional|: both are large where no
+    single depth is right (edges, glass, fog). Every file describes its values: nerfcli info FILE.
+    \b
+    Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos and previews of
+    views that were already rendered are made without rendering again (add --overwrite to replace existing ones).
+    On a cluster, render --frames 0:100, --frames 100:200, ... in parallel; the same command without --frames then
+    assembles the videos.
 
     \b
     Examples:
@@ -185,7 +203,7 @@ def render(
     )
     one_of(colour_map, COLOUR_MAPS, "--colour-map")
     if max_size is not None and (width is not None or height is not None):
-        raise typer.BadParameter("give it or --width and --height", param_hint="--max-size")
+        raise typer.BadParameter("cannot be combined with --width or --height", param_hint="--max-size")
     look = look_of(width, height, lens=lens, fov_deg=fov, crop=crop)
     fps = fps or file_fps(cameras) or DEFAULT_FPS
     part = None if frames is None else frame_range(frames)
@@ -206,7 +224,9 @@ def render(
         rgba=rgba,
     )
     if rgba and videos is not None:
-        raise typer.BadParameter("a video has no alpha; leave out --rgba or the video", param_hint="--rgba")
+        raise typer.BadParameter(
+            "videos have no alpha channel; remove --rgba or the video options", param_hint="--rgba"
+        )
     views = Views(cameras, count, through, nerfstudio_frame, max_size, look)
 
     def work(folder: Path, one_of_many: bool) -> None:

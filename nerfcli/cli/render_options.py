@@ -1,4 +1,4 @@
-"""Options of `nerfcli render`: files of depth, the work that goes into a picture, videos, frames and lenses."""
+"""Options of `nerfcli render`: depth files, rendering quality, videos, frames and lenses."""
 
 import math
 import re
@@ -18,38 +18,40 @@ MOST_SAMPLES = 256
 Tolerance = Annotated[
     str,
     typer.Option(
-        help="What a channel of a colour may miss because rays stop early, as 1/255 or 0.001; the bound that was "
-        "reached is in the files. It is about the rendering of the field, not about the field."
+        help="Maximum error of a colour channel due to early stopping of rays, such as 1/255 or 0.001. It concerns the "
+        "rendering, not how accurate the field is."
     ),
 ]
 Step = Annotated[
     float,
     typer.Option(
-        help="Length of the steps along rays, in those of the training: 2 is faster, 0.5 nearer to the field.",
+        help="Step length along rays relative to training: 2 is faster, 0.5 more accurate.",
         min=1 / 64,
         max=64,
     ),
 ]
 SamplesPerPixel = Annotated[
     int,
-    typer.Option(help="Rays of a pixel, against jagged edges; depth is that of all together.", min=1, max=MOST_SAMPLES),
+    typer.Option(help="Rays per pixel, for antialiasing; depth uses all of them together.", min=1, max=MOST_SAMPLES),
 ]
 Rgba = Annotated[
     bool,
-    typer.Option("--rgba", help="Colours without background and the opacity as alpha (straight; EXR premultiplied)."),
+    typer.Option(
+        "--rgba", help="Write colour without background, with opacity as alpha (straight; EXR premultiplied)."
+    ),
 ]
 DepthFormat = Annotated[
     str,
     typer.Option(
-        help="Some of tiff, exr, npy, npz (floats; exr and npz hold all outputs of a view) and png16 (16-bit levels "
-        "beside floats)."
+        help="Any of tiff, exr, npy, npz (float32; exr and npz hold all outputs of a view) and png16 (16-bit integers, "
+        "in addition to float32)."
     ),
 ]
 DepthScale = Annotated[
     str,
     typer.Option(
-        help="Scene units per level of png16; auto: the finest of 1, 2, 5 times a power of ten that holds twice "
-        "what 99.9 % of all pixels need (what is farther has none there), never finer than a millimetre in metres."
+        help="Scene units per level of png16; auto: the finest of 1, 2, 5 times a power of ten that covers twice the "
+        "99.9th percentile of depth, but at least a millimetre in metric scenes."
     ),
 ]
 
@@ -65,9 +67,11 @@ def depth_formats(text: str, *, outputs: tuple[str, ...], convention: str) -> tu
     hint = "--depth-format"
     chosen = some_of(text, FORMATS, hint)
     if "png16" in chosen and "depth" not in outputs:
-        raise typer.BadParameter("png16 holds depth, which is not among the --outputs", param_hint=hint)
+        raise typer.BadParameter("png16 is a depth format; add depth to --outputs", param_hint=hint)
     if "png16" in chosen and convention == "moment":
-        raise typer.BadParameter("png16 keeps 0 for no depth; the moment of an empty ray is 0", param_hint=hint)
+        raise typer.BadParameter(
+            "png16 uses 0 for no depth, but the moment of an empty ray is 0; use another format", param_hint=hint
+        )
     return chosen
 
 
@@ -80,7 +84,7 @@ def level_scale(text: str, *, formats: tuple[str, ...]) -> float | None:
     if text == "auto":
         return None
     if "png16" not in formats:
-        raise typer.BadParameter("it is for --depth-format png16", param_hint="--depth-scale")
+        raise typer.BadParameter("only used with --depth-format png16", param_hint="--depth-scale")
     try:
         scale = float(text)
     except ValueError:
@@ -97,7 +101,7 @@ def finite(value: float | None, option: str) -> None:
         typer.BadParameter: it is one of them.
     """
     if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"{value} is no distance or share", param_hint=option)
+        raise typer.BadParameter(f"{value} is not a finite number", param_hint=option)
 
 
 def tolerance_of(text: str) -> float:
@@ -134,16 +138,20 @@ def video_settings(
     one_of(layout, LAYOUTS, "--video-layout")
     one_of(direction, DIRECTIONS, "--direction")
     if "gif" in chosen and fps > GIF_FASTEST_FPS:
-        raise typer.BadParameter(f"{fps:g}; players show a gif at {GIF_FASTEST_FPS:g} at most", param_hint="--fps")
+        raise typer.BadParameter(
+            f"{fps:g}; a gif plays at {GIF_FASTEST_FPS:g} frames per second at most", param_hint="--fps"
+        )
     if crf is not None:
         scaled = [name for name in chosen if FORMATS[name].crf is not None]
         if not scaled:
-            raise typer.BadParameter("a gif has no scale of quality; leave it out", param_hint="--crf")
+            raise typer.BadParameter("gif has no quality setting; remove --crf", param_hint="--crf")
         for name in scaled:
             if crf > FORMATS[name].worst_crf:
-                raise typer.BadParameter(f"{crf}; {name} ends at {FORMATS[name].worst_crf}", param_hint="--crf")
+                raise typer.BadParameter(
+                    f"{crf}; the maximum of {name} is {FORMATS[name].worst_crf}", param_hint="--crf"
+                )
     if loop == 0 and chosen != ("gif",):
-        raise typer.BadParameter("0; a gif alone can be told to play for ever", param_hint="--loop")
+        raise typer.BadParameter("0; only a gif can repeat forever", param_hint="--loop")
     return VideoSettings(formats=chosen, layout=layout, direction=direction, fps=fps, crf=crf, plays=loop)
 
 
@@ -156,7 +164,7 @@ def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[floa
     if text is None:
         return None
     if "depth" not in outputs:
-        raise typer.BadParameter("it is of depth, which is not among the --outputs", param_hint="--colour-range")
+        raise typer.BadParameter("is for depth; add depth to --outputs", param_hint="--colour-range")
     try:
         low, high = map(float, text.split(":"))
     except ValueError:
@@ -194,7 +202,7 @@ def look_of(
 
     one_of(lens, LENSES, "--lens")
     if fov_deg is not None and lens is None:
-        raise typer.BadParameter("it is the angle of --lens; give both", param_hint="--fov")
+        raise typer.BadParameter("needs --lens", param_hint="--fov")
     window = None
     if crop is not None:
         match = re.fullmatch(r"(\d+),(\d+),(\d+),(\d+)", crop.replace(" ", ""))

@@ -1,4 +1,4 @@
-"""nerfcli report: one page about a run, or about several side by side."""
+"""nerfcli report: one page about one or more runs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,10 +13,14 @@ from nerfcli.errors import UserError
 
 @command
 def report(
-    runs: Annotated[list[str], typer.Argument(help="Folders that train wrote, or - for such on standard input.")],
-    views: Annotated[int, typer.Option(help="Held-out photos to show at most, from the worst to the best.", min=0)] = 8,
-    depth: Annotated[str, typer.Option(help="Convention of the depth shown, as in render.")] = "conditional",
-    depth_axis: Annotated[str, typer.Option(help="z or ray.")] = "z",
+    runs: Annotated[
+        list[str], typer.Argument(help="Run folders written by train, or - to read paths from standard input.")
+    ],
+    views: Annotated[
+        int, typer.Option(help="Maximum number of held-out photos to show, from the worst to the best.", min=0)
+    ] = 8,
+    depth: Annotated[str, typer.Option(help="Definition of depth, as in render.")] = "conditional",
+    depth_axis: Annotated[str, typer.Option(help="z: along the optical axis; ray: along the ray.")] = "z",
     output: Output = None,
     device: Device = "auto",
     threads: Threads = 0,
@@ -24,11 +28,11 @@ def report(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write a self-contained page about a run, or about several.
+    """Write a self-contained HTML page about one or more runs.
 
-    Numbers, everything that was warned about, held-out photos beside what the run renders of them (with a border that
-    moves, error maps and depth in its convention), training curves against seconds, capture, poses, speed, settings and
-    versions. One run: RUN/report.html; several: report.html beside the first.
+    Shows metrics, warnings, held-out photos next to their renderings (with a slider, error maps and depth), training
+    curves, capture, poses, speed, settings and versions. Writes RUN/report.html, or report.html next to the first of
+    several runs.
 
     \b
     Examples:
@@ -40,12 +44,12 @@ def report(
     from nerfcli.workflows.report import report_runs
 
     if not is_convention(depth) or depth == "background":
-        raise typer.BadParameter(f"{depth!r}; choose one that render --help names", param_hint="--depth")
+        raise typer.BadParameter(f"{depth!r}; choose one listed in nerfcli render --help", param_hint="--depth")
     one_of(depth_axis, ("ray", "z"), "--depth-axis")
     console = Console(quiet=quiet, json_lines=json)
     paths = list(stdin_paths()) if runs == [STDIN] else [Path(run) for run in runs]
     if not paths:
-        raise UserError("no run was given", "give the folders that nerfcli train wrote")
+        raise UserError("no run was given", "give run folders written by nerfcli train")
     with console.progress("report") as update:
         page = report_runs(
             paths,

@@ -1,4 +1,4 @@
-"""nerfcli run: from photos to poses, field, numbers, depth maps and a video."""
+"""nerfcli run: all stages, from photos to a report."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,7 +35,7 @@ from nerfcli.cli.poses import Frames, Intrinsics, IntrinsicsAs, Quality, sizes_o
 
 @command
 def run(
-    photos: Annotated[str, typer.Argument(help="A folder of photos or a video, or - for such on standard input.")],
+    photos: Annotated[str, typer.Argument(help="Folder of photos or a video, or - to read paths from standard input.")],
     output: Output = None,
     frames: Frames = None,
     quality: Quality = "default",
@@ -46,9 +46,10 @@ def run(
     exclude: Exclude = None,
     model: ModelChoice = "auto",
     downscale: Downscale = "auto",
-    count: Annotated[int, typer.Option(help="Views of the orbit video.", min=2)] = 60,
+    count: Annotated[int, typer.Option(help="Number of views of the orbit video.", min=2)] = 60,
     max_size: Annotated[
-        int | None, typer.Option(help="Longer side of the video at most, pixels.  [default: as trained]", min=8)
+        int | None,
+        typer.Option(help="Maximum longer side of the video, in pixels.  [default: training resolution]", min=8),
     ] = None,
     holdout: Holdout = None,
     strict: Strict = False,
@@ -60,10 +61,10 @@ def run(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Do everything: poses, train, evaluate, render, video, report.
+    """Run all stages: poses, train, evaluate, render, video, report.
 
-    Writes PHOTOS-scene/ and PHOTOS-scene-run/ beside the photos, or scene/ and run/ inside --output. Stages that are
-    complete are kept, so an interrupted run goes on where it stopped. Components for --with and --without are those of
+    Writes PHOTOS-scene/ and PHOTOS-scene-run/ next to the photos, or scene/ and run/ inside --output. Completed stages
+    are kept: run the same command again to resume an interrupted run. For the components of --with and --without see
     `nerfcli train --help`.
 
     \b
@@ -122,7 +123,7 @@ def run(
         field = result_path(scene, suffix="-run", output=None, one_of_many=False)
         if output is not None:
             scene, field = scene / "scene", scene / "run"
-        with console.progress(f"frames of {source.name}") as update:
+        with console.progress(f"extract frames of {source.name}") as update:
             folder = folder_of_photos(
                 source, scene, frames=frames, overwrite=overwrite, notify=console.note, progress=update
             )
@@ -170,7 +171,7 @@ def run(
                 console.result(path)
         with console.progress("report") as update:
             page = report_runs([field], keep=True, **where, notify=console.note, progress=update)
-        console.note(f"everything about it, to look at: {page}")
+        console.note(f"report with all results: {page}")
         console.result(page)
         check_requirements(trained, evaluation.metrics, requirements)
 

@@ -1,4 +1,4 @@
-"""nerfcli selftest: how right the numbers are on this machine."""
+"""nerfcli selftest: check numerical accuracy on this machine."""
 
 import time
 from typing import TYPE_CHECKING, Annotated
@@ -35,21 +35,20 @@ def selftest(
     textbook: Annotated[
         bool,
         typer.Option(
-            "--textbook", help="Show a row per textbook formula, where it is worst, with this program's error."
+            "--textbook", help="Show one row per textbook formula: its worst case, next to the error of nerfcli."
         ),
     ] = False,
     json: Annotated[
-        bool, typer.Option("--json", help="A line of JSON per row on stdout instead of the table.")
+        bool, typer.Option("--json", help="Print one line of JSON per row on stdout instead of the table.")
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Try every kernel on hard cases and show errors, bounds, verdicts and time on this machine.
+    """Check the numerical accuracy of the kernels on hard cases.
 
-    Thin fog and opaque walls, no samples and thousands, densities at overflow, points at infinity: in float32, bfloat16
-    and in the compiled kernels, against the definitions in float64. Errors are relative; beside each stands that of the
-    formula that textbooks give.
-
-    Ends with exit code 7 if an error is above its bound.
+    Compares the kernels in float32, in bfloat16 and as compiled with their definitions in float64: thin fog and opaque
+    walls, no samples and thousands, densities near overflow, points at infinity. Prints relative errors of values and
+    gradients, their bounds, time, and the error of the textbook formula. The exit code is 7 if an error exceeds its
+    bound.
 
     \b
     Examples:
@@ -80,15 +79,15 @@ def selftest(
     met = sum(row.verdict == MET for row in measured)
     failed = [row for row in measured if row.verdict == NOT_MET]
     console.note(
-        f"{met} of {met + len(failed)} rows within their bounds; {sum(row.textbook_fails for row in formulas)} of "
-        f"{len(formulas)} textbook formulas are beyond them somewhere; {time.perf_counter() - begin:.1f} s"
+        f"{met} of {met + len(failed)} rows within bounds; {sum(row.textbook_fails for row in formulas)} of "
+        f"{len(formulas)} textbook formulas exceed them somewhere; {time.perf_counter() - begin:.1f} s"
     )
     if failed:
         row = failed[0]
         raise UserError(
-            f"{len(failed)} of {len(measured)} rows are not within their bounds; first: {row.case} ({row.operation}, "
+            f"{len(failed)} of {len(measured)} rows exceed their bounds; first: {row.case} ({row.operation}, "
             f"{row.precision})",
-            "numbers of this machine cannot be trusted; report this with the output of nerfcli selftest --json",
+            "results on this machine are not reliable; please report this with the output of nerfcli selftest --json",
             GATE_NOT_MET,
         )
 

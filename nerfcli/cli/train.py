@@ -42,12 +42,14 @@ DEFAULT_BUDGET = "2m"
 
 @command
 def train(
-    scene: Annotated[str, typer.Argument(help="A scene folder, or - for scenes on standard input.")],
+    scene: Annotated[str, typer.Argument(help="Scene folder, or - to read paths from standard input.")],
     output: Output = None,
     budget: Annotated[
         str | None, typer.Option(help="Training time: 90s, 5m, 1h.  [default: 2m, or none with --steps]")
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps in all; repeatable bit for bit.", min=1)] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Total optimizer steps; results repeat bit for bit on a CPU.", min=1)
+    ] = None,
     include: Include = None,
     exclude: Exclude = None,
     field: FieldKind = "hash",
@@ -55,14 +57,16 @@ def train(
     model: ModelChoice = "auto",
     downscale: Downscale = "auto",
     contraction: Contraction = "auto",
-    log2_rows: Annotated[
-        int, typer.Option(help="Rows of each table of a hash grid, as a power of two.", min=4, max=24)
-    ] = 16,
-    levels: Annotated[int, typer.Option(help="Tables of the field; other numbers than 8 are slow.", min=1)] = 8,
-    width: Annotated[int, typer.Option(help="Neurons of its layers; other numbers than 32 are slow.", min=1)] = 32,
-    batch: Annotated[int, typer.Option(help="Most samples of a step; the first ones are smaller.", min=2**8)] = 2**16,
+    log2_rows: Annotated[int, typer.Option(help="Rows of each hash table, as a power of two.", min=4, max=24)] = 16,
+    levels: Annotated[int, typer.Option(help="Levels of the hash grid; values other than 8 are slow.", min=1)] = 8,
+    width: Annotated[int, typer.Option(help="Width of the network layers; values other than 32 are slow.", min=1)] = 32,
+    batch: Annotated[
+        int, typer.Option(help="Maximum number of samples per step; the first steps use fewer.", min=2**8)
+    ] = 2**16,
     holdout: Holdout = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the last checkpoint to the new total.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue from the last checkpoint to the new total.")
+    ] = False,
     memory: Memory = None,
     device: Device = "auto",
     seed: Seed = 0,
@@ -73,24 +77,32 @@ def train(
 ) -> None:
     """Fit a radiance field to a scene.
 
-    SCENE is what `nerfcli poses` wrote, a COLMAP project, or a folder with transforms.json (nerfstudio, instant-ngp),
-    transforms_train.json (Blender) or poses_bounds.npy (LLFF). Photos are held out as the scene says, else every 8th,
-    or by --holdout. Writes SCENE-run/. Ctrl-C or SIGTERM saves a checkpoint; --resume goes on from it.
+    SCENE is a folder written by `nerfcli poses`, a COLMAP project, or a folder with transforms.json (nerfstudio,
+    instant-ngp), transforms_train.json (Blender) or poses_bounds.npy (LLFF). The held-out photos are those of the
+    scene, else every 8th photo, or those of --holdout. Writes SCENE-run/. Ctrl-C or SIGTERM saves a checkpoint;
+    --resume continues from it.
 
-    Components, for --with and --without: background (auto, black, constant, random, sphere: what is behind the
-    field), view (0 to 3: the degree to which colours depend on the direction), exposure (none, exif, learned:
-    brightness and white balance of each photo), cameras (fixed, poses, focal, all: what of the photos' cameras learns
-    with the field), masks (ignore, empty: what their black means), points (a weight: surfaces at points that photos
-    share), entropy (a weight: rays are opaque or clear), near (smaller gradients near cameras), distortion (a weight:
-    the light of a ray in one place), antialias (true, false: details smaller than a pixel fade out; for photos from
-    near and far), pixels (anywhere, error: more of them where the photos are explained worst). The scene decides on
-    points, exposure, cameras, background and view, unless they are named by --with or --without: short trainings on
-    up to 15 % of the budget keep a component that is better by more than the noise, on pixels of the
-    training photos that were not seen. --model default skips that.
+    \b
+    Components, for --with and --without:
+      background  auto, black, constant, random, sphere: colour behind the field
+      view        0 to 3: degree of view-dependent colour
+      exposure    none, exif, learned: brightness and white balance of each photo
+      cameras     fixed, poses, focal, all: camera parameters optimized together with the field
+      masks       ignore, empty: whether black in masks is unknown or empty space
+      points      a weight: surfaces at the 3D points of matched features
+      entropy     a weight: favour rays that are either opaque or transparent
+      near        true, false: smaller gradients near cameras
+      distortion  a weight: concentrate the density along each ray
+      antialias   true, false: fade out details smaller than a pixel; for photos from near and far
+      pixels      anywhere, error: sample more pixels where the error is large
 
-    Fields, for --field: hash (a multiresolution hash grid with two small networks: best for its time), voxels (a dense
-    grid of density and spherical harmonics), mlp (one network on Fourier features: small, and slow). The finest detail
-    of the last two is a pixel's footprint at the centre of the scene.
+    Unless they are set with --with or --without, points, exposure, cameras, background and view are selected
+    automatically: short trainings on up to 15 % of the budget keep a component if it improves PSNR by more than the
+    noise, on training pixels left out of these trials. --model default skips the selection.
+
+    Types of field, for --field: hash (a multiresolution hash grid with two small networks: best quality for its time),
+    voxels (a dense grid of density and spherical harmonics), mlp (one network on Fourier features: small and slow).
+    The resolution of the last two is one pixel's footprint at the centre of the scene.
 
     \b
     Examples:
