@@ -137,9 +137,9 @@ def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, An
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}", hint) from error
+        raise UserError(f"cannot read {path}: {error}", hint) from error
     if not isinstance(content, dict) or any(key not in content for key in needed):
-        raise UserError(f"{path} cannot be read: it lacks {', '.join(needed)}", hint)
+        raise UserError(f"cannot read {path}: {', '.join(needed)} is missing", hint)
     return content
 
 
@@ -148,7 +148,7 @@ def cannot_write(path: Path, error: OSError) -> UserError:
     reason = error.strerror or str(error)
     return UserError(
         f"cannot write {path}: {reason}",
-        "choose a writable place with -o, or free space on the disk, and run the same command again",
+        "choose a writable folder with -o or free some disk space, and run the same command again",
     )
 
 

@@ -31,7 +31,7 @@ def exclusive(path: Path, holder: str) -> Iterator[int]:
         raise cannot_write(path.parent, error) from error
     try:
         if not _take(lock):
-            raise UserError(f"another {holder}", "wait until it is done, or choose another folder with -o")
+            raise UserError(f"another {holder}", "wait until it has finished, or choose another folder with -o")
         yield lock
     finally:
         os.close(lock)

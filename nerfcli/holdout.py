@@ -29,8 +29,8 @@ def check_holdout(text: str) -> str:
     if Path(text).is_file():
         return str(Path(text).absolute())
     raise ValueError(
-        f"{text!r} is neither every:N with N from 2 on, nor block:SHARE with a share between 0 and 1, nor a file that "
-        "is there"
+        f"{text!r} is not a valid split: expected every:N with N >= 2, block:FRACTION between 0 and 1, or an existing "
+        "file"
     )
 
 
@@ -57,8 +57,8 @@ def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = (
         held_out = _listed(Path(rule), frozenset(present), frozenset(others))
     if not held_out or len(held_out) == len(present):
         raise UserError(
-            f"the hold-out {rule} takes {len(held_out)} of {len(present)} photos",
-            "some photos must be left to train on, and some to measure on",
+            f"the split {rule} holds out {len(held_out)} of {len(present)} photos",
+            "some photos are needed for training and some for evaluation",
         )
     return held_out
 
@@ -78,7 +78,7 @@ def _listed(path: Path, present: frozenset[str], others: frozenset[str]) -> froz
     if unknown:
         shown = ", ".join(unknown[:_NAMES_SHOWN])
         raise UserError(
-            f"{path} lists {len(unknown)} names that no photo has: {shown}",
-            f"names are written as in the capture, such as {min(present, default='a.jpg')}",
+            f"{path} lists {len(unknown)} names that match no photo: {shown}",
+            f"write names as in the capture, such as {min(present, default='a.jpg')}",
         )
     return listed & present

@@ -202,10 +202,10 @@ def fingerprint(scene: Scene) -> str:
 
 def _load(path: Path) -> Scene:
     if not path.exists():
-        raise UserError(f"there is no {path}", "give the folder of a scene")
+        raise UserError(f"{path} does not exist", "give a scene folder")
     if path.is_file():
         if path.suffix.lower() != ".json":
-            raise UserError(f"{path} is a file, not a scene", "give the folder of a scene, or its transforms.json")
+            raise UserError(f"{path} is a file, not a scene", "give a scene folder, or its transforms.json")
         if path.name != SCENE_FILE:
             return _scene(path.parent, read_transforms(path, _measure))
         path = path.parent
@@ -258,8 +258,8 @@ def _load_own(root: Path) -> Scene:
     images = described.image_folder
     if not images.is_dir():
         raise UserError(
-            f"{described.path}: the photos should be in {images}, which is not there",
-            "put the photos back, or set image_folder to where they are now",
+            f"{described.path}: the photo folder {images} does not exist",
+            "put the photos back, or correct image_folder in that file",
         )
     capture = read_colmap(described.model_dir, images, _measure_upright)
     listed = described.listed
@@ -298,8 +298,8 @@ def _image_folder(root: Path, model_dir: Path, model: ColmapModel) -> Path:
     folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
     if not folders:
         raise UserError(
-            f"{root} holds a COLMAP model, but no photos: there is no folder images/",
-            "put the photos that the model was made from into images/ beside it",
+            f"{root} has a COLMAP model but no photos: the folder images/ is missing",
+            "put the photos of the model into images/ next to it",
         )
     names = [image.name for image in model.images]
     return max((*folders, *homes), key=lambda folder: sum((folder / name).is_file() for name in names))
@@ -322,7 +322,10 @@ def _no_scene(path: Path) -> UserError:
         photos = len(list_images(folder)) if folder.is_dir() else 0
         if photos:
             return UserError(
-                f"{folder} holds {photos} photos, but no poses; looked for {looked_for}",
-                f"run: nerfcli poses {folder}",
+                f"{folder} has {photos} photos but no poses; looked for {looked_for}",
+                f"estimate them with: nerfcli poses {folder}",
             )
-    return UserError(f"{path} is no scene; looked for {looked_for}", "give the folder of a scene, or one of photos")
+    return UserError(
+        f"{path} is not a scene; looked for {looked_for}",
+        "give a scene folder, or estimate poses first: nerfcli poses PHOTOS",
+    )

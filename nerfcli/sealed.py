@@ -33,7 +33,7 @@ def read_sealed(path: Path) -> dict[str, Any]:
     """
     content = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(content, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     if (seal := content.pop(SEAL, None)) is not None and seal != digest(content):
-        raise ValueError("its content is not what was written")
+        raise ValueError("its content has changed since it was written")
     return content

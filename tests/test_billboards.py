@@ -128,7 +128,7 @@ def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(spheres_run, mo
     plain = evaluate_model(model, held_out, on_image=lambda done, total: None)
     metrics = evaluate_model(model, held_out, on_image=lambda done, total: None, extras=Extras(billboards=billboards))
     assert metrics["shape"] is None
-    assert metrics["warnings"] == ["whether the field shows a shape could not be checked: LinAlgError: singular matrix"]
+    assert metrics["warnings"] == ["the comparison with a model without geometry failed: LinAlgError: singular matrix"]
     assert metrics["mean"] == plain["mean"]
 
 

@@ -226,7 +226,7 @@ def test_resizing_allows_for_rounding_and_refuses_another_shape():
     assert camera.resized(1081, 1920) is camera
     eighth = camera.resized(135, 240)
     np.testing.assert_allclose(eighth.params, (1000 * 135 / 1081, 125, 67.5, 120))
-    with pytest.raises(UserError, match="1920x1081 pixels does not fit a camera of 1081x1920"):
+    with pytest.raises(UserError, match="1920x1081 pixels does not match a camera of 1081x1920"):
         camera.resized(1920, 1081)
     with pytest.raises(UserError, match="500x500 pixels"):
         camera.resized(500, 500)
@@ -263,13 +263,13 @@ def test_a_camera_survives_json_and_is_a_key():
         ("INVALID", (4, 4), (), "unknown camera model"),
         ("PINHOLE", (4, 4), (1, 1, 1), "PINHOLE has 4 parameters, got 3"),
         ("PINHOLE", (0, 4), (1, 1, 1, 1), "0x4 pixels"),
-        ("PINHOLE", (4, 4), (1, -1, 1, 1), "make no camera"),
-        ("SIMPLE_PINHOLE", (4, 4), (float("nan"), 1, 1), "make no camera"),
-        ("SIMPLE_RADIAL", (4, 4), (1, 1, 1, 1e31), "make no camera"),
-        ("EUCM", (4, 4), (1, 1, 1, 1, 1.01, 1), "make no camera"),
-        ("EUCM", (4, 4), (1, 1, 1, 1, 0.5, 0), "make no camera"),
-        ("FOV", (4, 4), (1, 1, 1, 1, 3.2), "make no camera"),
-        ("EQUIRECTANGULAR", (4, 4), (4, 0), "make no camera"),
+        ("PINHOLE", (4, 4), (1, -1, 1, 1), "invalid parameters"),
+        ("SIMPLE_PINHOLE", (4, 4), (float("nan"), 1, 1), "invalid parameters"),
+        ("SIMPLE_RADIAL", (4, 4), (1, 1, 1, 1e31), "invalid parameters"),
+        ("EUCM", (4, 4), (1, 1, 1, 1, 1.01, 1), "invalid parameters"),
+        ("EUCM", (4, 4), (1, 1, 1, 1, 0.5, 0), "invalid parameters"),
+        ("FOV", (4, 4), (1, 1, 1, 1, 3.2), "invalid parameters"),
+        ("EQUIRECTANGULAR", (4, 4), (4, 0), "invalid parameters"),
     ],
 )
 def test_what_is_no_camera_is_refused(model, size, params, what):
@@ -278,7 +278,7 @@ def test_what_is_no_camera_is_refused(model, size, params, what):
 
 
 def test_json_that_is_no_camera_is_refused():
-    with pytest.raises(UserError, match="not a camera: KeyError: 'params'"):
+    with pytest.raises(UserError, match="not a valid camera: KeyError: 'params'"):
         Camera.from_json({"model": "PINHOLE", "width": 3, "height": 3})
 
 
@@ -314,7 +314,7 @@ def test_a_calibration_is_fitted_to_the_picture_on_disk(tmp_path):
     untouched, same = fit_to_picture(camera, pose, path=path, measure=lambda _: (100, 80, 1))
     assert untouched is camera
     assert same is pose
-    with pytest.raises(UserError, match=r"a\.jpg: a picture of 90x90 pixels does not fit a camera of 100x80"):
+    with pytest.raises(UserError, match=r"a\.jpg: a picture of 90x90 pixels does not match a camera of 100x80"):
         fit_to_picture(camera, pose, path=path, measure=lambda _: (90, 90, 1))
     with pytest.raises(UserError, match="orientation 5 mirrors"):
         fit_to_picture(camera, pose, path=path, measure=lambda _: (80, 100, 5))

@@ -164,7 +164,7 @@ def test_what_the_format_cannot_hold_is_told(tmp_path):
     assert {(camera.model, camera.width, camera.height) for camera in cameras} == {("PINHOLE", 64, 48)}
     # The picture of twice the size has the same field of view.
     np.testing.assert_allclose([camera.focal_px for camera in cameras], [51, 50, 50, 50], rtol=1e-13)
-    with pytest.raises(UserError, match="there is no view to write"):
+    with pytest.raises(UserError, match="there are no views to write"):
         write_camera_path(Capture((), np.zeros((0, 3)), (), None, "x"), tmp_path / "none.json")
     assert not (tmp_path / "none.json").exists()
 
@@ -182,7 +182,7 @@ def test_nerfstudios_normalisation_is_a_similarity(tmp_path):
         ({"transform": transform.tolist(), "scale": 0}, "scale is 0"),
         ({"transform": transform[:2].tolist(), "scale": 1}, "transform is"),
         ({"transform": transform[:, :3].tolist(), "scale": 1}, "transform has 9 numbers"),
-        ({"transform": (2 * transform).tolist(), "scale": 1}, "is no rotation"),
+        ({"transform": (2 * transform).tolist(), "scale": 1}, "is not a rotation"),
     ):
         with pytest.raises(UserError, match=what) as caught:
             read_normalisation(written(tmp_path, broken))
@@ -230,8 +230,8 @@ TRANSPOSED = np.array(OPENGL_POSE).reshape(4, 4).T.ravel().tolist()
         ({"camera_to_world": [*OPENGL_POSE[:15], 10**400]}, r"camera_to_world: \[15\] is 1000"),
         ({"camera_to_world": ["0", *OPENGL_POSE[1:]]}, r"camera_to_world: \[0\] is '0'"),
         ({"camera_to_world": [[1.0], [2.0, 3.0], [4.0]]}, "camera_to_world has 4 numbers"),
-        ({"camera_to_world": TRANSPOSED}, "its last row is 1, 2, 3, 1"),
-        ({"camera_to_world": [2.0, *OPENGL_POSE[1:]]}, "is no rotation"),
+        ({"camera_to_world": TRANSPOSED}, "the last row is 1, 2, 3, 1"),
+        ({"camera_to_world": [2.0, *OPENGL_POSE[1:]]}, "is not a rotation"),
         ({"camera_to_world": [0.0, 0, -1, *OPENGL_POSE[3:]]}, "mirrors the scene"),
     ],
 )

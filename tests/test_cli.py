@@ -241,7 +241,7 @@ def test_damaged_photos_are_named_with_what_is_wrong(tmp_path):
     assert result.exit_code == TOO_FEW_PHOTOS
     error, hint = error_of(result)
     assert "only 2 of 4 photos" in error
-    assert "photo 0.jpg: damaged or cut short" in error.replace(" is ", " ")
+    assert "photo 0.jpg: damaged or truncated" in error.replace(" is ", " ")
     assert "copy the damaged files again" in hint
     assert listing(tmp_path) == before
 
@@ -251,7 +251,7 @@ def test_photos_without_poses_are_sent_to_poses(tmp_path):
     result = nerfcli("train", photos, *QUICK)
     assert result.exit_code == BAD_INPUT
     error, hint = error_of(result)
-    assert "holds 5 photos, but no poses" in error
+    assert "has 5 photos but no poses" in error
     assert f"nerfcli poses {photos}" in hint
     assert not (tmp_path / "photos-run").exists()
 
@@ -336,7 +336,7 @@ def test_train_evaluate_render_info_in_a_row(capture):
     assert (reported.exit_code, reported.stdout) == (0, f"{run / 'report.html'}\n")
     assert f"{metrics['mean']['psnr']:.2f} dB" in (run / "report.html").read_text(encoding="utf-8")
     both = nerfcli("report", run, run, "-o", run / "report.html")
-    assert (both.exit_code, "is no page of this report" in both.stderr) == (3, True)
+    assert (both.exit_code, "is not a page of this report" in both.stderr) == (3, True)
     told = json.loads(nerfcli("info", run, "--json").stdout)
     assert (told["kind"], told["photos"], told["held_out"], told["step"]) == ("run", 4, 1, 1)
     assert told["metrics"] == metrics["mean"]
@@ -410,7 +410,7 @@ def test_python_m_nerfcli_is_the_program():
 def test_there_is_no_place_beside_the_root():
     result = nerfcli("poses", "/")
     assert result.exit_code == BAD_INPUT
-    assert error_of(result) == ("Error: there is no place beside /", "Hint:  say with -o where the result shall go")
+    assert error_of(result) == ("Error: cannot write a result next to /", "Hint:  choose the output folder with -o")
 
 
 def test_many_inputs_share_one_output_folder(capture, tmp_path):
@@ -423,7 +423,7 @@ def test_many_inputs_share_one_output_folder(capture, tmp_path):
 def test_an_empty_batch_is_told(command, stdin, tmp_path):
     result = nerfcli(command, "-", *needed(command, tmp_path), stdin=stdin)
     assert result.exit_code == BAD_INPUT
-    assert "no path came on standard input" in error_of(result)[0]
+    assert "no paths on standard input" in error_of(result)[0]
 
 
 def test_a_finished_training_is_kept_another_one_refused_and_overwritten_on_demand(capture):
@@ -487,7 +487,7 @@ def test_metrics_are_kept_for_the_same_checkpoint_and_refused_for_another(finish
     write_json(finished / "metrics.json", metrics)
     result = nerfcli("evaluate", finished)
     assert result.exit_code == BAD_INPUT
-    assert "earlier state" in error_of(result)[0]
+    assert "earlier checkpoint" in error_of(result)[0]
     assert nerfcli("evaluate", finished, "--overwrite").exit_code == 0
 
 
@@ -565,7 +565,7 @@ def test_a_folder_with_other_files_is_never_replaced_by_renders(finished, tmp_pa
     for target in (tmp_path / "diary", tmp_path / "diary" / "monday.txt"):
         result = nerfcli("render", finished, "--outputs", "rgb", "-o", target, "--overwrite")
         assert result.exit_code == BAD_INPUT
-        assert "something else than renders" in error_of(result)[0]
+        assert "does not contain renders" in error_of(result)[0]
     assert listing(tmp_path / "diary") == {"monday.txt": b"rain"}
 
 
@@ -597,7 +597,7 @@ def test_cameras_of_another_file_and_none_at_all(capture, finished, tmp_path):
     assert len(list((tmp_path / "views" / "rgb").rglob("*.png"))) == 5
     result = nerfcli(*arguments, "--cameras", "somewhere")
     assert result.exit_code == BAD_INPUT
-    assert "no cameras called somewhere" in error_of(result)[0]
+    assert "no cameras found at somewhere" in error_of(result)[0]
 
 
 def views_of(folder: Path) -> list[dict[str, Any]]:
@@ -723,8 +723,8 @@ def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(sent, exit_co
     assert not any(word in stderr for word in ("Traceback", "stack trace"))
     saved, ended = stderr.splitlines()[-2:]
     go_on = f"nerfcli train {shlex.quote(str(capture))} -o {shlex.quote(str(run))} --resume"
-    assert saved == f"checkpoint saved; go on with: {go_on}"
-    assert ended.endswith("; what was complete is kept.")
+    assert saved == f"checkpoint saved; continue with: {go_on}"
+    assert ended.endswith("; completed work is kept.")
     assert {path.name for path in run.iterdir()} >= {"config.json", "field.safetensors", "state.safetensors"}
     assert not list(run.rglob("*partial*"))
     trained = read_log(run)[-1]

@@ -76,9 +76,9 @@ def test_videos_and_folders_on_standard_input(clip, estimated):
     assert result.stdout.splitlines() == ["photos-scene", "my clip-scene"]
     assert [folder for folder, _, _ in estimated] == ["photos", "my clip-frames"]
     for told in (
-        "photos is no video: all of its photos",
-        "sound.m4a: there is no video stream",
-        "cut.mp4 is cut short",
+        "photos is not a video: using all of its photos",
+        "sound.m4a: contains no video stream",
+        "cut.mp4 is truncated",
     ):
         assert told in result.stderr
     assert sorted(path.name for path in Path().iterdir() if "frames" in path.name) == ["my clip-frames"]
@@ -95,7 +95,7 @@ def test_more_frames_than_there_are(clip, estimated):
     assert result.exit_code == BAD_INPUT
     assert result.stderr.splitlines()[-2:] == [
         "Error: my clip.MOV has 20 frames, 21 were asked for",
-        "Hint:  ask for --frames 20 or fewer",
+        "Hint:  use --frames 20 or fewer",
     ]
     assert (estimated, Path("my clip-frames").exists()) == ([], False)
 
@@ -110,7 +110,7 @@ def test_a_camera_that_stands_still(tmp_path, estimated):
 def test_frames_and_scene_are_kept(clip, estimated):
     nerfcli("poses", clip, "--frames", "6")
     assert "my clip-frames is kept" in nerfcli("poses", clip, "--frames", "6").stderr
-    assert "my clip-frames holds other frames" in nerfcli("poses", clip, "--frames", "5").stderr
+    assert "my clip-frames contains other frames" in nerfcli("poses", clip, "--frames", "5").stderr
     assert nerfcli("poses", clip, "--frames", "5", "--overwrite").exit_code == 0
     assert [count for _, _, count in estimated] == [6, 6, 5]
 

@@ -200,8 +200,8 @@ def test_axes_and_pixel_centre_of_the_written_file(form, tmp_path):
 @pytest.mark.parametrize(
     ("form", "options", "message"),
     [
-        ("colmap", ("--axes", "opengl"), "colmap fixes the camera axes"),
-        ("opensfm", ("--pixel-center", "0"), "opensfm fixes where pixel positions count from"),
+        ("colmap", ("--axes", "opengl"), "colmap prescribes the camera axes"),
+        ("opensfm", ("--pixel-center", "0"), "opensfm prescribes the pixel convention"),
     ],
 )
 def test_a_convention_that_the_format_fixes_is_refused(form, options, message, tmp_path):
@@ -427,7 +427,7 @@ def test_a_view_under_another_name_is_found(tmp_path, monkeypatch):
     monkeypatch.setattr(transforms, "relative_path", lambda frame, folder: "photo 01.png")
     result = nerfcli("convert", source, tmp_path / "out", "--to", "transforms", "--allow-loss")
     assert result.exit_code == GATE_NOT_MET
-    assert "where photo 00.png should be, it lists photo 01.png" in error_of(result)[0]
+    assert "it lists photo 01.png instead of photo 00.png" in error_of(result)[0]
 
 
 def test_after_a_fault_the_old_result_stands(tmp_path, monkeypatch):
@@ -459,7 +459,7 @@ def test_points_alone(tmp_path):
     result = nerfcli("convert", source, tmp_path / "points.ply", "--to", "ply", "--allow-loss")
     assert result.exit_code == 0, result.stderr
     assert "6 cameras and their poses" in result.stderr
-    assert "its 60 points are those of" in result.stderr
+    assert "its 60 points equal those of" in result.stderr
     capture = capture_of([PINHOLE])
     shifted = replace(capture, points=capture.points + 1e-9)
     wrong = replace(format_named("ply"), write=lambda _, path: write_ply(shifted, path))
@@ -558,7 +558,7 @@ def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, 
 
 def test_what_was_looked_for_is_told(tmp_path):
     (tmp_path / "notes.md").write_text("hello")
-    with pytest.raises(UserError, match="holds no capture in a known format") as caught:
+    with pytest.raises(UserError, match="contains no capture in a supported format") as caught:
         recognise(tmp_path)
     for form in FORMATS:
         assert form.parse is None or form.looked_for in caught.value.hint

@@ -169,7 +169,7 @@ def test_the_epipolar_error_is_the_distance_in_pixels():
 def test_points_alone_tell_axes(tmp_path):
     capture = replace(misread(capture_of([PINHOLE]), Convention("opencv"), "opengl"), observations=None)
     found = detect(capture, axes="opengl", progress=silent)
-    assert "whether they lie inside" in found.evidence
+    assert "the visibility of" in found.evidence
     assert [question.name for question in found.questions] == ["axes and direction"]
     best = found.questions[0].answers[0]
     assert best.inlier_share == 1
@@ -250,7 +250,7 @@ def test_photos_tell_the_convention_and_how_to_read_it(meant, photographed, tmp_
     result = nerfcli("convert", tmp_path, "--detect")
     assert result.exit_code == 0, result.stderr
     assert "SIFT matches" in result.stdout
-    assert "holds" in result.stdout
+    assert "fits" in result.stdout
     report = json.loads(nerfcli("convert", tmp_path, "--detect", "--json").stdout)
     axes, size, centre = report["questions"]
     assert (axes["verdict"], size["verdict"]) == ("holds", "holds")
@@ -277,13 +277,13 @@ def test_nothing_to_judge_by(tmp_path):
     write_npz(capture, tmp_path / "in.npz")
     result = nerfcli("convert", tmp_path / "in.npz", "--detect")
     assert result.exit_code == BAD_INPUT
-    assert "nothing to judge the convention by" in error_of(result)[0]
+    assert "the convention cannot be detected" in error_of(result)[0]
     assert "--images" in error_of(result)[1]
 
 
 def test_a_photo_of_another_shape_is_told(photographed):
     other = replace(photographed.frames[0], camera=Camera.pinhole(500, 300, 420.0))
-    with pytest.raises(UserError, match="480x360 pixels does not fit a camera of 500x300"):
+    with pytest.raises(UserError, match="480x360 pixels does not match a camera of 500x300"):
         match_neighbours((other, *photographed.frames[1:]), progress=silent)
 
 

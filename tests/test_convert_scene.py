@@ -113,7 +113,7 @@ def test_cameras_of_a_scene_are_for_upright_photos(camera, tmp_path):
     assert nerfcli("convert", npz_of(tmp_path, capture), tmp_path / "sparse/0", "--to", "colmap").exit_code == 0
     result = nerfcli("convert", tmp_path, tmp_path / "scene", "--to", "nerfcli")
     assert result.exit_code == 0, result.stderr
-    assert "3 photos have an EXIF orientation: their cameras refer to the pixels upright" in result.stderr
+    assert "3 photos have an EXIF orientation: their cameras refer to pixels upright" in result.stderr
     scene = scenes.load(tmp_path / "scene")
     _, _, parsed = load(tmp_path / "scene", Given(), Doubt())
     assert parsed.observations is not None
@@ -148,7 +148,7 @@ def test_other_programs_get_cameras_for_the_pixels_as_they_are_stored(form, plac
     options = ("--pixels", "stored", "--allow-loss")
     result = nerfcli("convert", tmp_path / "scene", tmp_path / place, "--to", form, *options)
     assert result.exit_code == 0, result.stderr
-    assert "3 photos have an EXIF orientation: their cameras refer to the pixels as stored" in result.stderr
+    assert "3 photos have an EXIF orientation: their cameras refer to pixels as stored" in result.stderr
     assert farthest_px(capture, load(tmp_path / place, Given(), Doubt())[2]) < LIMIT_PX
     if form in ("colmap", "colmap-text", "transforms"):
         trained = scenes.load(tmp_path)
@@ -224,7 +224,7 @@ def test_masks_and_depth_bounds_of_any_layout_are_kept(tmp_path):
     np.testing.assert_array_equal(scene.depth_bounds, bounds)
     assert capture.frames[4].mask is not None
     capture.frames[4].mask.unlink()
-    with pytest.raises(UserError, match=r"the mask of photo 04\.png, is not there"):
+    with pytest.raises(UserError, match=r"the mask of photo 04\.png, does not exist"):
         scenes.load(tmp_path / "scene")
 
 
@@ -245,7 +245,7 @@ def test_photos_in_several_folders_get_their_paths_for_names(tmp_path):
     frames = photographed(capture, tmp_path / "a").frames[:3] + photographed(capture, tmp_path / "b").frames[3:]
     source = npz_of(tmp_path, replace(capture, frames=frames))
     refused = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
-    assert "the names of 6 photos, which become their paths below one folder" in error_of(refused)[0]
+    assert "the names of 6 photos, which become paths relative to one folder" in error_of(refused)[0]
     result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli", "--allow-loss")
     assert result.exit_code == 0, result.stderr
     assert [frame.name for frame in scenes.load(tmp_path / "scene").frames][2:4] == ["a/photo 02.png", "b/photo 03.png"]
@@ -261,7 +261,7 @@ def test_views_without_photos_make_no_scene(tmp_path):
     source = npz_of(tmp_path, gone)
     result = nerfcli("convert", source, tmp_path / "scene", "--to", "nerfcli")
     assert result.exit_code == BAD_INPUT
-    assert "none of the 6 photos is on disk" in error_of(result)[0]
+    assert "none of the 6 photos exists" in error_of(result)[0]
     assert set(listing(tmp_path)) == before
     assert not (tmp_path / "scene").exists()
 
@@ -307,10 +307,10 @@ def test_a_scene_is_replaced_only_when_asked_and_after_a_fault_stands_again(tmp_
         ("colmap", {"observations": "moved"}, "the observations of photo 00.png differ"),
         ("npz", {"observations": "other"}, "the observations of photo 00.png differ"),
         ("nerfcli", {"observations": "none"}, "the observations of photo 00.png differ"),
-        ("transforms", {"masks": "none"}, "photo 01.png has a mask in one and none in the other"),
+        ("transforms", {"masks": "none"}, "photo 01.png has a mask in only one of the two"),
         ("npz", {"masks": "other"}, "the mask of photo 01.png would be"),
-        ("transforms", {"splits": "other"}, "photo 00.png is of test and became train"),
-        ("nerfcli", {"splits": "other"}, "photo 00.png is of test and became train"),
+        ("transforms", {"splits": "other"}, "the split of photo 00.png changed from test to train"),
+        ("nerfcli", {"splits": "other"}, "the split of photo 00.png changed from test to train"),
         ("llff", {"bounds": "other"}, "its depth bounds differ"),
         ("npz", {"unit": "other"}, "its unit is arbitrary, not metre"),
     ],
@@ -370,5 +370,5 @@ def test_intrinsics_for_another_size_are_told_once(command, tmp_path):
         said = nerfcli("train", tmp_path, "--resume", "-o", tmp_path / "run").stderr  # it ends for want of a run
     else:
         said = nerfcli("convert", tmp_path, tmp_path / "out", "--to", "colmap").stderr
-    assert said.count("5 photos are 640x480, and the intrinsics are given for 1280x960") == 1
-    assert said.count("1 photo is 480x640, and the intrinsics are given for 960x1280") == 1
+    assert said.count("5 photos are 640x480, but the intrinsics are for 1280x960") == 1
+    assert said.count("1 photo is 480x640, but the intrinsics are for 960x1280") == 1

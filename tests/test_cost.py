@@ -127,7 +127,7 @@ def test_nothing_is_finer_than_a_pixel(contraction):
 
 
 def test_memory_that_holds_no_field_is_told():
-    with pytest.raises(UserError, match="no field fits into 100 bytes: the smallest takes"):
+    with pytest.raises(UserError, match="no field fits into 100 bytes: the smallest needs"):
         chosen_size("voxels", hash_grid=HASH, footprint=0.01, memory_bytes=100)
 
 

@@ -102,7 +102,7 @@ def test_levels_are_read_alike_by_three_libraries(tmp_path):
     )
     assert np.nanmax(np.abs(expected * 1e-3 - depth.astype(np.float64))[expected > 0]) == pytest.approx(rounding)
     with Image.open(path) as image:
-        assert "a level is 1 mm, 0 is no value" in image.info["Comment"]
+        assert "one level is 1 mm, 0 means no value" in image.info["Comment"]
 
 
 def test_an_exr_has_the_channels_that_compositing_programs_look_for(tmp_path):
@@ -201,11 +201,11 @@ def test_what_does_not_fit_into_levels_is_refused(tmp_path):
     """Neither wrapped nor clipped, and no depth turns into "no depth"."""
     path = tmp_path / "a.png"
     for value, told in (
-        (65.536, r"16 bits hold depths up to 65.535 at 0.001 per level; one is 65.536"),
-        (math.inf, r"one is inf"),
-        (4e-4, r"a depth of 0.0004 would read as no depth in levels of 0.001"),
-        (0.0, r"a depth of 0 would read as no depth"),
-        (-2.0, r"a depth of -2 would read as no depth"),
+        (65.536, r"16 bits hold depth up to 65.535 at 0.001 per level, but the maximum is 65.536"),
+        (math.inf, r"maximum is inf"),
+        (4e-4, r"a depth of 0.0004 would become 0 \(no value\) in levels of 0.001"),
+        (0.0, r"a depth of 0 would become 0"),
+        (-2.0, r"a depth of -2 would become 0"),
     ):
         with pytest.raises(UserError, match=told):
             write_png16(path, np.full((2, 2), value, np.float32), META, units_per_level=1e-3)
@@ -251,7 +251,7 @@ def test_files_of_the_first_version_keep_their_meaning(tmp_path):
 def test_maps_of_another_meaning_are_not_mixed(change, told):
     other = replace(META, **change)
     assert difference_of(META, other) == told
-    with pytest.raises(UserError, match=rf"b\.tiff and a\.tiff do not mean the same: {told}"):
+    with pytest.raises(UserError, match=rf"b\.tiff and a\.tiff have different definitions: {told}"):
         refuse_mixing([(Path("a.tiff"), META), (Path("b.tiff"), other)])
 
 
@@ -265,19 +265,19 @@ def test_reading_what_is_no_depth_map_tells_why(tmp_path):
     with pytest.raises(UserError, match=r"cannot read .*a\.tif: No such file"):
         read_tiff(path)
     path.write_bytes(b"")
-    with pytest.raises(UserError, match=r"a\.tif is damaged or no TIFF"):
+    with pytest.raises(UserError, match=r"a\.tif is damaged or not a TIFF"):
         read_tiff(path)
     path.write_text("this is text\n" * 50)
-    with pytest.raises(UserError, match=r"a\.tif is damaged or no TIFF"):
+    with pytest.raises(UserError, match=r"a\.tif is damaged or not a TIFF"):
         read_tiff(path)
     write_tiff(path, np.random.default_rng(0).random((64, 64), np.float32), META)
     path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(UserError, match=r"a\.tif is damaged or no TIFF"):
+    with pytest.raises(UserError, match=r"a\.tif is damaged or not a TIFF"):
         read_tiff(path)
     tifffile.imwrite(path, np.zeros((4, 5), np.uint16))
-    with pytest.raises(UserError, match=r"a\.tif holds uint16 \(4, 5\), not a float32 depth map"):
+    with pytest.raises(UserError, match=r"a\.tif contains uint16 \(4, 5\), not a float32 depth map"):
         read_tiff(path)
     for description in ("", "a depth map", "[1]", '{"axis": "ray"}', "3"):
         tifffile.imwrite(path, np.zeros((4, 5), np.float32), description=description, metadata=None)
-        with pytest.raises(UserError, match=r"a\.tif does not say what its depth means"):
+        with pytest.raises(UserError, match=r"a\.tif does not state its definition of depth"):
             read_tiff(path)

@@ -169,11 +169,11 @@ def test_exif_of_another_picture_is_named(clean):
         return inventory.focal_length([replace(f, exif=e) for f, e in zip(clean.facts, exifs, strict=False)])
 
     assert focal_length(exif, resized).verdict == GOOD
-    assert focal_length(exif, resized).summary == "0.81 times the longer side by EXIF (2 photos)"
+    assert focal_length(exif, resized).summary == "0.81 times the longer side, from EXIF (2 photos)"
     found = focal_length(resized, cropped)
     assert (found.verdict, found.names) == (LOOK, ("01.jpg",))
     assert "EXIF is of 4032x2268 pixels" in found.summary
-    assert "give intrinsics" in found.advice
+    assert "give --intrinsics" in found.advice
 
 
 # Whole captures
@@ -383,7 +383,7 @@ def test_weakly_determined_intrinsics_of_a_scene_are_named(tmp_path):
     assert bad is not None
     assert (good.verdict, good.number) == (GOOD, 0.2)
     assert (bad.verdict, bad.number) == (LOOK, 4.0)
-    assert "weakly determined: focal length +-4 %" in bad.summary
+    assert "weakly determined: focal length ± 4 %" in bad.summary
     assert "--intrinsics" in bad.advice
 
 
@@ -445,10 +445,10 @@ def test_only_a_page_of_the_same_capture_is_replaced(clean, tmp_path):
     page = tmp_path / "page.html"
     page.write_text(page_html(clean.diagnosis()), encoding="utf-8")
     refuse_foreign(page, clean.folder)
-    with pytest.raises(UserError, match="no page of this capture"):
+    with pytest.raises(UserError, match="not a page of this capture"):
         refuse_foreign(page, tmp_path)
     page.write_text("mine")
-    with pytest.raises(UserError, match="no page of this capture"):
+    with pytest.raises(UserError, match="not a page of this capture"):
         refuse_foreign(page, clean.folder)
 
 

@@ -177,7 +177,7 @@ def test_masked_pixels_do_not_count():
 
 def test_a_mask_that_hides_a_whole_photo_is_told():
     hidden = HeldOut(frame("a.png"), noise(0, (12, 16, 3)), np.zeros((12, 16), dtype=bool))
-    with pytest.raises(UserError, match=r"no pixel of a\.png is left to compare"):
+    with pytest.raises(UserError, match=r"no pixels of a\.png are left to compare"):
         evaluate_model(fog(NOWHERE, Similarity.identity()), [hidden], on_image=lambda done, total: None)
 
 
@@ -196,6 +196,6 @@ def test_protocol_says_what_was_measured():
 
 
 def test_nothing_held_out_is_told():
-    with pytest.raises(UserError, match="no held-out photo to evaluate on") as caught:
+    with pytest.raises(UserError, match="no held-out photos to evaluate on") as caught:
         evaluate_model(fog(NOWHERE, Similarity.identity()), [], on_image=lambda done, total: None)
     assert caught.value.exit_code == BAD_INPUT

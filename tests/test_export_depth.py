@@ -111,7 +111,7 @@ def test_maps_beside_depth_state_their_own_convention_and_floor(model, tmp_path)
 
 def test_levels_of_a_clip_in_metres_are_millimetres(model, tmp_path):
     notes = export(model, ordered([frame("a"), frame("b", 3.0)], formats=("png16",)), tmp_path / "views")
-    assert "16-bit files: a level is 1 mm, 0 is no value" in notes
+    assert "16-bit files: one level is 1 mm, 0 means no value" in notes
     for name, distance in (("a", 2.0), ("b", 3.0)):
         depth = pictured(model, name, distance).depth
         assert depth is not None
@@ -146,7 +146,7 @@ def test_a_few_far_pixels_do_not_make_levels_coarse(tmp_path):
     assert told is not None
     assert told.error_bounds["pixels_beyond_levels"] == 3
     # A length that is asked for holds all or is refused.
-    with pytest.raises(UserError, match="one is 1000"):
+    with pytest.raises(UserError, match="maximum is 1000"):
         write_levels(tmp_path, ["a"], settings=replace(settings, depth_scale=1e-3), meaning=meaning)
     # Where all of it is within twice what most needs, all of it is held.
     depths[0, :3, 0] = 5.0
@@ -158,7 +158,7 @@ def test_a_few_far_pixels_do_not_make_levels_coarse(tmp_path):
 def test_levels_that_are_too_short_leave_the_earlier_export_alone(model, tmp_path):
     export(model, ordered([frame("a")]), tmp_path / "views")
     before = {path: path.read_bytes() for path in (tmp_path / "views").rglob("*") if path.is_file()}
-    with pytest.raises(UserError, match=r"16 bits hold depths up to 0\.65535 at 1e-05 per level; one is"):
+    with pytest.raises(UserError, match=r"16 bits hold depth up to 0\.65535 at 1e-05 per level, but the maximum is"):
         export(model, ordered([frame("a")], formats=("png16",), depth_scale=1e-5), tmp_path / "views")
     assert {path: path.read_bytes() for path in (tmp_path / "views").rglob("*") if path.is_file()} == before
 
@@ -173,7 +173,7 @@ def test_a_file_of_another_meaning_is_not_read_into_a_clip(file_format, model, t
         expected = meaning.of(output, opacity_floor=floor_of(DEPTH, output))
         np.testing.assert_array_equal(read_map(tmp_path, "a", expected), getattr(pictured(model), output))
     write_maps(pictured(model), tmp_path, "a", settings=settings, meta=replace(meaning, axis="ray"))
-    with pytest.raises(UserError, match=r"a\.\w+ and the other frames do not mean the same: axis z and ray"):
+    with pytest.raises(UserError, match=r"a\.\w+ and the other frames have different definitions: axis z and ray"):
         read_map(tmp_path, "a", meaning)
 
 
@@ -181,7 +181,7 @@ def test_depth_without_a_meaning_is_not_read_into_a_clip(model, tmp_path):
     tifffile.imwrite(tmp_path / "a.tiff", np.zeros((8, 10), np.float32))
     (tmp_path / "depth").mkdir()
     (tmp_path / "a.tiff").rename(tmp_path / "depth/a.tiff")
-    with pytest.raises(UserError, match="nothing says what it means"):
+    with pytest.raises(UserError, match="it does not state what its values mean"):
         read_map(tmp_path, "a", depth_meta(model, DEPTH))
 
 
@@ -195,6 +195,6 @@ def test_depth_without_a_meaning_is_not_read_into_a_clip(model, tmp_path):
 )
 def test_a_folder_of_another_meaning_is_told_as_that(other, told, model, tmp_path):
     export(model, ordered([frame("a")], outputs=("depth",)), tmp_path / "views")
-    with pytest.raises(UserError, match=f"views holds depth of another meaning: {told}"):
+    with pytest.raises(UserError, match=f"views contains depth with another definition: {told}"):
         ordered([frame("a")], outputs=("depth",), depth=other).is_held_by(tmp_path / "views")
     assert ordered([frame("a")], outputs=("depth",)).is_held_by(tmp_path / "views")

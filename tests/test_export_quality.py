@@ -54,7 +54,7 @@ def test_every_file_states_the_error_of_its_rendering(views):
     assert 0 <= facts["truncation_of_colour_mean"] <= facts["truncation_of_colour_max"] <= 0.01
     assert facts["pixels_measured"] == 80
     assert facts["quadrature_of_depth_p95"] > 0
-    assert "not about how far the field is from the scene" in description["error_meaning"]
+    assert "not how close the field is to the scene" in description["error_meaning"]
     _, meta = read_tiff(views / "depth/a.tiff")
     assert {name: meta.error_bounds[name] for name in facts} == facts
     assert meta.error_bounds["meaning"] == description["error_meaning"]

@@ -154,7 +154,7 @@ def test_parts_are_put_together_without_rendering(model, tmp_path, in_one_go):
     for part in (range(3, 4), range(0, 3, 2), range(1, 4)):
         export_part(model, order(), folder, part, on_rays=lambda rays: None, notify=told.append)
         assert not folder.exists()
-    assert [text.split(" frames are there")[0] for text in told] == ["1 of 4", "3 of 4", "2 of 3", "4 of 4"]
+    assert [text.split(" frames are ")[0] for text in told] == ["1 of 4", "3 of 4", "resuming: 2 of 3", "4 of 4"]
     done: list[int] = []
     export(model, order(), folder, on_rays=done.append)
     assert done == [4 * PIXELS]
@@ -192,7 +192,7 @@ def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in
     assert done == [PIXELS] * 4
     assert contents(tmp_path / "views") == in_one_go
     (death,) = [text for text in told if "process" in text]
-    assert "was ended by signal 9 (SIGKILL) while it rendered" in death
+    assert "was ended by signal 9 (SIGKILL) while rendering" in death
     assert not multiprocessing.active_children()
 
 
@@ -253,7 +253,7 @@ def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monk
 
     monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_kill)
     told: list[str] = []
-    with pytest.raises(UserError, match=f"die while they render f[01]/v: .* signal {signal.SIGKILL:d}") as caught:
+    with pytest.raises(UserError, match=f"keep failing on f[01]/v: .* signal {signal.SIGKILL:d}") as caught:
         export_frames(
             *(model, order(), tmp_path / "views"),
             on_rays=lambda rays: None,
@@ -261,7 +261,7 @@ def test_processes_that_die_again_and_again_end_the_export(model, tmp_path, monk
             workers=Workers(jobs=2, threads=2),
         )
     assert caught.value.exit_code == OUT_OF_MEMORY
-    assert "renders it again" in told[0]
+    assert "retrying it" in told[0]
 
 
 # What is made of pictures that are there
@@ -297,7 +297,7 @@ def test_what_would_be_replaced_is_asked_for_and_what_is_added_is_not(model, tmp
     assert order(video=None).is_held_by(folder)
     export(model, order(), folder)
     assert order().is_held_by(folder)
-    with pytest.raises(UserError, match="holds the same pictures with other videos") as caught:
+    with pytest.raises(UserError, match="contains the same pictures with different videos") as caught:
         order(video=replace(VIDEO, fps=30)).is_held_by(folder)
     assert "--overwrite" in caught.value.hint
 
@@ -366,12 +366,12 @@ def test_what_no_video_can_be_made_of_is_told_before_rendering(model, tmp_path, 
     first, second = order(2).frames
     other = Frame("other.png", Camera.pinhole(12, 8, 8.0), second.world_from_cam)
     mixed = Order((first, other), order().settings, {})
-    with pytest.raises(UserError, match="the views have 2 sizes \\(10x8, 12x8\\); a video has one"):
+    with pytest.raises(UserError, match="the views have 2 different sizes \\(10x8, 12x8\\), which cannot be combined"):
         export(model, mixed, tmp_path / "views", on_rays=rendered)
     program = tmp_path / "ffmpeg"
     program.write_text("#!/bin/sh\necho ' V....D libx264 H.264'\n")
     program.chmod(0o755)
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
-    with pytest.raises(UserError, match="cannot make gif videos"):
+    with pytest.raises(UserError, match="cannot write gif videos"):
         export(model, order(video=VideoSettings(formats=("gif",))), tmp_path / "views", on_rays=rendered)
     assert list(tmp_path.iterdir()) == [program]

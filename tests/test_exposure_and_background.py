@@ -204,7 +204,7 @@ def test_what_is_behind_an_object_is_not_exposed():
 
 
 def test_behind_photos_with_alpha_nothing_is_learned():
-    with pytest.raises(UserError, match="these photos have alpha"):
+    with pytest.raises(UserError, match="their alpha channel says"):
         parts_of(LEARNED, torch.rand(2, 4), [0.0, 0.0])
 
 

@@ -333,6 +333,6 @@ def test_a_field_from_before_there_were_kinds_is_a_hash_grid(tmp_path):
 
 
 def test_a_kind_of_a_later_version_is_told():
-    with pytest.raises(UserError, match="fields of the kind 'gaussians' are not known here") as caught:
+    with pytest.raises(UserError, match="unknown type of field: 'gaussians'") as caught:
         settings_from_json({"kind": "gaussians", "contraction": "l2"})
     assert caught.value.exit_code == BAD_INPUT

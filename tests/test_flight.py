@@ -176,10 +176,10 @@ def test_frames_by_their_whole_name_and_by_what_ends_only_one():
     assert [frame.name for frame in chosen] == [
         *("right/a b.jpg", "ü.png", "right/ü.png", "plain", "left/a b.jpg", "plain")
     ]
-    with pytest.raises(UserError, match=r"2 images are called a b\.jpg: left/a b\.jpg, right/a b\.jpg"):
+    with pytest.raises(UserError, match=r"2 images match a b\.jpg: left/a b\.jpg, right/a b\.jpg"):
         frames_named(frames, ["a b.jpg"])
-    with pytest.raises(UserError, match=r"no image is called 'right/a\.jpg'") as caught:
+    with pytest.raises(UserError, match=r"no image is named 'right/a\.jpg'") as caught:
         frames_named(frames, ["right/a.jpg"])
     assert "right/a b.jpg" in caught.value.hint
-    with pytest.raises(UserError, match="no image is called ''"):
+    with pytest.raises(UserError, match="no image is named ''"):
         frames_named(frames, [""])

@@ -53,9 +53,9 @@ def test_a_focal_length_that_holds(exif: Exif, focal_px: float | None):
 @pytest.mark.parametrize(
     ("exif", "focal_px", "words"),
     [
-        (sized(CAMERA, 640, 640), 7600.0 * 640 / 3648, "EXIF is of 5472x3648 pixels, the file has 640x640"),
+        (sized(CAMERA, 640, 640), 7600.0 * 640 / 3648, "EXIF is for 5472x3648 pixels, but the file has 640x640"),
         (replace(sized(PHONE, 1280, 720), taken_px=(4032, 3024)), 28 / 43.27 * 1600, "cropped after the shot"),
-        (sized(PHONE, 640, 640), 28 / 43.27 * 640 * 2**0.5, "no camera takes pictures of 640x640 pixels"),
+        (sized(PHONE, 640, 640), 28 / 43.27 * 640 * 2**0.5, "an unusual size of 640x640 pixels"),
     ],
 )
 def test_a_focal_length_of_another_picture(exif: Exif, focal_px: float, words: str):
@@ -75,7 +75,7 @@ def test_a_resolution_that_no_sensor_has_tells_nothing(exif: Exif):
 def test_an_absurd_focal_length_is_doubted():
     found = focal_evidence(replace(PHONE, focal_35mm=4000.0))
     assert (found.focal_px, found.holds) == (None, False)
-    assert "EXIF says" in found.doubt
+    assert "EXIF gives" in found.doubt
 
 
 def test_the_recorded_size_and_resolution_are_read(tmp_path: Path):
@@ -104,7 +104,7 @@ def test_cameras_start_from_exif_only_where_it_holds():
     assert [camera.has_prior_focal_length for camera in cameras] == [True, False, False]
     assert [camera.mean_focal_length() for camera in cameras] == pytest.approx([7600, 7600 * 640 / 3648, 768])
     assert grouped.notes[1:] == (
-        "no focal length is taken from EXIF for 1.jpg: EXIF is of 5472x3648 pixels, the file has 640x640: "
+        "EXIF's focal length is not used for 1.jpg: EXIF is for 5472x3648 pixels, but the file has 640x640: "
         "cropped after the shot",
     )
     bare = [camera_of_group(group.without_exif()) for group in grouped.groups]

@@ -80,25 +80,29 @@ def test_arrays_of_other_writers_are_read(tmp_path, compress):
 @pytest.mark.parametrize(
     ("name", "array", "what"),
     [
-        ("version", np.array(2), "version 2 is not known"),
-        ("names", np.array(["a"] * 6), "names: no frame, a frame without a name, or two of the same"),
+        ("version", np.array(2), "unknown version 2"),
+        ("names", np.array(["a"] * 6), "names: no frames, a frame without a name, or two frames with the same"),
         ("names", np.arange(6), r"names: \(6,\) values of type int64, expected a row of texts"),
-        ("splits", np.array(["train"] * 5 + ["x"]), "splits: another word"),
+        ("splits", np.array(["train"] * 5 + ["x"]), "splits: a value other than"),
         ("unit", np.array("feet"), "unit: 'feet'"),
-        ("camera_index", np.full(6, 1), "camera_index: a camera that is not one of the 1"),
+        ("camera_index", np.full(6, 1), "camera_index: a camera index outside the list of 1"),
         ("camera_index", np.full(6, 0.0), "camera_index: .* expected 6 numbers"),
         ("camera_models", np.array(["PENTAGON"]), "camera 0: unknown camera model 'PENTAGON'"),
-        ("camera_sizes", np.array([[2**60, 1]]), "camera 0: a picture of 1.15e"),
+        ("camera_sizes", np.array([[2**60, 1]]), "camera 0: invalid size of a picture: 1.15e"),
         ("camera_params", np.array([[500, np.nan, 320, 240]]), "camera 0: a parameter is NaN"),
-        ("camera_params", np.array([[500, 1e300, 320, 240]]), r"camera 0: camera parameters 500, 1e\+300, 320, 240"),
-        ("world_from_cam", np.full((6, 4, 4), np.nan), r"world_from_cam\[0\]: holds a number that is not finite"),
+        (
+            "camera_params",
+            np.array([[500, 1e300, 320, 240]]),
+            r"camera 0: invalid camera parameters 500, 1e\+300, 320, 240",
+        ),
+        ("world_from_cam", np.full((6, 4, 4), np.nan), r"world_from_cam\[0\]: contains a number that is not finite"),
         ("points", np.zeros((40, 2)), r"points: \(40, 2\) values"),
         ("points", np.full((40, 3), np.inf), "points: a position"),
         ("colours", np.full((40, 3), 256), "colours: a number that is not between 0 and 255"),
         ("depth_bounds", np.ones((6, 2)), "depth_bounds: expected 0 < near < far"),
-        ("observation_points", np.full(252, 40), "observation_points: a point that is not one of the 40"),
-        ("observation_frames", np.full(252, -1), "observation_frames: a frame that is not one of the 6"),
-        ("points", np.array([{"a": 1}]), "points: it holds values of type object"),
+        ("observation_points", np.full(252, 40), "observation_points: a point index outside the list of 40"),
+        ("observation_frames", np.full(252, -1), "observation_frames: a frame index outside the list of 6"),
+        ("points", np.array([{"a": 1}]), "points: it contains values of type object"),
     ],
 )
 def test_a_wrong_array_is_named(tmp_path, name, array, what):
@@ -123,7 +127,7 @@ def test_what_is_no_archive_is_refused(tmp_path):
     with pytest.raises(UserError, match="No such file"):
         parse_npz(tmp_path / "a.npz")
     (tmp_path / "a.npz").write_bytes(b"PK\3\4 no")
-    with pytest.raises(UserError, match=r"a\.npz: no readable \.npz file"):
+    with pytest.raises(UserError, match=r"a\.npz is not a readable \.npz file"):
         parse_npz(tmp_path / "a.npz")
 
 

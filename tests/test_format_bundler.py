@@ -126,7 +126,7 @@ def test_unregistered_and_missing_photos_are_no_frames(tmp_path):
 def test_the_list_is_found_where_colmap_writes_it(tmp_path):
     path = write(tmp_path, model_text())
     (tmp_path / "list.txt").rename(tmp_path / "bundle" / "model.list.txt")
-    with pytest.raises(UserError, match="there is no list of images"):
+    with pytest.raises(UserError, match="the list of images next to it is missing"):
         parse(path)
     path = path.rename(path.with_name("model.bundle.out"))
     assert len(parse_bundler(path, measure, images=tmp_path).frames) == 3
@@ -144,22 +144,22 @@ def edited(number: int, line: str | None) -> str:
     ("text", "names", "what"),
     [
         ("", NAMES, "does not begin with # Bundle file"),
-        (edited(1, "# Bundle file v0.2"), NAMES, "line 1: is of another version"),
+        (edited(1, "# Bundle file v0.2"), NAMES, "line 1: is of an unsupported version"),
         (edited(2, "3"), NAMES, "line 2: has 1 numbers"),
         (edited(2, "3 -7"), NAMES, "line 2: announces 3 cameras and -7 points"),
         (edited(2, "900000000000 7"), NAMES, "announces 900000000000 cameras and 7 points, but the file has 37"),
         (edited(20, None), NAMES, "but the file has 36 lines"),
-        (edited(3, "-60 0 0"), NAMES, "line 3: .*make no camera"),
+        (edited(3, "-60 0 0"), NAMES, "line 3: .*invalid parameters"),
         (edited(3, "60 0"), NAMES, "line 3: has 2 numbers"),
-        (edited(4, "1 1 1"), NAMES, "line 4: its upper left 3x3 is no rotation"),
+        (edited(4, "1 1 1"), NAMES, "line 4: the upper left 3x3 block is not a rotation"),
         (edited(7, "1 nan 1"), NAMES, "line 7: 'nan' is not finite"),
-        (edited(18, "1 2 x"), NAMES, "line 18: 'x' is no number"),
+        (edited(18, "1 2 x"), NAMES, "line 18: 'x' is not a number"),
         (edited(20, "1 0 5 10"), NAMES, "line 20: announces 1 views, but has 3 numbers"),
-        (edited(20, "1 3 5 10 20"), NAMES, "line 20: a view has a camera that is not there"),
-        (edited(20, "1 0.5 5 10 20"), NAMES, "line 20: a view has a camera that is not there"),
+        (edited(20, "1 3 5 10 20"), NAMES, "line 20: a view refers to a camera that does not exist"),
+        (edited(20, "1 0.5 5 10 20"), NAMES, "line 20: a view refers to a camera that does not exist"),
         (model_text(), NAMES[:2], r"has 3 cameras, but .*list\.txt has 2 images"),
         (model_text(), ["a.jpg", "a.jpg", "b c.jpg"], r"list\.txt: image 'a.jpg' is listed twice"),
-        (model_text(), ["x", "y", "z"], "none of the 3 photos"),
+        (model_text(), ["x", "y", "z"], "none of the 3 listed photos"),
     ],
 )
 def test_malformed_files_are_refused_with_file_and_line(tmp_path, text, names, what):

@@ -122,7 +122,9 @@ def test_features_whose_points_are_gone(tmp_path):
     write_colmap_text(capture, tmp_path / "model")
     lines = (tmp_path / "model/points3D.txt").read_text().splitlines()
     (tmp_path / "model/points3D.txt").write_text("\n".join(lines[:-1]))
-    with pytest.raises(UserError, match=r"images\.txt and points3D\.txt .* a feature has the point 40, which is not"):
+    with pytest.raises(
+        UserError, match=r"images\.txt and points3D\.txt .* a feature refers to point 40, which does not"
+    ):
         parse_colmap(tmp_path / "model")
     (tmp_path / "model/points3D.txt").write_text("\n".join([*lines, lines[-1]]))
     with pytest.raises(UserError, match=r"points3D\.txt .*: two points have the id 40"):
@@ -157,7 +159,7 @@ def test_observations_in_any_order_and_none_at_all(tmp_path, suffix):
 def test_what_a_model_cannot_hold_is_listed(tmp_path):
     capture = ring(CAMERAS["PINHOLE"])
     assert losses_colmap(capture) == ()
-    assert losses_colmap_text(capture) == ("6 names with spaces (COLMAP reads them up to the first space)",)
+    assert losses_colmap_text(capture) == ("6 names with spaces (COLMAP truncates them at the first space)",)
     first = replace(capture.frames[0], mask=tmp_path / "m.png", split="test")
     more = replace(capture, frames=(first, *capture.frames[1:]), unit="metre", depth_bounds=np.tile([1.0, 2.0], (6, 1)))
     assert losses_colmap(more) == ("1 masks", "the split of 1 frames", "depth bounds", "the unit of length (metre)")
@@ -166,7 +168,7 @@ def test_what_a_model_cannot_hold_is_listed(tmp_path):
 def test_a_folder_with_other_files_is_left_alone(tmp_path):
     capture = ring(CAMERAS["PINHOLE"])
     (tmp_path / "a.jpg").write_bytes(b"photo")
-    with pytest.raises(UserError, match=r"holds other files than a COLMAP model, such as a\.jpg"):
+    with pytest.raises(UserError, match=r"contains files other than a COLMAP model, such as a\.jpg"):
         write_colmap_binary(capture, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["a.jpg"]
     (tmp_path / "model").mkdir()

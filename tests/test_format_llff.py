@@ -88,7 +88,7 @@ def test_depth_bounds_are_percentiles_of_what_each_view_sees(tmp_path):
 
 def test_neither_points_nor_bounds_is_refused(tmp_path):
     capture = replace(pinhole_ring(), points=np.zeros((0, 3)), colours=None, observations=None)
-    with pytest.raises(UserError, match="needs depths, but no view of the 6 sees two of the 0 points"):
+    with pytest.raises(UserError, match="needs depth bounds, but none of the 6 views sees two of the 0 points"):
         write_llff(capture, tmp_path)
     with pytest.raises(UserError, match="spherical picture"):
         write_llff(ring(CAMERAS["EQUIRECTANGULAR"]), tmp_path)

@@ -198,21 +198,21 @@ def test_each_camera_has_its_sensor(tmp_path):
     ("change", "what"),
     [
         (("</chunk>", "</clump>"), "not valid XML"),
-        (("chunk", "clump"), "has no chunk, but a 'document'"),
+        (("chunk", "clump"), "has no chunk element, but a 'document'"),
         (("<camera id", "<cam id"), "not valid XML"),
         (("<transform>0.0", "<transform>"), "camera 'a.jpg': transform: has 15 numbers"),
         (("<transform>0.0", "<transform>nan"), "camera 'a.jpg': transform: 'nan' is not finite"),
-        (("<transform>0.0", "<transform>2"), "camera 'a.jpg': transform: its upper left 3x3 is no rotation"),
+        (("<transform>0.0", "<transform>2"), "camera 'a.jpg': transform: the upper left 3x3 block is not a rotation"),
         (('sensor_id="0"', 'sensor_id="4"'), "camera 'a.jpg': sensor_id is '4'"),
         (('label="a.jpg"', 'label=""'), "the image's name is ''"),
         (("<f>500.0</f>", ""), "sensor '0': has no focal length f"),
-        (("<f>500.0</f>", "<f>-500.0</f>"), "sensor '0': .*make no camera"),
-        (("<f>500.0</f>", "<f>wide</f>"), "sensor '0': f: 'wide' is no number"),
+        (("<f>500.0</f>", "<f>-500.0</f>"), "sensor '0': .*invalid parameters"),
+        (("<f>500.0</f>", "<f>wide</f>"), "sensor '0': f: 'wide' is not a number"),
         (("<f>500.0</f>", "<f>500.0</f><b2>0.1</b2>"), "b2 is not 0"),
         (("<f>500.0</f>", "<f>500.0</f><k4>0.1</k4>"), "k4 is not 0"),
         (("<f>500.0</f>", "<f>500.0</f><p3>0.1</p3>"), "p3 is not 0"),
         (('type="frame"', 'type="equisolid_fisheye"'), "type 'equisolid_fisheye' is not supported"),
-        (('type="frame"', 'type="spherical"'), "a spherical picture of 640x480"),
+        (('type="frame"', 'type="spherical"'), "invalid size of a spherical picture: 640x480"),
         (('width="640"', 'width="6.5"'), "width and height are 6.5"),
         (("<resolution", "<revolution"), "has no resolution"),
         (('<component id="0"/>', f'<component id="0">{WORLD.replace("2.5<", "0<")}</component>'), "scale is 0"),
@@ -235,7 +235,7 @@ def test_malformed_files_are_refused_with_file_and_field(tmp_path, change, what)
 
 def test_no_camera_aligned_is_refused(tmp_path):
     path = write(tmp_path, document(sensor_xml({"f": 500.0}), camera_xml("a", pose=None)))
-    with pytest.raises(UserError, match="lists no image with a pose"):
+    with pytest.raises(UserError, match="lists no images with a pose"):
         parse_metashape(path)
     with pytest.raises(UserError, match="No such file"):
         parse_metashape(tmp_path / "none.xml")

@@ -114,7 +114,7 @@ def edges_of(data: bytes, num_vertices: int) -> tuple[np.ndarray, np.ndarray]:
             header("binary_little_endian", "element a 1", "property list uchar int b", "element vertex 0").replace(
                 b"end_header", b"property float x\nproperty float y\nproperty float z\nend_header"
             ),
-            "element a holds lists",
+            "element a contains lists",
         ),
         (header("pdf", "element vertex 0"), "its format is 'pdf'"),
     ],

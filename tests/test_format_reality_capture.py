@@ -128,19 +128,19 @@ def test_names_photos_and_a_line_before_the_header(tmp_path):
 @pytest.mark.parametrize(
     ("rows", "header", "what"),
     [
-        ((row("a.jpg"),), "", "has no line #name"),
+        ((row("a.jpg"),), "", "has no header line #name"),
         ((row("a.jpg"),), OLD.replace("pitch", "pitches"), "line 1: has no column pitch"),
         ((row("a.jpg"),), OLD.replace(",heading", ",head"), "line 1: has no column heading or yaw"),
         ((), OLD, "lists no image"),
         (("a.jpg,1,2",), OLD, "line 2: has 3 columns"),
-        ((row("a.jpg"), row("b.jpg").replace("28.5", "wide")), OLD, "line 3: 'wide' is no number"),
+        ((row("a.jpg"), row("b.jpg").replace("28.5", "wide")), OLD, "line 3: 'wide' is not a number"),
         ((row("a.jpg", (1, 2, float("inf"), 0, 0, 0)),), OLD, "line 2: 'inf' is not finite"),
-        ((row("a.jpg", lens={**LENS, "f": 0.0}),), OLD, "line 2: .*make no camera"),
+        ((row("a.jpg", lens={**LENS, "f": 0.0}),), OLD, "line 2: .*invalid parameters"),
         ((row("a.jpg", lens={**LENS, "k4": 0.1}),), OLD, "line 2: k4 is 0.1"),
         ((row("a.jpg"), row("a.jpg")), OLD, "'a.jpg' is listed twice"),
         ((row(""),), OLD, "line 2: the image's name is ''"),
-        ((row('"a.jpg'),), OLD, "line 2: is no line of a table"),
-        ((row("x.jpg"), row("y.jpg")), OLD, "none of the 2 photos .* such as 'x.jpg'"),
+        ((row('"a.jpg'),), OLD, "line 2: is not a valid line of a table"),
+        ((row("x.jpg"), row("y.jpg")), OLD, "none of the 2 listed photos .* such as 'x.jpg'"),
     ],
 )
 def test_malformed_files_are_refused_with_file_and_line(tmp_path, rows, header, what):

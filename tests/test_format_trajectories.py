@@ -104,9 +104,9 @@ def test_what_is_lost_is_said():
 def test_without_a_camera_the_user_is_asked_for_one(tmp_path, kind):
     path = tmp_path / "poses.txt"
     path.write_text(TEXTS[kind])
-    with pytest.raises(UserError, match=f"of the {kind.upper()} format has poses only") as caught:
+    with pytest.raises(UserError, match=f"a {kind.upper()} trajectory contains poses but no camera") as caught:
         PARSERS[kind](path, None)
-    assert "give the camera too" in caught.value.hint
+    assert "--intrinsics" in caught.value.hint
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_without_a_camera_the_user_is_asked_for_one(tmp_path, kind):
         ("tum", "", "has no pose"),
         ("tum", "# only\n", "has no pose"),
         ("tum", "1 2 3\n", "line 1: has 3 numbers"),
-        ("tum", "\n1 0 0 0 0 0 0 x\n", "line 2: 'x' is no number"),
+        ("tum", "\n1 0 0 0 0 0 0 x\n", "line 2: 'x' is not a number"),
         ("tum", "1 0 0 0 0 0 0 nan\n", "'nan' is not finite"),
         ("tum", "1 1e200 0 0 0 0 0 1\n", "'1e200' is too large"),
         ("tum", "noon 0 0 0 0 0 0 1\n", "its timestamp is 'noon'"),
@@ -123,7 +123,7 @@ def test_without_a_camera_the_user_is_asked_for_one(tmp_path, kind):
         ("tum", "1 0 0 0 0 0 0 0\n", "quaternion has length 0"),
         ("tum", "1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "'1' is listed twice"),
         ("kitti", "1 0 0 0 0 1 0 0 0 0 1\n", "line 1: has 11 numbers"),
-        ("kitti", "2 0 0 0 0 1 0 0 0 0 1 0\n", "is no rotation"),
+        ("kitti", "2 0 0 0 0 1 0 0 0 0 1 0\n", "is not a rotation"),
         ("kitti", "-1 0 0 0 0 1 0 0 0 0 1 0\n", "mirrors the scene"),
     ],
 )

@@ -144,7 +144,7 @@ def test_names_and_sizes_without_the_photos(tmp_path):
     path = write_json(tmp_path / "transforms.json", camera_angle_x=1.0, frames=frames)
     with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing"):
         parse_transforms(path)
-    with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing, and .*images/a b.jpg is not there"):
+    with pytest.raises(UserError, match=r"frames\[0\]: w and h are missing, and .*images/a b.jpg does not exist"):
         parse_transforms(path, measure)
     (tmp_path / "images").mkdir()
     (tmp_path / "images/no_suffix.JPG").write_bytes(b"")
@@ -187,7 +187,7 @@ def test_images_of_blender_files_in_another_folder(tmp_path):
     capture = with_photos(pinhole_ring(), tmp_path / "images")
     named = (replace(f, name=f"r_{i}.png", image=tmp_path / f"train/r_{i}.png") for i, f in enumerate(capture.frames))
     write_blender(replace(capture, frames=tuple(named)), tmp_path)
-    with pytest.raises(UserError, match="not there to be measured"):
+    with pytest.raises(UserError, match="does not exist"):
         parse_blender(tmp_path, measure)
     (tmp_path / "elsewhere").mkdir()
     for index in range(len(capture.frames)):
@@ -261,7 +261,7 @@ def test_what_blender_cannot_hold_is_listed(tmp_path):
     with pytest.raises(UserError, match="spherical picture"):
         write_blender(ring(CAMERAS["EQUIRECTANGULAR"]), tmp_path)
     write_json(tmp_path / "transforms_val.json", frames=[])
-    with pytest.raises(UserError, match=r"transforms_val\.json is there already"):
+    with pytest.raises(UserError, match=r"transforms_val\.json already exists"):
         write_blender(capture, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["transforms_val.json"]
     with pytest.raises(UserError, match=r"transforms_train\.json: No such file"):

@@ -126,24 +126,24 @@ def test_rounded_poses_become_exactly_rigid(tmp_path):
         ({"frames": [3]}, "has no list of frames"),
         ({"frames": [{"file_path": "a.png"}]}, r"frames\[0\]: transform_matrix is missing"),
         ({"frames": [entry("a.png", transform_matrix=[[1, 0], [0, 1]])]}, r"shape \(2, 2\)"),
-        ({"frames": [entry("a.png", transform_matrix="no")]}, "no matrix"),
-        ({"frames": [entry("a.png", transform_matrix=(2 * np.eye(4)).tolist())]}, "is no rotation"),
+        ({"frames": [entry("a.png", transform_matrix="no")]}, "not a matrix"),
+        ({"frames": [entry("a.png", transform_matrix=(2 * np.eye(4)).tolist())]}, "is not a rotation"),
         ({"frames": [entry("a.png", transform_matrix=np.diag([1, 1, -1, 1]).tolist())]}, "mirrors the scene"),
         ({"frames": [entry("a.png", transform_matrix=np.full((4, 4), np.nan).tolist())]}, "not finite"),
         ({"frames": [entry("a.png"), {"transform_matrix": OPENGL_POSE}]}, r"frames\[1\]: file_path is None"),
         ({"frames": [entry("a.png"), entry("./a.png")]}, "a.png is listed twice"),
-        ({"frames": [entry("x.png"), entry("y.png")]}, "none of the 2 images .* such as x.png"),
-        ({"frames": [entry("a.png", mask_path="m.png")]}, "mask m.png is not on disk"),
+        ({"frames": [entry("x.png"), entry("y.png")]}, "none of the 2 listed images .* such as x.png"),
+        ({"frames": [entry("a.png", mask_path="m.png")]}, "mask m.png does not exist"),
         ({"fl_x": "wide"}, "fl_x is 'wide'"),
         ({"fl_x": -3}, "fl_x is -3.0"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x nor camera_angle_x"),
         ({"fl_x": None, "camera_angle_x": 4.0}, "camera_angle_x is 4.0"),
         ({"w": 63.5}, "w and h are 63.5"),
-        ({"w": 48, "h": 64}, "64x48 pixels does not fit a camera of 48x64"),
+        ({"w": 48, "h": 64}, "64x48 pixels does not match a camera of 48x64"),
         ({"camera_model": "PENTAGON"}, "camera_model 'PENTAGON' is not supported"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "fisheye camera with p1 or p2"),
         ({"k4": 0.1}, "k4 is 0.1 without a fisheye"),
-        ({"test_filenames": "a.png"}, "test_filenames is no list"),
+        ({"test_filenames": "a.png"}, "test_filenames is not a list"),
     ],
 )
 def test_malformed_transforms_are_refused_with_file_and_field(tmp_path, change, what):
@@ -234,19 +234,19 @@ def test_llff_by_hand(tmp_path):
 def test_malformed_llff_is_refused(tmp_path):
     path = tmp_path / "poses_bounds.npy"
     np.save(path, llff_rows(3))
-    with pytest.raises(UserError, match="has 3 rows, but there is no folder images/"):
+    with pytest.raises(UserError, match="has 3 rows, but the folder images/ is missing"):
         read_llff(tmp_path, measure, list_files)
     touch(tmp_path, "images/1.jpg", "images_8/1.jpg", "images_8/2.jpg")
     with pytest.raises(UserError, match="3 rows, but images/ has 1, images_8/ has 2"):
         read_llff(tmp_path, measure, list_files)
     path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(UserError, match=r"poses_bounds\.npy: no readable NumPy array"):
+    with pytest.raises(UserError, match=r"poses_bounds\.npy is not a readable NumPy array"):
         read_llff(tmp_path, measure, list_files)
     path.write_bytes(b"")
-    with pytest.raises(UserError, match="no readable NumPy array"):
+    with pytest.raises(UserError, match="not a readable NumPy array"):
         read_llff(tmp_path, measure, list_files)
     np.save(path, llff_rows(3)[:, :15])
-    with pytest.raises(UserError, match=r"an array of \(3, 15\)"):
+    with pytest.raises(UserError, match=r"array of shape \(3, 15\)"):
         read_llff(tmp_path, measure, list_files)
     for column, value, what in (
         (15, 0.0, "depth bounds 0 and 20"),
@@ -314,7 +314,7 @@ def test_colmap_images_that_are_not_on_disk_are_missing(tmp_path, synthetic):
     assert [frame.name for frame in capture.frames] == names[1:]
     assert capture.frames[0].camera.params == (640, 256, 192, 0.05)
     assert capture.kind == "colmap"
-    with pytest.raises(UserError, match="500x500 pixels does not fit a camera of 1024x768"):
+    with pytest.raises(UserError, match="500x500 pixels does not match a camera of 1024x768"):
         read_colmap(tmp_path, tmp_path / "images", lambda _: (500, 500, 1))
 
 
@@ -351,11 +351,11 @@ def test_colmap_text_by_hand(tmp_path):
     np.testing.assert_allclose(model.images[0].world_from_cam[:3, :3], np.diag([-1, -1, 1]), rtol=0, atol=1e-15)
     assert model.points.shape == (0, 3)
     for text, what in (
-        ("1 1 0 0 0 1 2 3 4 a.jpg\n\n", "image a.jpg has camera 4, which is not there"),
+        ("1 1 0 0 0 1 2 3 4 a.jpg\n\n", "image a.jpg refers to camera 4, which does not exist"),
         ("1 1 0 0 0 1 2 3 3 a.jpg\n\n2 1 0 0 0 1 2 3 3 a.jpg\n\n", "a.jpg is registered twice"),
         ("1 0 0 0 0 1 2 3 3 a.jpg\n\n", r"images\.txt is damaged: a quaternion"),
         ("1 1 0 0 0 nan 2 3 3 a.jpg\n\n", "pose of image a.jpg is not 7 finite"),
-        ("# nothing\n", "no registered image"),
+        ("# nothing\n", "no registered images"),
     ):
         (tmp_path / "images.txt").write_text(text)
         with pytest.raises(UserError, match=what):

@@ -85,7 +85,7 @@ def test_a_picture_of_all_directions():
     np.testing.assert_allclose(seen, [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], rtol=0, atol=1e-12)
     with pytest.raises(UserError, match="500x300"):
         sized(camera, 500, 300)
-    with pytest.raises(UserError, match="no camera model"):
+    with pytest.raises(UserError, match="cannot be cropped"):
         cropped(camera, Window(0, 0, 10, 10))
 
 

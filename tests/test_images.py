@@ -191,7 +191,7 @@ def test_cmyk_becomes_rgb(tmp_path):
 def test_pixels_without_a_known_white_are_refused(tmp_path, dtype, kind):
     path = tmp_path / "depth.tif"
     Image.fromarray(np.ones((3, 4), dtype)).save(path)
-    with pytest.raises(UserError, match=rf"depth\.tif has 32-bit {kind} pixels, whose white is not known"):
+    with pytest.raises(UserError, match=rf"depth\.tif has 32-bit {kind} pixels, whose white level is unknown"):
         read_image(path)
 
 
@@ -242,14 +242,14 @@ def test_unreadable_files_are_told_by_name(tmp_path):
     Image.fromarray(noise(64, 64, 3)).save(webp, "WEBP")
     contents = {
         "zero.jpg": (b"", "is empty \\(0 bytes\\)"),
-        "text.jpg": (b"this is no photo\n" * 20, "is not a picture that can be read"),
-        "head.png": (png.getvalue()[:12], "is not a picture that can be read"),
-        "cut.jpg": (jpeg[: len(jpeg) // 2], "is damaged or cut short"),
-        "cut.png": (png.getvalue()[:3000], "is damaged or cut short"),
-        "cut.tif": (tiff.getvalue()[:3000], "is damaged or cut short|is not a picture"),
-        "cut.webp": (webp.getvalue()[:2000], "is damaged or cut short|is not a picture"),
-        "flipped.png": (png.getvalue()[:100] + b"\0" * 500 + png.getvalue()[600:], "is damaged or cut short"),
-        "größe 1.jpg": (b"\xff\xd8\xff\xe0", "is not a picture that can be read"),
+        "text.jpg": (b"this is no photo\n" * 20, "is not a readable picture"),
+        "head.png": (png.getvalue()[:12], "is not a readable picture"),
+        "cut.jpg": (jpeg[: len(jpeg) // 2], "is damaged or truncated"),
+        "cut.png": (png.getvalue()[:3000], "is damaged or truncated"),
+        "cut.tif": (tiff.getvalue()[:3000], "is damaged or truncated|is not a readable picture"),
+        "cut.webp": (webp.getvalue()[:2000], "is damaged or truncated|is not a readable picture"),
+        "flipped.png": (png.getvalue()[:100] + b"\0" * 500 + png.getvalue()[600:], "is damaged or truncated"),
+        "größe 1.jpg": (b"\xff\xd8\xff\xe0", "is not a readable picture"),
     }
     for name, (content, message) in contents.items():
         (tmp_path / name).write_bytes(content)

@@ -73,10 +73,10 @@ def test_a_depth_file_tells_all_that_it_knows(suffix, tmp_path):
         assert numbers[name] == pytest.approx(float(expected(depth)), abs=tolerance)
     text = info(path).stdout
     for expected in (
-        "background depth along the optical axis (z), in metres (known from: GPS, ± 0.3 %)",
-        "pixels less opaque than 0.333333 have no value (" + ("0)" if suffix == ".png" else "NaN)"),
+        "background depth along the optical axis (z), in metres (from: GPS, ± 0.3 %)",
+        "pixels with an opacity below 0.333333 have no value (" + ("0)" if suffix == ".png" else "NaN)"),
         "background distance, 12.25",
-        "it bounds the rendering, not the field",
+        "a bound on the rendering, not on the accuracy of the field",
         "camera of Küche 北.jpg: PINHOLE 53x37, parameters 50 0.333333",
         "run kitchen",
     ):
@@ -87,8 +87,8 @@ def test_levels_tell_their_scale_and_rounding(tmp_path):
     write_png16(tmp_path / "a.png", plain_depth(), META, units_per_level=2e-3)
     text = info(tmp_path / "a.png").stdout
     assert "value = level x 0.002" in text
-    assert "rounding to levels changed no depth by more than 0.001" in text
-    assert "the scale of the scene is not known" in text
+    assert "rounding to integers changed depth by at most 0.001" in text
+    assert "the scene has no metric scale" in text
 
 
 def test_several_maps_in_a_file_are_each_told(tmp_path):
@@ -116,7 +116,7 @@ def test_depth_of_another_program_is_told_as_what_nobody_states(tmp_path):
         (numbers,) = told["maps"].values()
         assert numbers["max"] == pytest.approx(np.nanmax(depth) * (1000 if path.suffix == ".png" else 1), rel=1e-4)
         assert NOT_STATED in info(path).stdout, path
-    assert "often a millimetre" in info(tmp_path / "a.png").stdout
+    assert "often 1 mm" in info(tmp_path / "a.png").stdout
 
 
 def test_arrays_that_are_no_pictures_are_told_by_their_shape(tmp_path):
@@ -132,7 +132,7 @@ def test_arrays_that_are_no_pictures_are_told_by_their_shape(tmp_path):
 def test_a_preview_is_not_taken_for_numbers(tmp_path):
     write_png(tmp_path / "a.png", np.zeros((4, 5, 3), np.uint8), metadata={KEY: META.to_text(), "range": "1.0 2.0"})
     text = info(tmp_path / "a.png").stdout
-    assert "picture of a depth map; its colours are no numbers" in text
+    assert "preview of a depth map (colours, not values)" in text
     assert "conditional depth along the ray" in text
     assert "range: 1.0 2.0" in text
 
@@ -173,9 +173,9 @@ def test_a_damaged_file_is_told_in_two_lines(suffix, tmp_path, capfd):
 
 
 def test_what_is_no_file_of_depth_is_refused(tmp_path):
-    assert "there is no" in info(tmp_path / "a.tiff").stderr
+    assert "does not exist" in info(tmp_path / "a.tiff").stderr
     (tmp_path / "a.txt").write_text("depth 1.0")
-    assert "is of no kind that carries depth or pictures" in info(tmp_path / "a.txt").stderr
+    assert "is not a supported depth, picture or video file" in info(tmp_path / "a.txt").stderr
     tifffile.imwrite(
         tmp_path / "b.tiff", plain_depth(), metadata=None, description=META.to_text().replace("depth 2", "depth 9")
     )
@@ -191,11 +191,11 @@ def test_renders_whose_depth_files_differ_are_refused(tmp_path):
     write_png16(tmp_path / "depth16" / "a.png", plain_depth(), META, units_per_level=1e-3)
     told = json.loads(info(tmp_path, "--json").stdout)
     assert (told["frames"], told["files"], told["meaning"]["axis"]) == (2, 3, "ray")
-    assert "3 depth files that mean the same" in info(tmp_path / RENDERS).stdout
+    assert "3 depth files with the same definition" in info(tmp_path / RENDERS).stdout
     write_png16(tmp_path / "depth16" / "b.png", plain_depth(), META, units_per_level=2e-3)
     assert "units per level 0.001 and 0.002" in info(tmp_path).stderr
     write_tiff(tmp_path / "depth" / "b.tiff", plain_depth(), replace(META, axis="z"))
     result = info(tmp_path)
     assert result.exit_code == 3
     assert "b.tiff" in result.stderr
-    assert "do not mean the same: axis ray and z" in result.stderr
+    assert "have different definitions: axis ray and z" in result.stderr

@@ -68,7 +68,7 @@ def test_sigterm_ends_poses_and_its_worker_without_a_stack_trace(tmp_path):
     process.send_signal(signal.SIGTERM)
     stdout, stderr = process.communicate(timeout=60)
     assert (process.returncode, stdout) == (TERMINATED, "")
-    assert stderr.splitlines()[-1] == "Ended by SIGTERM; what was complete is kept."
+    assert stderr.splitlines()[-1] == "Ended by SIGTERM; completed work is kept."
     assert not any(word in stderr for word in ("Traceback", "stack trace"))
     assert not (scene / "scene.json").exists()
     with workspace(scene):  # whose lock the worker has as long as it lives

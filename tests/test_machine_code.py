@@ -71,6 +71,6 @@ def test_no_room_for_what_is_compiled_is_told(monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(numba_cpu, "visible_samples", full)
-    with pytest.raises(UserError, match=r"compiled kernels cannot be kept in .*: No space left on device") as caught:
+    with pytest.raises(UserError, match=r"cannot cache compiled kernels in .*: No space left on device") as caught:
         numba_cpu.warm_up()
     assert "NUMBA_CACHE_DIR" in caught.value.hint

@@ -100,7 +100,9 @@ def test_masks_that_do_not_fit_are_named(photos, masks, tmp_path):
     write_png(masks / "p 0.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
     write_png(masks / "p 1.png", np.full((HEIGHT, WIDTH - 1), 255, np.uint8))
     write_png(masks / "p 3.png", np.full((WIDTH, HEIGHT), 255, np.uint8))  # the photo is stored upright: not turned
-    with pytest.raises(UserError, match=r"2 masks do not fit: .*p 1\.png is 119x80, its photo is 120x80; .*p 3\.png"):
+    with pytest.raises(
+        UserError, match=r"2 masks have the wrong size: .*p 1\.png is 119x80, but its photo is 120x80; .*p 3\.png"
+    ):
         laid_out(photos, masks, tmp_path / "work")
 
 
@@ -109,8 +111,8 @@ def test_photos_without_a_mask_are_named(photos, masks, tmp_path):
     write_png(masks / "p 2.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     result, notes = laid_out(photos, masks, tmp_path / "work")
     assert notes == [
-        "2 of 4 photos have no mask and are used whole: p 0.png, p 3.png",
-        "1 masks are black all over, so that nothing of the photo is used: p 2.png",
+        "2 of 4 photos have no mask and are used completely: p 0.png, p 3.png",
+        "1 masks are completely black, so their photos are not used: p 2.png",
     ]
     assert [mask.used_share for mask in result] == [1, 1, 0, 1]
     assert [bool(mask.key) for mask in result] == [False, True, True, False]
@@ -123,9 +125,9 @@ def test_a_folder_without_masks_is_told(photos, masks, tmp_path):
     with pytest.raises(UserError, match="has a mask in") as error:
         laid_out(photos, masks, tmp_path / "work")
     assert "p 0.png.png or p 0.png" in error.value.hint
-    with pytest.raises(UserError, match="there is no folder of masks"):
+    with pytest.raises(UserError, match="the mask folder"):
         laid_out(photos, tmp_path / "absent", tmp_path / "work")
-    with pytest.raises(UserError, match="holds the photos themselves"):
+    with pytest.raises(UserError, match="contains the photos themselves"):
         laid_out(photos, photos.folder, tmp_path / "work")
 
 

@@ -57,7 +57,7 @@ def test_a_full_disk_is_told_and_what_was_there_is_as_it_was(name, finished, cap
     assert result.exit_code == BAD_INPUT, result.stderr
     error, hint = error_of(result)
     assert error.startswith("Error: cannot write ")
-    assert "free space on the disk" in hint
+    assert "free some disk space" in hint
     assert result.stdout == ""
     assert with_leftovers(capture.parent, before) == {}
     assert before.items() <= listing(capture.parent).items()
@@ -92,8 +92,8 @@ def test_ctrl_c_and_sigterm_end_a_command_in_one_line(name, finished, capture, i
     assert interrupted_when_written
     assert result.stdout == ""
     assert (result.exit_code, result.stderr.splitlines()[-1]) in (
-        (INTERRUPTED, "Interrupted; what was complete is kept."),
-        (TERMINATED, "Ended by SIGTERM; what was complete is kept."),
+        (INTERRUPTED, "Interrupted; completed work is kept."),
+        (TERMINATED, "Ended by SIGTERM; completed work is kept."),
     )
     assert not any(word in result.stderr for word in ("Traceback", "Error:"))
     assert with_leftovers(capture.parent, before) == {}
@@ -116,12 +116,12 @@ def test_a_reader_that_goes_away_loses_nothing(name, finished):
 
 def test_a_second_training_of_a_run_is_refused_while_the_first_is_at_work(capture):
     run = capture.with_name("new")
-    with exclusive(run / LOCK, "nerfcli train is at work"):
+    with exclusive(run / LOCK, "nerfcli train is working"):
         result = nerfcli("train", capture, "-o", run, *ONE_STEP)
     assert result.exit_code == BAD_INPUT
     assert error_of(result) == (
-        f"Error: another nerfcli train is at work on {run}",
-        "Hint:  wait until it is done, or choose another folder with -o",
+        f"Error: another nerfcli train is working on {run}",
+        "Hint:  wait until it has finished, or choose another folder with -o",
     )
     assert [path.name for path in run.iterdir()] == [LOCK]
 
@@ -134,7 +134,7 @@ def test_a_run_that_was_moved_without_its_photos_says_which_and_how_to_mend_it(f
     error, hint = error_of(result)
     missing = moved.parent / "spheres" / "test" / "r_000.png"
     assert error == f"Error: the photo {missing} is not there"
-    assert "put a link to the photos' folder in its place" in hint
+    assert "put a link to the photo folder there" in hint
     (moved.parent / "spheres").symlink_to(capture)  # as it says
     assert nerfcli("evaluate", moved).exit_code == 0
 
@@ -151,7 +151,7 @@ def test_what_a_killed_evaluation_left_goes_with_the_next(finished):
 
 def test_a_scene_is_read_while_it_is_trained_on(capture):
     """Two commands on one scene take no lock of it: it is only read."""
-    with exclusive(capture.with_name("new") / LOCK, "nerfcli train is at work"):
+    with exclusive(capture.with_name("new") / LOCK, "nerfcli train is working"):
         assert len(scene.load(capture).frames) == 5
         assert nerfcli("info", capture).exit_code == 0
 

@@ -86,5 +86,5 @@ def test_only_a_page_of_the_same_kind_and_source_is_replaced(tmp_path):
     page.refuse_foreign(path, mark, about="capture")
     assert str(tmp_path) not in path.read_text(encoding="utf-8")
     for other in (page.Mark("bench", tmp_path), page.Mark("test", tmp_path.parent)):
-        with pytest.raises(UserError, match="no page of this capture"):
+        with pytest.raises(UserError, match="not a page of this capture"):
             page.refuse_foreign(path, other, about="capture")

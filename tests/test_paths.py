@@ -185,7 +185,7 @@ def test_an_ellipse_ignores_the_farthest_tenth_and_goes_around_where_the_cameras
     behind = centres_of(ellipse(facing(10.0), count=32))[:, 1]
     np.testing.assert_allclose([behind.min(), behind.max()], [0, 20], rtol=0, atol=1e-6)
     line = np.array([[0.0, -y, 0] for y in (1.0, 2.0, 3.0)])
-    with pytest.raises(UserError, match="make no ellipse about what they look at"):
+    with pytest.raises(UserError, match="do not surround what they look at"):
         ellipse(frames_at(line, np.zeros(3)), count=8)
 
 
@@ -294,5 +294,5 @@ def test_a_path_needs_frames_and_views(make):
 def test_there_is_nothing_to_orbit_for_a_camera_on_a_tripod_that_looks_around():
     angle = np.linspace(0, 2 * np.pi, 8, endpoint=False)
     frames = frames_at(np.zeros((8, 3)), np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=1))
-    with pytest.raises(UserError, match="stand in one place"):
+    with pytest.raises(UserError, match="are in one place"):
         orbit(frames, count=5)

@@ -53,7 +53,7 @@ def test_photos_are_sorted_and_upright(folder: Path):
 
 
 def test_progress_counts_every_file(folder: Path):
-    (folder / "f.jpg").write_text("not a picture")
+    (folder / "f.jpg").write_text("not a readable picture")
     told: list[tuple[int, int]] = []
     find_photos(folder, lambda done, total: told.append((done, total)))
     assert told == [(done, 6) for done in range(1, 7)]
@@ -65,13 +65,13 @@ def test_text_and_truncated_files_are_left_out_with_their_reason(folder: Path):
     (folder / "e.jpg").write_bytes(whole[: len(whole) // 2])
     photos = find_photos(folder)
     assert photos.names == ("a.jpg", "b.jpg", "c.jpg", "d.jpg")
-    assert photos.unreadable["note.jpg"] == "not a picture that can be read"
-    assert photos.unreadable["e.jpg"].startswith("damaged or cut short")
+    assert photos.unreadable["note.jpg"] == "not a readable picture"
+    assert photos.unreadable["e.jpg"].startswith("damaged or truncated")
     assert str(folder) not in " ".join(photos.unreadable.values())
 
 
 def test_a_missing_folder_is_bad_input(tmp_path: Path):
-    with pytest.raises(UserError, match=r"there is no folder .*nowhere") as caught:
+    with pytest.raises(UserError, match=r"the folder .*nowhere") as caught:
         find_photos(tmp_path / "nowhere")
     assert caught.value.exit_code == BAD_INPUT
 
@@ -106,7 +106,9 @@ def test_two_photos_are_too_few(folder: Path):
 def test_too_few_readable_photos_name_a_broken_one(folder: Path):
     (folder / "a.jpg").write_text("this is text")
     (folder / "b.jpg").write_bytes(b"")
-    with pytest.raises(UserError, match=r"only 3 of 5 photos .* can be read.*\(a\.jpg: not a picture") as caught:
+    with pytest.raises(
+        UserError, match=r"only 3 of 5 photos .* can be read.*\(a\.jpg: not a readable picture"
+    ) as caught:
         find_photos(folder)
     assert caught.value.exit_code == TOO_FEW_PHOTOS
 

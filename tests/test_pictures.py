@@ -210,7 +210,7 @@ def test_quadrature_error_shrinks_with_the_step_and_repeats():
         assert one.percentile_95 / other.percentile_95 == pytest.approx(8, rel=0.5)
     again = measure_error(fog(cells, Similarity.identity(), step=1 / 20), TOWARDS, depth=request, tolerance=1e-3)
     assert again == coarse
-    assert "not about how far the field is from the scene" in IN_WORDS
+    assert "not how close the field is to the scene" in IN_WORDS
     assert coarse.depth is not None
     assert coarse.to_json()["quadrature_of_depth_p95"] == coarse.depth.percentile_95
     without = measure_error(fog(cells, Similarity.identity(), step=1 / 20), TOWARDS, depth=None, tolerance=1e-3)

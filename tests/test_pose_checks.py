@@ -170,7 +170,7 @@ def test_components_say_what_joins_them(job: Job):
     largest, other = describe_components([first, second], job)
     assert (largest["size"], largest["photos"], largest["apart"]) == (5, [0, 1, 2, 3, 4], None)
     assert (other["size"], other["photos"]) == (3, [5, 6, 7])
-    assert "pairs of photos join it with the largest" in other["apart"]
+    assert "pairs connect it to the largest" in other["apart"]
 
 
 # From here on the whole command, on the room corner of `corner`.
@@ -211,7 +211,7 @@ def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path,
     )
     assert report.registered == len(NAMES)
     assert "SIGABRT" in report.not_computed["pose uncertainty"]
-    assert sum("a check could not be computed (pose uncertainty)" in note for note in notes) == 2
+    assert sum("could not compute a check (pose uncertainty)" in note for note in notes) == 2
     assert stages.count("check 0") == 2
     assert len([stage for stage in stages if stage == "map 2"]) == 1  # mapped once
     assert scenes.load(tmp_path / "scene").frames
@@ -237,7 +237,7 @@ def test_a_refused_model_stays_and_can_be_accepted(
 ):
     monkeypatch.setenv("PYTHONPATH", str(refusing))
     scene = tmp_path / "scene"
-    with pytest.raises(UserError, match=r"not to be trusted: it is wrong: so") as caught:
+    with pytest.raises(UserError, match=r"cannot be trusted: it is wrong: so") as caught:
         estimate(photos, scene)
     assert caught.value.exit_code == TOO_FEW_PHOTOS
     assert "--accept-refused" in caught.value.hint
@@ -255,7 +255,7 @@ def test_a_refused_model_stays_and_can_be_accepted(
     )
     assert {"map", "match", "extract", "check"}.isdisjoint(stages)  # nothing is done again
     assert not report.verdict["accepted"]
-    assert any("as --accept-refused says" in note for note in notes)
+    assert any("because of --accept-refused" in note for note in notes)
     assert not (scene / "refused-model").exists()
     assert len(scenes.load(scene).frames) == len(NAMES)
 
@@ -283,7 +283,7 @@ def test_after_the_time_limit_in_a_check_only_the_checks_are_left(photos: Path, 
     report, notes = estimate(photos, tmp_path / "scene", progress=lambda stage, done, total: stages.add(stage))
     assert report.registered == len(NAMES)
     assert stages == {"read", "check"}
-    assert "the photos are mapped already: only the checks are left" in notes
+    assert "the photos are already mapped: running the checks" in notes
 
 
 def test_closing_notes_name_components_and_checks(photos: Path, tmp_path: Path):
@@ -295,8 +295,8 @@ def test_closing_notes_name_components_and_checks(photos: Path, tmp_path: Path):
         not_computed={"pose uncertainty": "ValueError: singular"},
     )
     assert closing_notes(two) == [
-        "component 2 has 2 photos (x.jpg ... y.jpg): no photo of it matches; --component 2 takes it",
-        "a check could not be computed (pose uncertainty): ValueError: singular",
+        "component 2 has 2 photos (x.jpg ... y.jpg): no photo of it matches; use it with --component 2",
+        "could not compute a check (pose uncertainty): ValueError: singular",
     ]
 
 
@@ -313,7 +313,7 @@ def test_photos_without_features_and_a_failing_search_for_motions_end_nothing(
     notes: list[str] = []
     worker.solve(replace(job, component=2), lambda *progress: None, notes.append)
     why = "IndexError: tuple index out of range"
-    assert f"whether an object moves before a still background is unknown: {why}" in notes
+    assert f"could not check for an object moving in front of a static background: {why}" in notes
 
 
 def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch):

@@ -84,8 +84,8 @@ def test_fixed_intrinsics_stay_to_the_last_bit_and_only_mapping_is_done_again(
         assert not found[width, height]["focal_from_exif"]
     assert worst_centre(scene) < worst_centre(unaided)
     assert "1 camera for 7 photos, 7 by size" in notes[0]
-    assert "5 photos are 480x360, and the intrinsics are given for 960x720: rescaled" in notes
-    assert "2 photos are 384x288, and the intrinsics are given for 960x720: rescaled" in notes
+    assert "5 photos are 480x360, but the intrinsics are for 960x720: rescaled" in notes
+    assert "2 photos are 384x288, but the intrinsics are for 960x720: rescaled" in notes
     assert report.intrinsics is not None
     assert [one["photos"] for one in report.intrinsics["cameras"]] == [5, 2]
     made = json.loads((scene / "scene.json").read_text())["provenance"]["intrinsics"]
@@ -183,11 +183,13 @@ def test_what_matches_no_photo_is_told():
     small, large = Camera.pinhole(320, 240, 300), Camera.pinhole(640, 480, 500)
     with pytest.raises(UserError, match=r"c has no camera for photo photo\.jpg of 640x360: .* for 320x240, 640x480$"):
         only(Calibration(Path("c"), (small, large), {}), photo(640, 360))
-    with pytest.raises(UserError, match=r"c has 2 cameras that may have taken photo photo\.jpg of 1280x960"):
+    with pytest.raises(
+        UserError, match=r"c does not list photo photo\.jpg of 1280x960, and 2 of its cameras have that size"
+    ):
         only(Calibration(Path("c"), (small, large), {}), photo(1280, 960))
     with pytest.raises(UserError, match=r"c lists 2 images called photo\.jpg, with different cameras"):
         only(Calibration(Path("c"), (small, large), {"a/photo.jpg": 0, "b/photo.jpg": 1}), photo(640, 480))
-    with pytest.raises(UserError, match=r"photo\.jpg: a picture of 640x360 pixels does not fit a camera of 640x480"):
+    with pytest.raises(UserError, match=r"photo\.jpg: a picture of 640x360 pixels does not match a camera of 640x480"):
         only(Calibration(Path("c"), (large,), {"photo.jpg": 0}), photo(640, 360))
     with pytest.raises(UserError, match="EXIF orientation 2 mirrors the photo"):
         only(Calibration(Path("c"), (large,), {}), photo(640, 480, 2))
@@ -203,7 +205,7 @@ def test_what_matches_no_photo_is_told():
         (
             "lens.json",
             '{"model": "PINHOLE", "width": 64, "height": 48, "params": [NaN, 1, 1, 1]}',
-            "make no camera|NaN",
+            "invalid parameters|NaN",
         ),
         ("poses.txt", "0 1 2 3 0 0 0 1\n" * 3, "poses.txt has no cameras"),
         ("cameras.txt", "1 PINHOLE 64 40 50 50 32 20\n", "has no camera for photo photo 0.jpg of 64x48"),
@@ -225,15 +227,15 @@ def test_a_dry_run_says_which_cameras_are_used(tmp_path: Path):
     result = nerfcli("poses", photos, "--dry-run", "--intrinsics", tmp_path / "cameras.txt", "--intrinsics-as", "prior")
     said = " ".join(result.stderr.split())
     assert "(prior): 1 camera for 4 photos, 4 by size" in said
-    assert "4 photos are 64x48, and the intrinsics are given for 128x96: rescaled" in said
+    assert "4 photos are 64x48, but the intrinsics are for 128x96: rescaled" in said
 
 
 @pytest.mark.parametrize(
     ("line", "named"),
     [
-        ("--intrinsics-as prior", "there are no intrinsics to use so"),
+        ("--intrinsics-as prior", "needs --intrinsics"),
         ("--intrinsics c.txt --intrinsics-as loose", "'loose'; choose fixed or prior"),
-        ("--intrinsics c.txt --camera-model OPENCV", "leave out --camera-model"),
+        ("--intrinsics c.txt --camera-model OPENCV", "remove --camera-model"),
     ],
 )
 def test_options_that_do_not_go_together_are_usage_errors(line: str, named: str):

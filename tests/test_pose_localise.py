@@ -96,7 +96,7 @@ def test_a_photo_that_may_be_of_two_places_is_not_placed(tmp_path: Path):
     both = np.intersect1d(one_looks, other_looks)
     one_looks = np.where(np.isin(one_looks, both), -1, one_looks)
     last = np.vstack([one, other]), np.concatenate([one_looks, np.where(np.isin(other_looks, both), -1, other_looks)])
-    assert "agree on another place" in refusal(tmp_path, last)
+    assert "agree on a different pose" in refusal(tmp_path, last)
 
 
 def test_a_place_that_the_photos_own_matches_contradict_is_not_kept(tmp_path: Path):
@@ -116,7 +116,7 @@ def test_nothing_is_placed_without_a_known_lens(tmp_path: Path):
     """A camera of its own, of which nobody has said anything."""
     model, job = capture(tmp_path, shown(VIEWS[3]), camera_id=2)
     _, attempts = localise(model, job, image_ids=[LAST])
-    assert attempts == [Attempt(LAST, refused="nothing is known of its camera")]
+    assert attempts == [Attempt(LAST, refused="its camera is unknown")]
 
 
 def test_a_model_without_points_places_nothing(tmp_path: Path):

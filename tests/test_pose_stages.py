@@ -281,17 +281,17 @@ def test_the_worker_keeps_the_lock_as_long_as_it_lives(tmp_path: Path):
 
 
 def test_too_much_memory_ends_the_worker(photos: Path, tmp_path: Path):
-    with pytest.raises(UserError, match=r"was ended while .*: it needed more than the 0.05 GB of --memory") as caught:
+    with pytest.raises(UserError, match=r"was stopped while .*: it needed more than the limit of 0.05 GB") as caught:
         estimate(photos, tmp_path / "scene", limits=Limits(memory_bytes=50_000_000))
     assert caught.value.exit_code == OUT_OF_MEMORY
     assert "--max-size" in caught.value.hint
 
 
 def test_too_much_time_ends_the_worker(photos: Path, tmp_path: Path):
-    with pytest.raises(UserError, match=r"was ended while .*: the 0.2 s of --time-limit are over") as caught:
+    with pytest.raises(UserError, match=r"was stopped while .*: the time limit of 0.2 s is over") as caught:
         estimate(photos, tmp_path / "scene", limits=Limits(seconds=0.2))
     assert caught.value.exit_code == GATE_NOT_MET
-    assert "goes on from there" in caught.value.hint
+    assert "to continue" in caught.value.hint
 
 
 def test_memory_is_known_for_this_process_and_machine():

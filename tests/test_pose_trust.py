@@ -166,8 +166,8 @@ def test_a_contradicted_model_is_mapped_again_from_its_sound_part(solved: Solved
     assert chance.examined.verdict.accepted
     assert chance.examined.model is not None
     assert [attempt["models"] for attempt in chance.mapped.attempts] == [[10], [10]]
-    assert told[0].endswith("the photos are mapped again, for 25 min at most")
-    assert told[-1] == "from the largest part that agrees with itself: 10 of 10 photos placed, accepted"
+    assert told[0].endswith("mapping again, for at most 25 min")
+    assert told[-1] == "from the largest consistent part: 10 of 10 photos registered, accepted"
     truth = synthetic.true_model(solved.views)
     for image_id in range(2, 11):
         relative = [
@@ -197,7 +197,7 @@ def test_a_second_chance_is_bounded_in_time(solved: Solved, tmp_path: Path):
     first = examine(wrong.models, wrong.job, lambda *told: None)
     told: list[str] = []
     chance = second_chance(wrong, first, lambda *progress: None, told.append, checks=Checks)
-    assert sum(note.startswith("not tried, for it takes too long") for note in told) == 4
+    assert sum(note.startswith("skipped, would take too long") for note in told) == 4
     assert chance.examined.model is not None
     assert chance.examined.model.num_reg_images() == 7
 
@@ -233,7 +233,7 @@ def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
         pairs = read_verified_pairs(database, min_matches=15)
     rest, left_out = leave_out_contradicting(wrong, pairs)
     assert rest.num_reg_images() == 9
-    assert "times as far away as the others" in left_out[10]
+    assert "times as far away as the other cameras" in left_out[10]
 
 
 def test_a_scene_that_repeats_itself_is_recognised(tmp_path: Path):
@@ -286,7 +286,7 @@ def test_a_photo_that_no_pair_holds_is_placed_by_what_the_model_knows(tmp_path: 
     weak = solve(tmp_path, views, synthetic.boulder(500, seed=0), pairs=lambda i, j: 3 not in (i, j))
     assert [(rung["what"], rung["models"]) for rung in weak.climbed.attempts] == [
         ("default thresholds", [6]),
-        ("single photos, by the points that they show", [7]),
+        ("remaining photos one by one, from the 3D points they see", [7]),
     ]
     assert [(one["name"], one["refused"]) for one in weak.climbed.attempts[1]["photos"]] == [("00003.jpg", "")]
     assert (weak.examined.verdict.accepted, weak.examined.left_out) == (True, {})
@@ -320,9 +320,9 @@ def test_a_focal_length_that_exif_tells_wrong_is_left_out(tmp_path: Path):
     register_photos(job)
     match(job, job.pairs, lambda *told: None)
     climbed = climb(job, lambda *told: None, told.append)
-    assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "without the focal length of EXIF"]
+    assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "without EXIF's focal length"]
     assert climbed.attempts[0]["models"] == [] or max(climbed.attempts[0]["models"]) < 4
-    assert "next: without the focal length of EXIF" in told
+    assert "next: without EXIF's focal length" in told
     assert climbed.models[0].num_reg_images() == 8
     (camera,) = climbed.models[0].cameras.values()
     assert camera.mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.02)

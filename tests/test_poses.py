@@ -107,10 +107,10 @@ def test_every_file_is_registered_or_has_its_reason(solved: Solved):
     images = {image.name: image for image in solved.report.images}
     assert sorted(images) == sorted([*NAMES, "notes.jpg", "wall.png"])
     assert all(images[name].registered and images[name].reason is None for name in NAMES)
-    assert images["notes.jpg"].reason == "unreadable: not a picture that can be read"
+    assert images["notes.jpg"].reason == "unreadable: not a readable picture"
     assert images["wall.png"].reason == "too few features (0)"
     assert (solved.report.registered, solved.report.total) == (7, 9)
-    assert "notes.jpg is left out: not a picture that can be read" in solved.notes
+    assert "notes.jpg is skipped: not a readable picture" in solved.notes
 
 
 def test_the_scene_folder_holds_the_model_and_of_the_work_what_helps_the_next(solved: Solved):
@@ -176,7 +176,7 @@ def estimate(photos: Path, scene_dir: Path, progress: Callable[[str, int, int], 
 def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
     write_noise(tmp_path / "photos")
     told: list[str] = []
-    with pytest.raises(UserError, match=r"only 0 of 5 photos could be placed.*matches no other photo well") as caught:
+    with pytest.raises(UserError, match=r"only 0 of 5 photos registered.*matches no other photo well") as caught:
         estimate_poses(
             tmp_path / "photos",
             tmp_path / "scene",
@@ -185,8 +185,10 @@ def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
             progress=lambda stage, done, total: told.append(stage),
         )
     # What was tried is told while the work goes on, not after it.
-    assert told.index("default thresholds: none of 5 photos placed") < told.index("next: more features, full size")
-    assert "match" in told[told.index("next: more features, full size") :]
+    assert told.index("default thresholds: none of 5 photos registered") < told.index(
+        "next: more features from full-size photos"
+    )
+    assert "match" in told[told.index("next: more features from full-size photos") :]
     assert caught.value.exit_code == TOO_FEW_PHOTOS
     assert "overlap" in caught.value.hint
     assert not (tmp_path / "scene" / "scene.json").exists()
@@ -224,7 +226,7 @@ def test_deaths_are_explained():
     log = "*** Aborted at 1 ***\nF1120 bundle.cc:9] Check failed: x > 0\n    @ 0x7f (libc.so)\n"
     aborted = supervise.explain_death(-6, "matching photos (3 of 10 done)", log, 10**9)
     assert aborted.message == (
-        "structure from motion died (SIGABRT) while matching photos (3 of 10 done): "
+        "structure from motion crashed (SIGABRT) while matching photos (3 of 10 done): "
         "F1120 bundle.cc:9] Check failed: x > 0"
     )
     assert supervise.explain_death(-9, "finding features", "", 10**9).exit_code == OUT_OF_MEMORY
@@ -236,14 +238,14 @@ def test_deaths_are_explained():
 )
 def test_a_full_disk_is_told_even_where_no_log_could_be_written(log: str, free_bytes: int):
     told = supervise.explain_death(1, "finding features (3 of 10 done)", log, free_bytes)
-    assert "cannot write on while finding features (3 of 10 done): the disk is full" in told.message
-    assert "the same command goes on from there" in told.hint
+    assert "stopped while finding features (3 of 10 done): the disk is full" in told.message
+    assert "run the same command again to continue" in told.hint
 
 
 def test_a_scene_never_takes_the_place_of_the_photos(tmp_path: Path):
     write_noise(tmp_path / "photos")
     for destination in (tmp_path / "photos", tmp_path):
-        with pytest.raises(UserError, match="would take the place of the photos"):
+        with pytest.raises(UserError, match="would overwrite the photos"):
             estimate(tmp_path / "photos", destination)
     assert len(list((tmp_path / "photos").iterdir())) == 5
 
@@ -252,7 +254,7 @@ def test_a_folder_that_is_no_scene_is_not_replaced(tmp_path: Path):
     write_noise(tmp_path / "photos")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
-    with pytest.raises(UserError, match="holds something that is no scene"):
+    with pytest.raises(UserError, match="the folder contains other files"):
         estimate(tmp_path / "photos", tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.tex").is_file()
 

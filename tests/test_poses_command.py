@@ -35,7 +35,7 @@ def test_what_is_no_amount_of_memory(text: str):
     [
         ("--quality superb", "'superb'; choose fast, default or best"),
         ("--pairing random", "'random'; choose auto, exhaustive, sequential, retrieval or spatial"),
-        ("--pairing spatial --pairs p.txt", "the pairs come from --pairs"),
+        ("--pairing spatial --pairs p.txt", "cannot be combined with --pairs"),
         ("--memory lots", "'lots' is not an amount of memory"),
         ("--time-limit soon", "'soon' is not a time"),
     ],
@@ -71,7 +71,7 @@ def test_a_dry_run_tells_the_plan_and_writes_nothing(
 def test_the_plan_can_be_read(tmp_path: Path):
     photos = write_photos(tmp_path / "photos", 5)
     result = nerfcli("poses", photos, "--dry-run")
-    assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to compare (exhaustive), about ")
+    assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to match (exhaustive), about ")
 
 
 @pytest.mark.parametrize("command", ["poses", "run"])

@@ -125,7 +125,7 @@ def test_a_model_without_sightings_gives_no_tracks(spheres):
 def test_points_that_are_asked_for_and_not_there_are_missed(spheres, tmp_path):
     alone = replace(spheres, frames=spheres.train_frames[:1], test_names=frozenset())
     settings = TrainSettings(budget_seconds=None, steps=1, downscale=8, components=Components(points=0.1))
-    with pytest.raises(UserError, match="agree on where a point is"):
+    with pytest.raises(UserError, match="no 3D point could be triangulated"):
         prepare(alone, settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
 
 
@@ -225,7 +225,7 @@ def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     assert prepared.settings.components == Components(points=0.1)
     assert prepared.points is not None
     assert len(prepared.points.known.numbers) == 3
-    assert "points=0.1: kept, 3 pixels see points whose distance is known" in told
+    assert "points=0.1: kept, 3 pixels see a 3D point at a known distance" in told
 
 
 @pytest.mark.parametrize("limit", [{"budget_seconds": None, "steps": 10}, {"budget_seconds": 1.0}])
@@ -250,7 +250,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=told.append)
     learns = cameras in ("focal", "all")
     assert prepared.log_focal == (check.log_focal if learns else 0.0)
-    assert any("ask for lenses -1.88%" in line for line in told) == learns
+    assert any("suggest a focal length 1.88 %" in line for line in told) == learns
     refined = prepared.fitting().parts.cameras
     if learns:
         assert refined is not None

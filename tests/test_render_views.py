@@ -38,7 +38,7 @@ def test_a_part_is_cut_out_of_the_whole_picture(finished):
 def test_depth_of_all_directions_is_along_the_rays(finished):
     refused = nerfcli("render", finished, *ONE, "--lens", "equirectangular", "--width", "32", "--depth-axis", "z")
     assert refused.exit_code == USAGE
-    assert "half of its directions are behind the camera" in error_of(refused)[0]
+    assert "half of their directions are behind the camera" in error_of(refused)[0]
     folder = rendered(finished, "--lens", "equirectangular", "--width", "32", outputs="depth")
     depth, meta = read_tiff(min(folder.glob("*.tiff")))
     assert (depth.shape, meta.axis) == ((16, 32), "ray")

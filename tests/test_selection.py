@@ -76,8 +76,8 @@ def test_a_gain_is_told_as_it_is_and_kept():
         ([trial(19.0), trial(20.0)], "loses"),
         ([trial(20.0), trial(21.0)], "no gain above the noise"),
         ([trial(20.9), trial(21.1)], "no gain above the noise"),
-        ([trial(20.4, halfway=20.2), trial(21.4, halfway=21.2)], "gains at first only"),
-        ([trial(20.4, seconds=2.0), trial(21.4, seconds=2.0)], "gains less than the steps would that it costs"),
+        ([trial(20.4, halfway=20.2), trial(21.4, halfway=21.2)], "the gain vanishes during the trial"),
+        ([trial(20.4, seconds=2.0), trial(21.4, seconds=2.0)], "gains less than spending the same time on more steps"),
     ],
 )
 def test_what_is_not_kept_is_told_why(changed, why):
@@ -109,9 +109,9 @@ def test_gains_that_differ_as_much_as_they_are_large_are_not_kept(first, second)
 @pytest.mark.parametrize(
     ("changed", "kept", "why"),
     [
-        ([trial(20.0), trial(21.0)], True, "surely within"),
-        ([trial(20.3), trial(21.3)], True, "surely within"),
-        ([trial(20.0 - MOST_LOSS_DB * 1.2), trial(21.0 - MOST_LOSS_DB * 1.2)], False, "needed: loses without it"),
+        ([trial(20.0), trial(21.0)], True, "the loss without it is below"),
+        ([trial(20.3), trial(21.3)], True, "the loss without it is below"),
+        ([trial(20.0 - MOST_LOSS_DB * 1.2), trial(21.0 - MOST_LOSS_DB * 1.2)], False, "needed: PSNR drops without it"),
         ([trial(19.8), trial(21.2)], False, "may be needed"),
         # 0.2 dB better, after 0.6 dB halfway: 0.2 dB worse when as many steps again are over.
         ([trial(20.2, halfway=19.6), trial(21.2, halfway=20.6)], False, "may be needed"),
@@ -178,7 +178,7 @@ def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for
     assert names(FITTED, spread=0.01) == {"background"}
     assert names(FITTED, far=0.009) == {"exposure"}
     (near,) = proposals(Components(), signs(0.3, 0.004), replace(FITTED, fixed=("cameras",)))[1]
-    assert near.in_words() == "background=sphere: not tried, 0.4% of the pixels have most of their light from far away"
+    assert near.in_words() == "background=sphere: not tried, only 0.4 % of the pixels see mostly distant surfaces"
     for sky, is_tried in (
         ((15.0, 15.9), False),
         ((15.0, 16.1), True),
@@ -189,10 +189,12 @@ def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for
         assert (("background", "sphere") in tried) == is_tried
         if not is_tried:
             (told,) = (one.in_words() for one in declined if one.component == "background")
-            assert told.endswith("but their colours are no matter of direction: 15.9 dB by it, 15.0 with one colour")
+            assert told.endswith(
+                "but viewing direction does not explain their colours: 15.9 dB with it, 15.0 dB with one colour"
+            )
     (declined,) = proposals(Components(), signs(0.01), replace(FITTED, fixed=("cameras",)))[1]
     assert (declined.component, declined.kept, declined.gain_db) == ("exposure", False, None)
-    assert "1.0%" in declined.in_words()
+    assert "1.0 %" in declined.in_words()
     assert ("exposure", "exif") in proposals(Components(), signs(0.0), replace(FITTED, has_exif=True))[0]
 
 
@@ -265,7 +267,7 @@ def test_points_are_taken_untried_where_there_is_no_time_for_a_start():
     scripted = Scripted(lambda c: 0.0)
     chosen = chosen_by(scripted, steps=100, facts=POINTED)
     assert chosen.components == Components(points=0.1)
-    assert [d.in_words() for d in chosen.decisions] == ["points=0.1: kept, 7 pixels see points whose distance is known"]
+    assert [d.in_words() for d in chosen.decisions] == ["points=0.1: kept, 7 pixels see a 3D point at a known distance"]
     assert scripted.asked == []
 
 
@@ -304,7 +306,7 @@ def test_a_sky_that_signs_speak_for_is_kept_at_a_smaller_gain(far, kept):
 def test_what_is_needed_stays():
     chosen = chosen_by(Scripted(lambda c: -0.5 * (c.view == 0)))
     assert chosen.components == Components()
-    assert [d.why for d in chosen.decisions if d.component == "view"] == ["needed: loses without it"]
+    assert [d.why for d in chosen.decisions if d.component == "view"] == ["needed: PSNR drops without it"]
 
 
 def test_what_another_component_does_better_is_left_out_beside_it():
@@ -318,7 +320,7 @@ def test_of_two_that_mend_the_same_fault_only_the_better_is_kept():
     chosen = chosen_by(scripted)
     assert chosen.components == Components(view=0, exposure="learned")
     (sphere,) = (decision for decision in chosen.decisions if decision.component == "background")
-    assert sphere.why == "no gain above the noise beside exposure"
+    assert sphere.why == "no gain above the noise, in addition to exposure"
 
 
 def test_two_that_gain_beside_each_other_are_both_kept():
@@ -357,7 +359,7 @@ def test_short_trainings_are_not_searched_for():
 
 def test_a_decision_says_in_words_what_was_and_what_was_not_tried():
     tried = Decision("view", 3, 0.5, 0.1, 0.2, -0.02, 0.5, True, "gains")
-    assert tried.in_words() == "view=3: +0.50 +- 0.10 dB, -2% time: kept, gains"
+    assert tried.in_words() == "view=3: +0.50 dB (± 0.10), 2 % less time: kept, gains"
 
 
 def test_cameras_are_tried_where_photos_do_not_agree_or_nobody_knows():
@@ -393,7 +395,11 @@ def test_a_focal_length_that_matched_features_are_sure_of_is_taken(check, kept):
     assert components == Components(cameras="focal" if kept else "fixed")
     assert log_focal == (check.log_focal if kept else 0.0)
     assert decision.kept == kept
-    told = f"{math.expm1(check.log_focal):+.2%}" if math.isfinite(check.error) else "miss by 1.10 px"
+    told = (
+        f"{100 * abs(math.expm1(check.log_focal)):.2f} % (±"
+        if math.isfinite(check.error)
+        else "is 1.10 px, more at other"
+    )
     assert told in decision.in_words()
     assert with_known_cameras(Components(), replace(facts, fixed=("cameras",))) == (Components(), 0.0, [])
     assert with_known_cameras(Components(), FITTED) == (Components(), 0.0, [])
@@ -411,7 +417,7 @@ def test_poses_with_which_features_surely_miss_are_refined_without_a_trial(error
     assert (components, log_focal) == (Components(cameras="poses"), 0.0)
     assert (focal.value, focal.kept, poses.value, poses.kept) == ("focal", False, "poses", True)
     assert poses.in_words() == (
-        "cameras=poses: kept, 900 matched features miss by 1.30 px, whatever the length of lenses"
+        "cameras=poses: kept, the epipolar error of 900 matched features is at least 1.30 px at any focal length"
     )
     assert not [change for change in proposals(components, signs(0.0), facts)[0] if change[0] == "cameras"]
     assert with_known_cameras(Components(), replace(facts, fixed=("cameras",)))[0] == Components()

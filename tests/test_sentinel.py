@@ -49,7 +49,7 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
         fit(views, tmp_path / "run", replace(FEW, learning_rate=1e12, warmup_steps=1))
     assert caught.value.exit_code == NON_FINITE
     assert "seen from train/r_00" in caught.value.message
-    assert "failure-2.safetensors has the state before it" in caught.value.hint
+    assert "failure-2.safetensors has the state before the failure" in caught.value.hint
     description, bad = replay(tmp_path / "run" / "failure-2.safetensors")
     assert bad is not None
     assert bad.name == "colour of samples"
@@ -67,10 +67,10 @@ def test_a_failure_is_passed_with_smaller_steps_and_counted(views, tmp_path, mon
     monkeypatch.setattr(Fitting, "learning_rate", poisoned)
     monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)
     told = fit(views, tmp_path / "run")
-    (line,) = [line for line in told if "back to step" in line]
+    (line,) = [line for line in told if "continuing from step" in line]
     # The rate is wrong in the eighth step; the table comes first among what it spoils. The loss shows it a step later.
     assert line.startswith("table is not finite at step 8")
-    assert "back to step 4 with 0.5 of the learning rate (1 of 3 times)" in line
+    assert "continuing from step 4 with 0.5 of the learning rate (1 of 3 retries)" in line
     assert told[-1].startswith("numbers became non-finite 1 times")
     last = read_log(tmp_path / "run")[-1]
     assert (last["step"], last["rollbacks"]) == (12, 1)
@@ -107,7 +107,7 @@ def test_a_fault_that_does_not_come_back_changes_nothing(views, tmp_path, monkey
 
     monkeypatch.setattr(numba_cpu, "composite", flaky)
     told = fit(views, tmp_path / "flaky")
-    assert any("are when the step is repeated" in line for line in told)
+    assert any("but are finite when the step is repeated" in line for line in told)
     assert weights(tmp_path / "flaky") == weights(tmp_path / "straight")
     assert not list((tmp_path / "flaky").glob("failure-*"))
 
@@ -124,7 +124,7 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
         patched.setattr(Fitting, "learning_rate", poisoned)
         patched.setattr(sentinel, "SNAPSHOT_EVERY", 4)
         told = fit(views, tmp_path / "poisoned")
-    (line,) = [line for line in told if "back to step" in line]
+    (line,) = [line for line in told if "continuing from step" in line]
     assert line.startswith("table is not finite at step 8")
     _, description = load_tensors(tmp_path / "poisoned" / "failure-8.safetensors", "cpu")
     assert description["state"]["step"] == 7
@@ -138,7 +138,7 @@ def test_where_no_two_runs_are_the_same_a_failure_is_found_all_the_same(views, t
 
     monkeypatch.setattr(numba_cpu, "composite", flaky)
     told = fit(views, tmp_path / "flaky")
-    assert any("no two runs are the same" in line for line in told)
+    assert any("this device does not repeat results exactly" in line for line in told)
 
 
 def test_a_poisoned_checkpoint_is_refused_by_name_and_kept(views, tmp_path):
@@ -153,7 +153,7 @@ def test_a_poisoned_checkpoint_is_refused_by_name_and_kept(views, tmp_path):
         tensors[name].view(-1)[5] = math.inf
         save_tensors(run / file, tensors, description)
         before = (run / file).read_bytes()
-        with pytest.raises(UserError, match=rf"^{name} in .*{file} is not finite in 1 of 512 places") as caught:
+        with pytest.raises(UserError, match=rf"^{name} in .*{file} has 1 non-finite values of 512") as caught:
             read()
         assert caught.value.exit_code == NON_FINITE
         assert (run / file).read_bytes() == before

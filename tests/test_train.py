@@ -374,11 +374,11 @@ def test_a_fresh_training_replaces_all_of_an_old_one(views, tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"budget_seconds": None, "steps": None}, "training without an end"),
-        ({"budget_seconds": -1.0}, "budget is not positive"),
-        ({"steps": -3}, "budget is not positive"),
-        ({"downscale": 3}, "downscale 3 is not possible"),
-        ({"field": "gaussians"}, "there is no field of the kind 'gaussians'"),
+        ({"budget_seconds": None, "steps": None}, "no stopping criterion"),
+        ({"budget_seconds": -1.0}, "budget must be positive"),
+        ({"steps": -3}, "budget must be positive"),
+        ({"downscale": 3}, "invalid downscale factor 3"),
+        ({"field": "gaussians"}, "unknown type of field: 'gaussians'"),
     ],
 )
 def test_impossible_settings_are_refused(wrong, message):
@@ -415,9 +415,9 @@ def test_cameras_of_a_run_come_back_exactly_and_move_with_it(tmp_path, spheres):
 
 
 def test_a_folder_that_is_no_run_is_told(tmp_path):
-    with pytest.raises(UserError, match=r"is not a run: it has no cameras\.json"):
+    with pytest.raises(UserError, match=r"is not a run folder: it has no cameras\.json"):
         read_cameras(tmp_path)
-    with pytest.raises(UserError, match=r"is not a run: it has no config\.json"):
+    with pytest.raises(UserError, match=r"is not a run folder: it has no config\.json"):
         read_config(tmp_path)
     (tmp_path / "cameras.json").write_text('{"train": [{"name": "a"}], "test": []}')
     (tmp_path / "config.json").write_text("{")

@@ -125,7 +125,7 @@ def test_a_box_holds_the_points_but_for_stray_ones():
 
 
 def test_a_box_needs_points():
-    with pytest.raises(UserError, match="3 points, which do not tell where the scene ends") as caught:
+    with pytest.raises(UserError, match="cannot be estimated from its 3 points") as caught:
         box_frame(scene_of(ring(), np.zeros((3, 3))))
     assert "--contraction l2" in caught.value.hint
 
@@ -222,7 +222,7 @@ def test_masked_pixels_are_never_drawn():
     used[7, 31] = used[29, 0] = True
     _, _, numbers = drawn(PixelPool([replace(photo, used=used)], SIMILARITY, CPU), 200)
     assert {tuple(row) for row in numbers} == {(0, 7, 31), (0, 29, 0)}
-    with pytest.raises(UserError, match="no pixel is left to train on"):
+    with pytest.raises(UserError, match="no pixels are left to train on"):
         PixelPool([replace(photo, used=np.zeros_like(used))], SIMILARITY, CPU)
 
 
@@ -254,7 +254,7 @@ def test_photos_that_do_not_fit_their_camera_are_told(tmp_path):
     frame = ring()[0]
     for wrong, message in (
         (frame, r"00\.png has no photo"),
-        (replace(frame, image=tmp_path / "small.png"), r"small\.png is 20x15, its camera says 40x30"),
+        (replace(frame, image=tmp_path / "small.png"), r"small\.png is 20x15 pixels, but its camera is for 40x30"),
         (
             replace(frame, image=tmp_path / "photo.png", mask=tmp_path / "small.png"),
             r"small\.png is 20x15, its photo is 40x30",
@@ -352,8 +352,10 @@ def test_what_does_not_fit_is_refused_up_front(tmp_path):
     assert room_for(needs, 4 * 10**9, folder=tmp_path)[0] is IN_MEMORY
     room, told = room_for(needs, 2 * 10**9, folder=tmp_path)
     assert isinstance(room, InFiles)
-    assert "about 4.00 GB would be needed, 2.00 GB are allowed: the photos (3.00 GB) stand in files" in told
-    with pytest.raises(UserError, match=r"needs about 1\.00 GB of memory besides the photos, 0\.90 GB") as caught:
+    assert "about 4.00 GB needed, limit 2.00 GB: the photos (3.00 GB) are kept in temporary files" in told
+    with pytest.raises(
+        UserError, match=r"needs about 1\.00 GB of memory in addition to the photos, but the limit is 0\.90 GB"
+    ) as caught:
         room_for(needs, 9 * 10**8, folder=tmp_path)
     assert caught.value.exit_code == OUT_OF_MEMORY
 

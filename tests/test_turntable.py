@@ -308,7 +308,7 @@ class TestDoctor:
 
 
 def test_refusal_says_what_to_do_about_it() -> None:
-    error = UserError("only 3 of 66 photos could be placed", "take more", 4)
+    error = UserError("only 3 of 66 photos registered", "take more", 4)
     facts = {"wide": True, "masked": False, "why_not": "x", "pairs": 9, "pairs_two_motions": 9, "unmasked": []}
     assert "--masks" in (advised(error, facts).hint or "")
     assert advised(error, facts).exit_code == 4

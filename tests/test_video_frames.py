@@ -98,7 +98,7 @@ def test_a_camera_that_stands_still_gets_no_frames_for_it(tmp_path):
 
 def test_a_camera_that_never_moves_is_told(tmp_path):
     path = encode(tmp_path / "still.mp4", pan([0.0] * 30))
-    with pytest.raises(UserError, match="shows only 1 different pictures, at least 4") as error:
+    with pytest.raises(UserError, match="has only 1 different frames; at least 4") as error:
         extract(path, tmp_path / "frames", count=10)
     assert error.value.exit_code == TOO_FEW_PHOTOS
     assert not (tmp_path / "frames").exists()
@@ -109,9 +109,9 @@ def test_frames_are_kept_and_not_replaced_unasked(clip, tmp_path):
     extract(clip, folder, count=8)
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
     (note,) = extract(clip, folder, count=8, overwrite=True)
-    assert "is kept: it holds the 8 frames asked for" in note
+    assert "is complete and kept: 8 frames" in note
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
-    with pytest.raises(UserError, match=r"holds other frames: 8 of clip\.mp4"):
+    with pytest.raises(UserError, match=r"contains other frames: 8 of clip\.mp4"):
         extract(clip, folder, count=6)
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
     extract(clip, folder, count=6, overwrite=True)
@@ -123,7 +123,7 @@ def test_frames_that_were_thrown_out_by_hand_stay_out(clip, tmp_path):
     extract(clip, folder, count=8)
     (folder / "frame_000013.jpg").unlink()
     (note,) = extract(clip, folder, count=8)
-    assert note.endswith("1 of them are no longer there")
+    assert note.endswith("1 of which are missing")
     extract(clip, folder, count=8, overwrite=True)
     assert numbers_in(folder) == SHARP
 

@@ -147,7 +147,7 @@ def test_a_video_that_is_cut_short_is_told(clip, tmp_path, name):
     ffmpeg("-i", str(clip), "-c", "copy", "-movflags", "+faststart", str(whole))
     content = whole.read_bytes()
     (tmp_path / name).write_bytes(content[: int(0.7 * len(content))])
-    with pytest.raises(UserError, match=r"cut short: it can be read up to 0\.\d s of 1\.3 s"):
+    with pytest.raises(UserError, match=r"truncated: it can be read up to 0\.\d s of 1\.3 s"):
         measured_levels(open_video(tmp_path / name))
 
 
@@ -164,7 +164,7 @@ def test_a_video_without_its_index_is_cut_short(clip, tmp_path):
     whole = tmp_path / "whole.mp4"
     ffmpeg("-i", str(clip), "-c", "copy", str(whole))  # the index comes last
     (tmp_path / "cut.mp4").write_bytes(whole.read_bytes()[:-2000])
-    with pytest.raises(UserError, match=r"cut\.mp4 is cut short"):
+    with pytest.raises(UserError, match=r"cut\.mp4 is truncated"):
         open_video(tmp_path / "cut.mp4")
 
 
@@ -174,16 +174,16 @@ def test_what_is_no_video_is_told(tmp_path):
     (tmp_path / "notes.txt").write_text("no video\n" * 100)
     (tmp_path / "empty.mp4").touch()
     for name, said in {
-        "sound.m4a": "there is no video stream in",
-        "photo.jpg": "there is no video stream in",
-        "notes.txt": r"no video stream|cannot be read as a video",
+        "sound.m4a": "contains no video stream",
+        "photo.jpg": "contains no video stream",
+        "notes.txt": r"no video stream|is not a readable video",
         "empty.mp4": r"empty \(0 bytes\)",
-        "absent.mp4": "there is no video",
+        "absent.mp4": "does not exist",
     }.items():
         with pytest.raises(UserError, match=said):
             open_video(tmp_path / name)
 
 
 def test_a_frame_that_is_not_there(clip):
-    with pytest.raises(UserError, match="cannot be read as a video"):
+    with pytest.raises(UserError, match="is not a readable video"):
         list(read_frames(open_video(clip), [3, COUNT]))

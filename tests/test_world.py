@@ -137,14 +137,14 @@ def test_origins():
 @pytest.mark.parametrize(
     ("make", "what"),
     [
-        (lambda: turned_up([], "up", up=np.ones(3)), "no axis 'up'"),
-        (lambda: turned_up([], "z"), "no cameras that would tell which way is up"),
-        (lambda: turned_up([], "z", up=np.zeros(3)), "is no direction"),
-        (lambda: turned_up([], "z", up=np.array([np.nan, 0, 1])), "is no direction"),
-        (lambda: moved_to_origin([], "focus"), "no cameras that would tell the focus"),
-        (lambda: moved_to_origin([], "middle"), "'middle' is no point"),
-        (lambda: moved_to_origin([], "1,2"), "no point of three finite numbers"),
-        (lambda: moved_to_origin([], "1,2,inf"), "no point of three finite numbers"),
+        (lambda: turned_up([], "up", up=np.ones(3)), "unknown axis 'up'"),
+        (lambda: turned_up([], "z"), "no cameras to estimate the up direction from"),
+        (lambda: turned_up([], "z", up=np.zeros(3)), "is not a direction"),
+        (lambda: turned_up([], "z", up=np.array([np.nan, 0, 1])), "is not a direction"),
+        (lambda: moved_to_origin([], "focus"), "no cameras to compute the focus from"),
+        (lambda: moved_to_origin([], "middle"), "'middle' is not a point"),
+        (lambda: moved_to_origin([], "1,2"), "not a point of three finite numbers"),
+        (lambda: moved_to_origin([], "1,2,inf"), "not a point of three finite numbers"),
     ],
 )
 def test_what_is_no_direction_or_place_is_refused(make, what):

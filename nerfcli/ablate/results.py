@@ -142,7 +142,7 @@ def write_results(folder: Path, rows: Sequence[Row], measured: Sequence[Measured
 def refuse_foreign(folder: Path) -> None:
     """Raise if something else than an ablation stands at a place."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / RESULT).exists()):
-        raise UserError(f"{folder} is not an ablation, but something else", "choose another place with -o")
+        raise UserError(f"{folder} exists and is not an ablation folder", "choose another folder with -o")
 
 
 def table_of(rows: Sequence[Row]) -> list[tuple[str, ...]]:

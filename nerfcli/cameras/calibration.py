@@ -78,7 +78,7 @@ def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str
     if len(listed) > 1:
         raise UserError(
             f"{calibration.path} lists {len(listed)} images called {picture.path.name}, with different cameras",
-            "give a file with the cameras of these photos alone",
+            "give a file that lists only the cameras of these photos",
         )
     if listed:
         number = next(iter(listed))
@@ -93,7 +93,7 @@ def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str
     what = f"photo {picture.path.name} of {picture.width}x{picture.height}"
     if fitting:
         raise UserError(
-            f"{calibration.path} has {len(fitting)} cameras that may have taken {what}, and does not list it",
+            f"{calibration.path} does not list {what}, and {len(fitting)} of its cameras have that size",
             "give a file that lists the photos by name, or one with a single camera of this size",
         )
     known = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in calibration.cameras))
@@ -101,7 +101,7 @@ def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str
     raise UserError(
         f"{calibration.path} has no camera for {what}: it does not list it, and its cameras are for "
         f"{', '.join(known[:_SIZES_SHOWN])}{more}",
-        "intrinsics belong to whole pictures of one shape; give those of these photos, or leave out --intrinsics",
+        "intrinsics are for a particular aspect ratio; give the intrinsics of these photos, or remove --intrinsics",
     )
 
 

@@ -54,8 +54,8 @@ class Camera:
             )
         if self.width < 1 or self.height < 1:
             raise UserError(
-                f"a camera of {self.width}x{self.height} pixels",
-                "width and height must be whole numbers of at least 1",
+                f"invalid size of a camera: {self.width}x{self.height} pixels",
+                "width and height must be integers of at least 1",
             )
         object.__setattr__(self, "params", tuple(float(value) for value in self.params))
         names = parameter_names(self.model)
@@ -66,7 +66,7 @@ class Camera:
             )
         values = dict(zip(names, self.params, strict=True))
         if complaint := _complaint(self.model, values):
-            raise UserError(f"camera parameters {self.params} of model {self.model} make no camera", complaint)
+            raise UserError(f"invalid parameters {self.params} for camera model {self.model}", complaint)
 
     @staticmethod
     def pinhole(width: int, height: int, focal_px: float) -> "Camera":
@@ -224,9 +224,9 @@ class Camera:
         off_width = abs(self.width * height / self.height - width)
         if min(off_height, off_width) > 1.0:
             raise UserError(
-                f"a picture of {width}x{height} pixels does not fit a camera of {self.width}x{self.height} pixels",
-                "the two have different shapes: it is cropped or rotated, not resized; use the picture that the camera "
-                "was calibrated with",
+                f"a picture of {width}x{height} pixels does not match a camera of {self.width}x{self.height} pixels",
+                "the aspect ratios differ: the picture was cropped or rotated, not resized; use the picture that the "
+                "camera was calibrated with",
             )
         colmap = pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
         colmap.rescale(width, height)
@@ -257,7 +257,7 @@ class Camera:
             width, height = int(content["width"]), int(content["height"])
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(
-                f"this is not a camera: {type(error).__name__}: {error}",
+                f"not a valid camera: {type(error).__name__}: {error}",
                 'expected {"model": COLMAP\'s name, "width": pixels, "height": pixels, "params": [numbers]}',
             ) from error
         return Camera(model, width, height, params)
@@ -283,9 +283,9 @@ def _complaint(model: str, values: dict[str, float]) -> str:
     """What is expected of parameters that make no camera; empty where they make one."""
     focal = [values[name] for name in ("f", "fx", "fy", "w", "h") if name in values]
     if not (np.abs(list(values.values())) < LARGEST_PARAMETER).all() or min(focal) <= 0:
-        return "focal lengths must be above 0 and every parameter a finite number"
+        return "focal lengths must be positive and all parameters finite"
     if model == "EUCM" and not (0 <= values["alpha"] <= 1 and values["beta"] > 0):
-        return "alpha must lie in [0, 1] and beta above 0"
+        return "alpha must be in [0, 1] and beta positive"
     if model == "FOV" and not abs(values["omega"]) < np.pi:
         return "omega is an angle in radians and must lie between -pi and pi"
     return ""

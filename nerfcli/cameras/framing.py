@@ -57,14 +57,14 @@ def cropped(camera: Camera, window: Window) -> Camera:
         UserError: the part is empty or reaches out of the picture, or the picture is equirectangular.
     """
     if camera.is_spherical:
-        raise UserError("a part of an equirectangular picture has no camera model", "leave --crop out", exit_code=2)
+        raise UserError("an equirectangular picture cannot be cropped", "remove --crop", exit_code=2)
     inside = window.x >= 0 and window.y >= 0 and window.width >= 1 and window.height >= 1
     inside = inside and window.x + window.width <= camera.width and window.y + window.height <= camera.height
     if not inside:
         raise UserError(
             f"--crop {window.x},{window.y},{window.width},{window.height} is not inside a picture of "
             f"{camera.width}x{camera.height}",
-            "expected X,Y,WIDTH,HEIGHT in pixels, counted from the upper left corner, after --width and --height",
+            "give X,Y,WIDTH,HEIGHT in pixels from the top-left corner, after --width and --height are applied",
             exit_code=2,
         )
     smaller = _changed(camera, {}, (window.width, window.height))
@@ -90,13 +90,17 @@ def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
     if lens == "equirectangular":
         if fov_deg is not None:
             raise UserError(
-                "--fov with an equirectangular picture, which shows all around", "leave it out", exit_code=2
+                "--fov cannot be used with equirectangular pictures, which cover 360 degrees",
+                "remove --fov",
+                exit_code=2,
             )
         return equirectangular(2 * height, height)
     most = 179.0 if lens == "pinhole" else 360.0
     if fov_deg is not None and not 0 < fov_deg <= most:  # True at NaN
         raise UserError(
-            f"--fov {fov_deg:g} of a {lens} lens", f"expected degrees above 0 and up to {most:g}", exit_code=2
+            f"--fov {fov_deg:g} is out of range for a {lens} lens",
+            f"expected degrees above 0 and up to {most:g}",
+            exit_code=2,
         )
     if lens == "fisheye":
         focal_px = width / math.radians(_FISHEYE_FOV_DEG if fov_deg is None else fov_deg)
@@ -114,8 +118,8 @@ def equirectangular(width: int, height: int) -> Camera:
     """
     if width != 2 * height:
         raise UserError(
-            f"an equirectangular picture of {width}x{height}",
-            "it shows 360 by 180 degrees and is twice as wide as high; give --width or --height alone",
+            f"invalid size of an equirectangular picture: {width}x{height}",
+            "its width must be twice its height; give only --width or only --height",
             exit_code=2,
         )
     return Camera("EQUIRECTANGULAR", width, height, (width, height))

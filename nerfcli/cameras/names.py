@@ -36,6 +36,6 @@ def _named(name: str, whole: dict[str, Frame], endings: dict[str, list[Frame]]) 
         return found[0]
     if found:
         several = ", ".join(frame.name for frame in found[:3])
-        raise UserError(f"{len(found)} images are called {name}: {several}", "give more of the name")
+        raise UserError(f"{len(found)} images match {name}: {several}", "give a longer part of the name")
     near = get_close_matches(name, whole, n=3, cutoff=0.5) or list(whole)[:3]
-    raise UserError(f"no image is called {name!r}", f"there are {len(whole)}, such as {', '.join(near)}")
+    raise UserError(f"no image is named {name!r}", f"there are {len(whole)}, such as {', '.join(near)}")

@@ -72,8 +72,8 @@ def turn_to_upright(camera: Camera, *, path: Path, measure: Measure) -> tuple[in
     width, height, orientation = measure(path)
     if orientation not in _TURNS:
         raise UserError(
-            f"{path}: EXIF orientation {orientation} mirrors the photo, which no camera can do",
-            "write the photo upright without the tag and find the poses again",
+            f"{path}: EXIF orientation {orientation} mirrors the photo, which is not supported",
+            "save the photo upright without the tag and estimate the poses again",
         )
     stored = (height, width) if orientation >= 5 else (width, height)
     if stored != (width, height) and _shape_error(camera, stored) > _shape_error(camera, (width, height)):
@@ -97,7 +97,7 @@ def turned(camera: Camera, world_from_cam: np.ndarray, *, orientation: int) -> t
     if camera.is_spherical:
         raise UserError(
             f"a spherical picture with EXIF orientation {orientation}",
-            "write the panorama upright without the tag",
+            "save the panorama upright without the tag",
         )
     turn = _TURNS[orientation]
     values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
@@ -145,8 +145,8 @@ def counted(sizes: Iterable[tuple[Size, Size] | None]) -> dict[tuple[Size, Size]
 def rescaling_told(rescaled: Mapping[tuple[Size, Size], int]) -> list[str]:
     """What `Capture.rescaled` holds, a sentence for each pair of sizes."""
     return [
-        f"{count} photo{'s are' if count > 1 else ' is'} {width}x{height}, "
-        f"and the intrinsics are given for {of_width}x{of_height}: rescaled"
+        f"{count} photo{'s are' if count > 1 else ' is'} {width}x{height}, but the intrinsics are for {of_width}x"
+        f"{of_height}: rescaled"
         for ((of_width, of_height), (width, height)), count in rescaled.items()
     ]
 

@@ -56,8 +56,8 @@ def orbit(
     offsets, distances = offsets[distances > 0], distances[distances > 0]
     if len(offsets) == 0:
         raise UserError(
-            "all cameras stand in one place and look around: there is nothing to orbit",
-            "choose the path through the frames (interpolate)",
+            "all cameras are in one place and look outwards: there is nothing to orbit",
+            "use --cameras interpolate, the path through the photos",
         )
     if surrounds(frames, up):
         curve = _ring(offsets, distances, up)
@@ -98,8 +98,9 @@ def ellipse(
     half = np.percentile(np.abs((centres - focus) @ axes), 90, axis=0)
     if half.min() <= 1e-6 * np.linalg.norm(centres - focus, axis=1).max():
         raise UserError(
-            f"the cameras make no ellipse about what they look at: its half axes are {half[1]:.3g} and {half[0]:.3g}",
-            "choose the path that sways in front of it (orbit), or the one through the frames (interpolate)",
+            f"the cameras do not surround what they look at: the half axes of the ellipse are {half[1]:.3g} and "
+            f"{half[0]:.3g}",
+            "use --cameras orbit, or interpolate for the path through the photos",
         )
     middle = focus + ((centres - focus) @ up).mean() * up
 

@@ -48,14 +48,14 @@ def turned_up(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = Non
         UserError: an unknown axis, an `up` of length 0, or neither frames nor `up`.
     """
     if axis not in WORLD_AXES:
-        raise UserError(f"there is no axis {axis!r} to point up", f"choose one of {', '.join(WORLD_AXES)}")
+        raise UserError(f"unknown axis {axis!r} for the up direction", f"choose one of {', '.join(WORLD_AXES)}")
     if up is None:
         if not frames:
-            raise UserError("the capture has no cameras that would tell which way is up", "give the direction")
+            raise UserError("the capture has no cameras to estimate the up direction from", "give the up direction")
         up = up_direction(frames)
     length = float(np.linalg.norm(up))
     if not (np.isfinite(length) and length > 0):
-        raise UserError(f"{up} is no direction", "expected three finite numbers, not all 0")
+        raise UserError(f"{up} is not a direction", "expected three finite numbers, not all 0")
     return Similarity(1.0, smallest_rotation(np.asarray(up, dtype=np.float64) / length, WORLD_AXES[axis]), np.zeros(3))
 
 
@@ -74,7 +74,7 @@ def moved_to_origin(frames: Sequence[Frame], origin: str, *, depth_hint: float |
     if origin not in ORIGINS:
         return Similarity(1.0, np.eye(3), -point_of(origin, f"choose {', '.join(ORIGINS)}, or x,y,z"))
     if not frames:
-        raise UserError(f"the capture has no cameras that would tell the {origin}", "give the origin as x,y,z")
+        raise UserError(f"the capture has no cameras to compute the {origin} from", "give the origin as x,y,z")
     place = centres_of(frames).mean(axis=0) if origin == ORIGINS[0] else focus_point(frames, depth_hint=depth_hint)
     return Similarity(1.0, np.eye(3), -place)
 
@@ -88,9 +88,9 @@ def point_of(text: str, hint: str) -> np.ndarray:
     try:
         point = np.array([float(part) for part in text.split(",")])
     except ValueError as error:
-        raise UserError(f"{text!r} is no point", hint) from error
+        raise UserError(f"{text!r} is not a point", hint) from error
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise UserError(f"{text!r} is no point of three finite numbers", hint)
+        raise UserError(f"{text!r} is not a point of three finite numbers", hint)
     return point
 
 

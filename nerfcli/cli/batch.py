@@ -39,7 +39,7 @@ def for_each_input(source: str, work: Callable[[Path, bool], None]) -> None:
             first_failure = first_failure or error
     if count == 0:
         raise UserError(
-            "no path came on standard input", "give one path per line, e.g. ls -d captures/*/ | nerfcli poses -"
+            "no paths on standard input", "give one path per line, for example: ls -d captures/*/ | nerfcli poses -"
         )
     if first_failure is not None:
         raise typer.Exit(first_failure.exit_code)
@@ -64,7 +64,7 @@ def result_path(source: Path, *, suffix: str, output: Path | None, one_of_many: 
     if source.name in ("", ".."):  # "." and ".." have a name only once they are resolved
         source = source.resolve()
     if not source.name and (output is None or one_of_many):
-        raise UserError(f"there is no place beside {source}", "say with -o where the result shall go")
+        raise UserError(f"cannot write a result next to {source}", "choose the output folder with -o")
     name = source.name + suffix
     if output is None:
         return source.with_name(name)

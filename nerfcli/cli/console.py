@@ -153,10 +153,10 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
             report_error(error)
             raise typer.Exit(error.exit_code) from error
         except Terminated as error:
-            _stderr("Ended by SIGTERM; what was complete is kept.")
+            _stderr("Ended by SIGTERM; completed work is kept.")
             raise typer.Exit(TERMINATED) from error
         except KeyboardInterrupt as error:
-            _stderr("Interrupted; what was complete is kept.")
+            _stderr("Interrupted; completed work is kept.")
             raise typer.Exit(INTERRUPTED) from error
         except BrokenPipeError as error:
             # Whoever read our results has gone: end quietly, and let Python not complain while closing stdout.
@@ -178,5 +178,5 @@ def out_of_memory_told() -> Iterator[None]:
         text = str(error).lower()
         if not isinstance(error, MemoryError) and "not enough memory" not in text and "out of memory" not in text:
             raise
-        hint = "try --downscale 4, smaller pictures (--max-size), or fewer photos"
+        hint = "use --downscale 4, smaller pictures (--max-size) or fewer photos"
         raise UserError("out of memory", hint, OUT_OF_MEMORY) from error

@@ -43,14 +43,14 @@ def words_of(facts: dict[str, Any]) -> list[str]:
 def _what(facts: dict[str, Any]) -> Iterator[str]:
     kinds = {
         "depth": "depth file",
-        "preview": "picture of a depth map; its colours are no numbers",
-        "array": "numbers of another program",
-        "levels": "16-bit levels of another program",
+        "preview": "preview of a depth map (colours, not values)",
+        "array": "depth of another program",
+        "levels": "16-bit integers of another program",
     }
     size = f", {facts['width']}x{facts['height']}" if "width" in facts else ""
     frames = f", {facts['frames']} frames" if "frames" in facts else ""
-    rate = f" at {facts['fps']:g} a second" if facts.get("fps") else ""
-    files = f", {facts['files']} depth files that mean the same" if facts.get("files") else ""
+    rate = f" at {facts['fps']:g} per second" if facts.get("fps") else ""
+    files = f", {facts['files']} depth files with the same definition" if facts.get("files") else ""
     yield f"{kinds.get(facts['kind'], facts['kind'])} ({facts['format']}{size}{frames}{rate}{files})"
 
 
@@ -74,22 +74,22 @@ def _meaning(meaning: dict[str, Any]) -> Iterator[str]:
         return
     invalid = {"nan": "NaN", "0": "0"}.get(meaning.get("invalid", "nan"), "marked")
     if meaning["opacity_floor"] > 0:
-        yield f"pixels less opaque than {meaning['opacity_floor']:g} have no value ({invalid})"
+        yield f"pixels with an opacity below {meaning['opacity_floor']:g} have no value ({invalid})"
     if meaning.get("background_distance") is not None:
-        yield f"what passes counts at the background distance, {meaning['background_distance']:.6g}"
+        yield f"light that passes counts at the background distance, {meaning['background_distance']:.6g}"
     if meaning.get("units_per_level") is not None:
         yield f"value = level x {meaning['units_per_level']:g}"
     if meaning["unit"] != "metre":
-        yield "the scale of the scene is not known: lengths are in the units of its world, not in metres"
+        yield "the scene has no metric scale: lengths are in scene units, not metres"
     elif not meaning.get("unit_source"):
-        yield "how the metre is known was not written down"
+        yield "the source of the metric scale is not recorded"
     for name, layer in meaning.get("layers", {}).items():
         yield f"also in the file: {name} ({layer.get('convention')})"
     bounds = dict(meaning.get("error_bounds", {}))
     if "rounding_max" in bounds:
-        yield f"rounding to levels changed no depth by more than {bounds.pop('rounding_max'):.3g}"
+        yield f"rounding to integers changed depth by at most {bounds.pop('rounding_max'):.3g}"
     if bounds:
-        told = bounds.pop("meaning", "it bounds the rendering, not the field")
+        told = bounds.pop("meaning", "a bound on the rendering, not on the accuracy of the field")
         listed = ", ".join(f"{name} {_number(value)}" for name, value in bounds.items())
         yield from _folded(f"error of the rendering: {listed}")
         yield from _folded(told)
@@ -108,7 +108,7 @@ def _camera(view: dict[str, Any]) -> Iterator[str]:
     line = f"camera of {view.get('name')}: {camera.get('model')} {camera.get('width')}x{camera.get('height')}"
     yield f"{line}, parameters {parameters}"
     if pose:
-        yield f"its centre in the world: {' '.join(f'{row[3]:.6g}' for row in pose[:3])}"
+        yield f"camera centre in the world: {' '.join(f'{row[3]:.6g}' for row in pose[:3])}"
 
 
 def _folded(text: str) -> list[str]:

@@ -130,11 +130,12 @@ def poses(
     one_of(camera_model, CAMERA_MODELS, "--camera-model")
     one_of(pairing, PAIRINGS, "--pairing")
     if pairs is not None and pairing != "auto":
-        raise typer.BadParameter("the pairs come from --pairs; leave out --pairing", param_hint="--pairing")
+        raise typer.BadParameter("cannot be combined with --pairs; remove --pairing", param_hint="--pairing")
     use = use_of(intrinsics, intrinsics_as)
     if intrinsics is not None and camera_model != "auto":
         raise typer.BadParameter(
-            "the camera models come from --intrinsics; leave out --camera-model", param_hint="--camera-model"
+            "cannot be combined with --intrinsics, which gives the camera models; remove --camera-model",
+            param_hint="--camera-model",
         )
     console = Console(quiet=quiet, json_lines=json)
     usual_size, usual_features = sizes_of(quality)
@@ -214,7 +215,7 @@ def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
 
     one_of(intrinsics_as, USES, "--intrinsics-as")
     if intrinsics_as is not None and intrinsics is None:
-        raise typer.BadParameter("there are no intrinsics to use so; add --intrinsics", param_hint="--intrinsics-as")
+        raise typer.BadParameter("needs --intrinsics", param_hint="--intrinsics-as")
     return intrinsics_as or USES[0]
 
 
@@ -226,6 +227,6 @@ def print_database(scene: Path, *, drop: bool, console: Console) -> None:
         drop_database(scene)
     elif size := database_bytes(scene):
         console.note(
-            f"{scene / 'database.db'}: features and matches, {size / 1e6:.0f} MB, make other settings quick; "
-            "--drop-database deletes them"
+            f"{scene / 'database.db'} keeps features and matches ({size / 1000000.0:.0f} MB) so that other settings "
+            "run faster; --drop-database deletes it"
         )

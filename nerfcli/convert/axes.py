@@ -39,9 +39,7 @@ def opencv_from_axes(axes: str) -> np.ndarray:
             f"choose {', '.join(NAMED_AXES)}, or three letters for where x, y and z point: rdf, rub, ...",
         )
     if np.linalg.det(columns) < 0:
-        raise UserError(
-            f"camera axes {axes!r} are left-handed", "a pose of such a camera is no rotation; turn one axis around"
-        )
+        raise UserError(f"camera axes {axes!r} are left-handed", "reverse one of the axes")
     return rigid.from_parts(columns, np.zeros(3))
 
 

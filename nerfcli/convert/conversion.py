@@ -132,19 +132,19 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wante
     turned = in_pixels(capture, _pixels(form, wanted, capture))
     capture = turned.capture
     off = len(turned.masks_left_out)
-    turned_masks = (f"{off} masks of photos with an EXIF orientation, which lie as the other pixels",) if off else ()
+    turned_masks = (f"{off} masks of photos with an EXIF orientation, which have the other orientation",) if off else ()
     losses = (*turned_masks, *form.losses(capture))
     # 2D features are what structure from motion works with; who asks for another format does not expect them there.
     refused = (*turned_masks, *form.losses(replace(capture, observations=None)))
     if refused and not wanted.allow_loss:
         raise UserError(
-            f"{form.name} cannot hold all of this capture; it would lose: {'; '.join(losses)}",
-            "add --allow-loss to leave that out, or choose another format, such as npz, which holds everything",
+            f"{form.name} cannot hold everything in this capture; it would lose: {'; '.join(losses)}",
+            "add --allow-loss to drop that, or use another format such as npz, which holds everything",
         )
     files = _files(form, path)
     there = [file for file in files if file.exists()]
     if there and not wanted.overwrite:
-        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another place")
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another output path")
     left = reduced(capture, form.name)
     verification = None
     with _kept_on_success(path, there, files):
@@ -160,18 +160,18 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wante
 def _pixels(form: Format, wanted: Wanted, capture: Capture) -> str:
     """The pixels that the cameras of the written file shall refer to."""
     if form.name == "nerfcli" and wanted.pixels == STORED:
-        raise UserError("the cameras of nerfcli's scenes refer to upright photos", "leave --pixels out", exit_code=2)
+        raise UserError("the nerfcli format always uses upright photos", "remove --pixels", exit_code=2)
     return wanted.pixels or form.pixels or capture.pixels
 
 
 def _orientation_notes(turned: Turned) -> tuple[str, ...]:
     notes = []
     if turned.num_turned:
-        stored = "as stored, which most programs read" if turned.capture.pixels == STORED else "upright"
-        notes.append(f"{turned.num_turned} photos have an EXIF orientation: their cameras refer to the pixels {stored}")
+        stored = "as stored, as most programs expect" if turned.capture.pixels == STORED else "upright"
+        notes.append(f"{turned.num_turned} photos have an EXIF orientation: their cameras refer to pixels {stored}")
     if turned.num_unknown:
         notes.append(
-            f"{turned.num_unknown} photos are not there: if they have an EXIF orientation, their cameras do not fit"
+            f"{turned.num_unknown} photos are missing: if they have an EXIF orientation, their cameras will be wrong"
         )
     return tuple(notes)
 
@@ -185,14 +185,14 @@ def _convention(form: Format, wanted: Wanted) -> Convention:
     axes = form.axes if wanted.axes is None else wanted.axes
     if not np.array_equal(opencv_from_axes(axes), opencv_from_axes(form.axes)) and not form.open_axes:
         raise UserError(
-            f"{form.name} fixes the camera axes: {form.axes}, not {axes}",
-            "leave --axes out; every program that reads this format expects its own axes",
+            f"{form.name} prescribes the camera axes {form.axes}, not {axes}",
+            "remove --axes; programs that read this format expect its own axes",
         )
     pixel_centre = 0.5 if wanted.pixel_centre is None else wanted.pixel_centre
     if pixel_centre != 0.5 and not form.open_centre:
         raise UserError(
-            f"{form.name} fixes where pixel positions count from: the first pixel's centre is (0.5, 0.5)",
-            "leave --pixel-center out; every program that reads this format expects it so",
+            f"{form.name} prescribes the pixel convention: the top-left pixel's centre is (0.5, 0.5)",
+            "remove --pixel-center; programs that read this format expect its own convention",
         )
     return Convention(axes, pixel_centre=pixel_centre)
 
@@ -218,8 +218,8 @@ def _does_not_hold(path: Path, verification: Verification) -> UserError:
         f"tolerance {verification.tolerance_px:.3g} px"
     )
     return UserError(
-        f"{path} did not hold what it should: {what}",
-        "nothing was kept; this is a fault of nerfcli, please report it (--no-verify writes the file all the same)",
+        f"{path} failed verification: {what}",
+        "nothing was kept; this is a bug in nerfcli, please report it (--no-verify writes the file anyway)",
         exit_code=GATE_NOT_MET,
     )
 

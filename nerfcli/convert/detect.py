@@ -147,8 +147,8 @@ def _evidence(capture: Capture, progress: Callable[[float, str], None]) -> Evide
     if len(capture.points):
         return FrustumEvidence(capture)
     raise UserError(
-        "there is nothing to judge the convention by: no photo on disk that matches another, and no 3D point",
-        "give the folder of the photos with --images",
+        "the convention cannot be detected: no photo matches another, and there are no 3D points",
+        "give the photo folder with --images",
     )
 
 
@@ -209,7 +209,7 @@ def _question(
         low, high = _interval(
             best, second, evidence.groups, lambda errors: -float(np.mean(errors <= evidence.threshold_px))
         )
-        what = f"the shares differ by {100 * (answers[0].inlier_share - answers[1].inlier_share):.1f} %"
+        what = f"the inlier ratios differ by {100 * (answers[0].inlier_share - answers[1].inlier_share):.1f} %"
     else:
         ratio = answers[1].median_px / max(answers[0].median_px, 1e-9)
         low, high = _interval(best, second, evidence.groups, lambda errors: float(np.median(errors)))
@@ -218,7 +218,7 @@ def _question(
         return Question(name, answers, "none holds", ratio, "most of the evidence contradicts each of them")
     if not (low > 0 and ratio >= LEAST_RATIO):
         noise = (high - low) / 2
-        reason = f"{what}, less than {'noise' if low <= 0 else 'a systematic error might make'} ({noise:.2g})"
+        reason = f"{what}, less than {'noise' if low <= 0 else 'a systematic error could cause'} ({noise:.2g})"
         return Question(name, answers, "not decidable", ratio, reason)
     return Question(name, answers, "holds", ratio, "")
 

@@ -127,7 +127,7 @@ class FrustumEvidence:
         self.groups = np.repeat(frames, len(chosen))
         self._points = np.tile(capture.points[chosen], (len(frames), 1))
         self._cameras = [frame.camera for frame in capture.frames]
-        self.name = f"{len(chosen)} points, whether they lie inside the pictures of {len(frames)} photos"
+        self.name = f"the visibility of {len(chosen)} points in {len(frames)} photos"
 
     def errors_px(self, world_from_cam: np.ndarray) -> np.ndarray:
         """0 or infinity for each pair of a photo and a point, (M,)."""

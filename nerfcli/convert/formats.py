@@ -110,13 +110,13 @@ def recognise(path: Path) -> tuple[Format, Path]:
         UserError: nothing there, or nothing that is known; what was looked for is listed.
     """
     if not path.exists():
-        raise UserError(f"there is no {path}", "give the file or the folder of a capture")
+        raise UserError(f"{path} does not exist", "give a file or folder of cameras")
     for form in FORMATS:
         found = form.find(path)
         if found is not None and form.parse is not None:
             return form, found
     looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.parse is not None))
-    raise UserError(f"{path} holds no capture in a known format", f"looked for {looked_for}")
+    raise UserError(f"{path} contains no capture in a supported format", f"looked for {looked_for}")
 
 
 def format_named(name: str) -> Format:
@@ -179,7 +179,7 @@ def _parse_model(path: Path, given: Given) -> Capture:
 FORMATS = (
     Format(
         "nerfcli",
-        "a scene as nerfcli poses writes it: a COLMAP model in sparse/0, and scene.json",
+        "a scene folder of nerfcli: a COLMAP model in sparse/0, and scene.json",
         SCENE_FILE,
         find_scene,
         _parse_scene,
@@ -210,7 +210,7 @@ FORMATS = (
     ),
     Format(
         "run",
-        "the cameras of a run, refined where training refined them (read)",
+        "the cameras of a run, as refined by training (read)",
         "cameras.json of a run",
         find_run,
         lambda path, given: parse_run(path),
@@ -322,7 +322,7 @@ FORMATS = (
     ),
     Format(
         "npz",
-        "everything, as arrays of NumPy",
+        "everything, as NumPy arrays",
         ".npz",
         by_suffix(".npz", "capture.npz"),
         lambda path, given: parse_npz(path),
@@ -336,7 +336,7 @@ FORMATS = (
     ),
     Format(
         "ply",
-        "the points alone (written)",
+        "the points only (written)",
         "",
         lambda path: None,
         None,

@@ -24,7 +24,9 @@ def read_intrinsics(path: Path) -> Camera:
     """
     cameras = read_calibration(path).cameras
     if len(cameras) != 1:
-        raise UserError(f"{path} has {len(cameras)} different cameras", "give a file with the one that took all frames")
+        raise UserError(
+            f"{path} has {len(cameras)} different cameras", "give a file with the single camera of all frames"
+        )
     return cameras[0]
 
 

@@ -22,7 +22,7 @@ def losses_scene(capture: Capture) -> tuple[str, ...]:
     """
     _, names = _named(capture)
     renamed = sum(frame.name != name for frame, name in zip(capture.frames, names, strict=True))
-    return (f"the names of {renamed} photos, which become their paths below one folder",) if renamed else ()
+    return (f"the names of {renamed} photos, which become paths relative to one folder",) if renamed else ()
 
 
 def named_for_scene(capture: Capture) -> Capture:
@@ -51,8 +51,8 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
     image_folder, _ = _named(capture)
     if not any(frame.image is not None and frame.image.is_file() for frame in capture.frames):
         raise UserError(
-            f"none of the {len(capture.frames)} photos is on disk, such as {capture.frames[0].image}",
-            "a scene refers to its photos; say with --images where they are",
+            f"none of the {len(capture.frames)} photos exists, such as {capture.frames[0].image}",
+            "a scene needs its photos; give their folder with --images",
         )
     capture = named_for_scene(capture)
     write_colmap_binary(capture, folder / scene.MODEL_FOLDER)
@@ -92,8 +92,8 @@ def _named(capture: Capture) -> tuple[Path, list[str]]:
     for frame in capture.frames:
         if frame.image is None:
             raise UserError(
-                f"{frame.name} has no photo, and a scene consists of photos",
-                "say with --images where the photos are; views without photos can go to another format",
+                f"{frame.name} has no photo, which a scene requires",
+                "give the photo folder with --images, or convert to another format",
             )
         images.append(os.path.abspath(frame.image))
     names = [frame.name for frame in capture.frames]

@@ -85,7 +85,7 @@ def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px
     try:
         order = _order(capture, back, listed)
         if back.points is not None and back.points.shape != points.shape:
-            raise UnreadableError(f"it holds {len(back.points)} points instead of {len(points)}")
+            raise UnreadableError(f"it contains {len(back.points)} points instead of {len(points)}")
     except UnreadableError as error:
         return replace(empty, fault=str(error))
     fault, parts = compared_parts(capture, back, order, tolerance_px=tolerance_px)
@@ -148,7 +148,7 @@ def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
         UnreadableError: a view is missing, or belongs to another photo.
     """
     if len(back.centres) != len(capture.frames):
-        raise UnreadableError(f"it holds {len(back.centres)} views instead of {len(capture.frames)}")
+        raise UnreadableError(f"it contains {len(back.centres)} views instead of {len(capture.frames)}")
     names = [frame.name for frame in capture.frames]
     places = {label: index for index, label in enumerate(back.labels or ())}
     if len(places) == len(names) and set(places) == set(names):
@@ -157,7 +157,7 @@ def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
         for frame_index, label in zip(listed, back.labels, strict=True):
             name = PurePosixPath(names[frame_index])
             if PurePosixPath(label).name not in (name.name, name.stem):
-                raise UnreadableError(f"where {name} should be, it lists {label}")
+                raise UnreadableError(f"it lists {label} instead of {name}")
     return np.argsort(listed)
 
 

@@ -48,7 +48,7 @@ def _colours(capture: Capture, back: ReadBack) -> tuple[str, str]:
     if capture.colours is None:
         return "", ""
     if back.colours is None or back.colours.shape != capture.colours.shape:
-        return "it holds no colours of the points, or of others", ""
+        return "it has no point colours, or colours of other points", ""
     wrong = int((back.colours != capture.colours).any(axis=1).sum())
     return (f"{wrong} points have another colour" if wrong else ""), f"colours of {len(capture.colours)} points"
 
@@ -58,7 +58,7 @@ def _observations(capture: Capture, back: ReadBack, order: np.ndarray, *, tolera
     if seen is None:
         return "", ""
     if back.features is None:
-        return "it holds no observations", ""
+        return "it has no observations", ""
     rows = np.argsort(seen.frame_index, kind="stable")
     rows_of_frames = np.split(rows, np.searchsorted(seen.frame_index[rows], np.arange(1, len(capture.frames))))
     step = max(1, -(-len(rows) // _MOST_OBSERVATIONS))
@@ -81,17 +81,17 @@ def _paths(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, st
     for frame, view in zip(capture.frames, order, strict=True):
         if frame.image is not None and not same(str(frame.image), images[view]):
             return f"the photo of {frame.name} would be {images[view]}", ""
-    return "", "the places of the photos"
+    return "", "the photo paths"
 
 
 def _masks(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, str]:
     masks, count = back.beside.masks, sum(frame.mask is not None for frame in capture.frames)
     if masks is None:
-        return ("it holds no masks" if count else ""), ""
+        return ("it has no masks" if count else ""), ""
     same = _Same()
     for frame, view in zip(capture.frames, order, strict=True):
         if (frame.mask is not None) != bool(masks[view]):
-            return f"{frame.name} has a mask in one and none in the other", ""
+            return f"{frame.name} has a mask in only one of the two", ""
         if frame.mask is not None and not same(str(frame.mask), masks[view]):
             return f"the mask of {frame.name} would be {masks[view]}", ""
     return "", f"{count} masks" if count else ""
@@ -100,10 +100,10 @@ def _masks(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, st
 def _splits(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[str, str]:
     splits = back.beside.splits
     if splits is None:
-        return ("it holds no split" if any(frame.split for frame in capture.frames) else ""), ""
+        return ("it has no split" if any(frame.split for frame in capture.frames) else ""), ""
     for frame, view in zip(capture.frames, order, strict=True):
         if (frame.split or "") != splits[view]:
-            return f"{frame.name} is of {frame.split or 'no split'} and became {splits[view] or 'of none'}", ""
+            return f"the split of {frame.name} changed from {frame.split or 'none'} to {splits[view] or 'none'}", ""
     return "", "the split" if any(splits) else ""
 
 
@@ -118,7 +118,7 @@ def _depth_bounds(capture: Capture, back: ReadBack, order: np.ndarray) -> tuple[
 def _unit(capture: Capture, back: ReadBack) -> tuple[str, str]:
     unit = back.beside.unit
     if unit is None:
-        return ("" if capture.unit == "arbitrary" else "it does not hold the unit of length"), ""
+        return ("" if capture.unit == "arbitrary" else "it has no unit of length"), ""
     return ("" if unit == capture.unit else f"its unit is {unit}, not {capture.unit}"), f"the unit ({unit})"
 
 

@@ -66,13 +66,13 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Simil
 def _source(estimate: ScaleEstimate) -> str:
     """How the metre is known, for people."""
     relative = None if estimate.standard_error is None else estimate.standard_error / estimate.metres_per_unit
-    return estimate.source if relative is None else f"{estimate.source}, +- {100 * relative:.2g} %"
+    return estimate.source if relative is None else f"{estimate.source}, ± {100 * relative:.2g} %"
 
 
 def _estimate(capture: Capture, wanted: WorldFrame) -> ScaleEstimate | None:
     given = {"--scale": wanted.scale, "--markers": wanted.markers, "--distance": wanted.distances or None}
     if len(named := [name for name, value in given.items() if value is not None]) > 1:
-        raise UserError(f"{' and '.join(named)} are given", "give one of them: a scene has one scale", exit_code=2)
+        raise UserError(f"{' and '.join(named)} cannot be combined", "give only one of them", exit_code=2)
     if wanted.distances:
         return scale_from_distances([known_distance(text, capture.frames) for text in wanted.distances])
     frames = [frame for frame in capture.frames if frame.image is not None and frame.image.is_file()]
@@ -96,7 +96,7 @@ def _scale_from_markers(frames: Sequence[Frame], text: str) -> ScaleEstimate:
         return scale_from_charuco(frames, board)
     except ValueError as error:
         raise UserError(
-            f"--markers is {text!r}",
+            f"invalid --markers {text!r}",
             "expected markers DICT_4X4_50:0.05, or a ChArUco board DICT_5X5_100:7x5:0.04:0.03, sides in metres",
             exit_code=2,
         ) from error
@@ -110,5 +110,5 @@ def _factor(text: str | None) -> float:
     except ValueError:
         factor = 0.0
     if not 0 < factor < np.inf:
-        raise UserError(f"--scale is {text!r}", "expected a number above 0, or gps", exit_code=2)
+        raise UserError(f"invalid --scale {text!r}", "expected a positive number, or gps", exit_code=2)
     return factor

@@ -39,18 +39,18 @@ def spread(scene: Scene) -> Finding:
     np.fill_diagonal(nearest, np.inf)
     step = float(np.median(nearest.min(axis=1) / depths)) if len(centres) > 1 else 0.0
     verdict = worst([verdict_below(ratio, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if far else GOOD])
-    summary = f"spread over depth {ratio:.2f}, to the nearest camera {step:.3f}"
-    advice = "" if verdict == GOOD else "step sideways between photos: depth shows only where the camera moves"
+    summary = f"camera spread / depth {ratio:.2f}, distance to the nearest camera / depth {step:.3f}"
+    advice = "" if verdict == GOOD else "step sideways between photos: depth is visible only if the camera moves"
     if far:
-        summary += f"; {several(len(far), 'camera')} far off the others"
-        advice = "look at these poses; wrong ones ruin the training: find poses again without these photos"
+        summary += f"; {several(len(far), 'camera')} far from the others"
+        advice = "check these poses: wrong ones ruin training; estimate poses again without these photos"
     return Finding(
         "camera spread",
         verdict,
         summary,
         ratio,
-        f"spread over depth: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}; "
-        f"a camera: look from {_FAR_OFF:g} times the median distance",
+        f"camera spread / depth: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}; a camera: look from "
+        f"{_FAR_OFF:g} times the median distance",
         advice,
         tuple((scene.frames[i].name, f"{distances[i] / typical:.0f} times the median distance") for i in far),
     )
@@ -76,20 +76,20 @@ def directions(scene: Scene) -> Finding:
         return Finding(
             "directions",
             verdict,
-            f"seen from the front, within {span:.0f} degrees; {high}",
+            f"cameras in front of the scene, within {span:.0f} degrees; {high}",
             span,
             f"span: look below {_SPAN_LOOK:g} degrees, bad below {_SPAN_BAD:g}",
-            "" if verdict == GOOD else "take photos from farther left, right, above and below",
+            "" if verdict == GOOD else "add photos from farther left, right, above and below",
         )
     widest = float(gaps.max())
     verdict = BAD if looks_in and widest >= _GAP_BAD else LOOK if looks_in and widest >= _GAP_LOOK else GOOD
     return Finding(
         "directions",
         verdict,
-        f"{'around' if looks_in else 'looking outwards'}, widest gap {widest:.0f} degrees; {high}",
+        f"cameras {'around the scene' if looks_in else 'looking outwards'}, widest gap {widest:.0f} degrees; {high}",
         widest,
-        f"gap around something: look from {_GAP_LOOK:g} degrees, bad from {_GAP_BAD:g}",
-        "" if verdict == GOOD else "fill the gap: from there nothing is known of the scene",
+        f"gap around the scene: look from {_GAP_LOOK:g} degrees, bad from {_GAP_BAD:g}",
+        "" if verdict == GOOD else "add photos in the gap: the scene is unknown from there",
     )
 
 
@@ -104,10 +104,10 @@ def points(scene: Scene) -> Finding | None:
     return Finding(
         "points",
         LOOK if few else GOOD,
-        f"{middle:.0f} points of the model in the middle photo" + (f", {len(few)} photos with few" if few else ""),
+        f"{middle:.0f} 3D points in the median photo" + (f", {len(few)} photos with few" if few else ""),
         middle,
-        f"a photo: look below {_POINTS_LOOK}",
-        "their poses are uncertain: look at renders from there before trusting them" if few else "",
+        f"per photo: look below {_POINTS_LOOK}",
+        "their poses are uncertain: check renderings from there" if few else "",
         tuple((name, several(count, "point")) for count, name in few),
     )
 
@@ -124,16 +124,14 @@ def intrinsics(scene: Scene) -> Finding | None:
     weak = [one for one in certain if one["weak"]]
     focal = max(one["focal_percent"] for one in certain)
     border_px = max(one["distortion_border_px"] for one in certain)
-    said = f"focal length +-{focal:.2g} %, distortion +-{border_px:.2g} px at the corners"
+    said = f"focal length ± {focal:.2g} %, distortion ± {border_px:.2g} px at the corners"
     return Finding(
         "intrinsics",
         LOOK if weak else GOOD,
         f"intrinsics are weakly determined: {said}" if weak else said,
         focal,
-        "one standard deviation: look from 1 % of the focal length, or half a per cent of the picture's half diagonal",
-        "give --intrinsics to nerfcli poses; or take photos from more sides and distances, of things with depth"
-        if weak
-        else "",
+        "standard deviation: look from 1 % of the focal length, or 0.5 % of half the image diagonal",
+        "use nerfcli poses --intrinsics, or add photos from more directions and distances" if weak else "",
     )
 
 
@@ -148,27 +146,27 @@ def belongings(scene: Scene) -> list[Finding]:
         Finding(
             "missing photos",
             BAD if len(missing) > 0.5 * total else LOOK if missing else GOOD,
-            f"{len(missing)} of {several(total, 'listed photo')} not on disk" if missing else "none",
+            f"{len(missing)} of {several(total, 'listed photo')} missing" if missing else "none",
             len(missing),
             "look from 1, bad from half of them",
-            "put them back, or leave it: the others are used" if missing else "",
-            tuple((name, "not on disk") for name in missing),
+            "put them back, or continue with the others" if missing else "",
+            tuple((name, "missing") for name in missing),
         ),
         Finding(
             "masks",
             LOOK if unmasked else GOOD,
-            f"{len(masked)} of {several(len(scene.frames), 'photo')} have one" if masked else "none",
+            f"{len(masked)} of {several(len(scene.frames), 'photo')} have a mask" if masked else "none",
             len(masked),
-            "look where some photos have one and others not",
-            "give every photo its mask, or none" if unmasked else "",
+            "look if only some photos have a mask",
+            "give all photos a mask, or none" if unmasked else "",
             tuple(unmasked),
         ),
         Finding(
             "unit",
             GOOD,
-            "lengths are metres" if metres else "lengths are arbitrary: depth maps are in scene units, not metres",
+            "lengths are in metres" if metres else "no metric scale: depth maps are in scene units, not metres",
             None,
-            "told, not judged",
+            "for information",
             "" if metres else "for metres: nerfcli convert with --scale gps, --distance or --markers",
         ),
     ]
@@ -182,16 +180,19 @@ def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
     metres, _ = east_north_up(positions)
     extent = np.ptp(metres[:, :2], axis=0)
     widest = float(extent.max())
-    use = "may do for a scale in metres" if widest > _GPS_WIDE else "too near each other for a scale in metres"
+    use = "may be enough for a metric scale" if widest > _GPS_WIDE else "too close together for a metric scale"
     return Finding(
         "GPS",
         GOOD,
         f"{several(len(positions), 'photo')} within {extent[0]:.0f} m x {extent[1]:.0f} m: {use}",
         widest,
-        "told, not judged",
+        "for information",
         ""
         if widest > _GPS_WIDE
-        else f"GPS is off by {_GPS_NOISE:g} m outdoors and by tens indoors; give a known distance for metres",
+        else (
+            f"GPS errors are about {_GPS_NOISE:g} m outdoors and tens of metres indoors; use a known distance for "
+            "metres"
+        ),
     )
 
 

@@ -152,7 +152,7 @@ def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unr
         ("clipping", lambda: quality.clipping(photos)),
     ]
     not_checked: list[tuple[str, str]] = []
-    few = "too few pairs with enough matches tell"
+    few = "too few pairs have enough matches"
     if len(photos) > 1:
         turning = checks.run("turning object", lambda: turntable.turning_object(pairs), otherwise=None)
         planned.append(("connectivity", lambda: graph.connectivity(photos, pairs)))
@@ -164,14 +164,14 @@ def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unr
             ]
         else:
             planned.append(("turning object", lambda: turning))
-            reason = "the camera stood still while an object turned before it"
+            reason = "the camera stood still while an object turned in front of it"
             not_checked.append(("moving content, movement, depth relief", reason))
     else:
-        not_checked.append(("connectivity, movement, moving content", "one photo cannot tell"))
+        not_checked.append(("connectivity, movement, moving content", "a single photo is not enough"))
     planned.append(("GPS", lambda: coverage.gps(photos)))
     found = [checks.run(name, compute, otherwise=None) for name, compute in planned]
     if subject.scene is None:
-        not_checked.append(("directions", "needs poses: find them with nerfcli poses, then examine the scene"))
+        not_checked.append(("directions", "needs poses: run nerfcli poses, then nerfcli doctor on the scene"))
     else:
         of_scene = subject.scene
         found += [

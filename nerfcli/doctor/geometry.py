@@ -43,9 +43,9 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
     standing = [i for i in np.argsort(np.where(known, largest, np.inf)) if known[i] and largest[i] < BASELINE_BAD]
     share = len(standing) / int(known.sum())
     verdict = worst([verdict_below(middle, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if share > 0.1 else GOOD])
-    summary = f"baseline over depth {middle:.2f} in the middle"
+    summary = f"median baseline / depth {middle:.2f}"
     if verdict == BAD:
-        summary = f"the camera only turned, or hardly moved: baseline over depth {middle:.3f}"
+        summary = f"the camera only turned or hardly moved: median baseline / depth {middle:.3f}"
     elif share > 0.1:
         summary += f"; {several(len(standing), 'photo')} without sideways movement to any other"
     return Finding(
@@ -53,9 +53,11 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
         verdict,
         summary,
         middle,
-        f"baseline over depth with the best partner: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}",
-        "" if verdict == GOOD else "step sideways between photos by a tenth of the distance; turning shows no depth",
-        tuple((photos[i].name, f"baseline over depth {largest[i]:.3f}") for i in standing) if verdict != GOOD else (),
+        f"baseline / depth with the best partner: look below {BASELINE_LOOK}, bad below {BASELINE_BAD}",
+        ""
+        if verdict == GOOD
+        else "step sideways between photos by a tenth of the distance to the scene; turning shows no depth",
+        tuple((photos[i].name, f"baseline / depth {largest[i]:.3f}") for i in standing) if verdict != GOOD else (),
     )
 
 
@@ -69,10 +71,10 @@ def flatness(pairs: Sequence[Pair]) -> Finding | None:
     return Finding(
         "depth relief",
         verdict,
-        f"{100 * share:.0f} % of {len(moved)} pairs that moved show nothing but one plane",
+        f"{100 * share:.0f} % of {len(moved)} pairs with movement show only a single plane",
         share,
         f"look from {_FLAT_LOOK:g}",
-        "what is flat leaves the focal length open: bring things at other distances into view, or give intrinsics"
+        "a flat scene does not determine the focal length: include objects at other distances, or give --intrinsics"
         if verdict == LOOK
         else "",
     )
@@ -96,18 +98,18 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
             still = still or patch.still
             width, height = photos[photo].features.size
             across, down = 100 * (left + right) / 2 / width, 100 * (top + bottom) / 2 / height
-            stays = ", stays in its place in the picture" if patch.still else ""
+            stays = ", fixed in the image" if patch.still else ""
             said.append(
                 (patch.matches, photos[photo].name, f"at {across:.0f} % across, {down:.0f} % down{stays}"),
             )
     share = len(said) / len(photos)
-    advice = "mask it, or remove these photos: what moves becomes fog and pulls poses"
+    advice = "mask it, or remove these photos: moving objects become fog and disturb poses"
     if still:
-        advice += "; what stays in its place is a watermark, a strap, or the background of a turntable"
+        advice += "; content fixed in the image is a watermark, a strap, or the background of a turntable"
     return Finding(
         "moving content",
         BAD if share > 0.5 else LOOK if said else GOOD,
-        f"something moves by itself in {several(len(said), 'photo')}" if said else "none found",
+        f"independent movement in {several(len(said), 'photo')}" if said else "none found",
         share,
         "look from 1 photo, bad from half of them",
         advice if said else "",

@@ -71,17 +71,19 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
     share = len(parts[0]) / len(photos)
     verdict = worst([GOOD if len(parts) == 1 else BAD if share < 0.9 else LOOK, LOOK if weak else GOOD])
     sizes = " + ".join(str(len(part)) for part in parts[:6]) + (" + ..." if len(parts) > 6 else "")
-    summary = f"{len(parts)} parts without common matches: {sizes}" if len(parts) > 1 else "all photos hang together"
+    summary = (
+        f"{len(parts)} parts without matches between them: {sizes}" if len(parts) > 1 else "all photos are connected"
+    )
     if weak:
-        summary += f"; {several(len(weak), 'photo')} by little"
+        summary += f"; {several(len(weak), 'photo')} only weakly"
     return Finding(
         "connectivity",
         verdict,
         summary,
         share,
-        f"share of photos in the largest part: look below 1, bad below 0.9; a photo: look below {WEAK_MATCHES} matches "
-        f"with its best partner or with less than {_FEWEST_PARTNERS} partners",
-        "" if verdict == GOOD else "take photos in between, so that each overlaps its neighbours by two thirds",
+        f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {WEAK_MATCHES} "
+        f"matches with its best partner or fewer than {_FEWEST_PARTNERS} partners",
+        "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds",
         tuple(said),
     )
 

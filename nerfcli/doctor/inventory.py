@@ -35,7 +35,7 @@ def readable(unreadable: Mapping[str, str], count: int) -> Finding:
         BAD if bad >= 0.1 * total and bad else LOOK if bad else GOOD,
         f"{bad} of {several(total, 'photo')} cannot be read" if bad else f"all {several(count, 'photo')} can be read",
         bad,
-        "look from 1, bad from a tenth of the photos",
+        "look from 1, bad from 10 % of the photos",
         "copy these files again, or remove them" if bad else "",
         tuple(unreadable.items()),
     )
@@ -46,8 +46,8 @@ def enough(count: int) -> Finding:
     verdict = verdict_below(count, look=ENOUGH_PHOTOS, bad=FEWEST_PHOTOS)
     advice = {
         GOOD: "",
-        LOOK: "more photos that overlap by two thirds give more to learn from and to check against",
-        BAD: "take more photos from other places: 20 or more that overlap by two thirds work well",
+        LOOK: "more photos with two-thirds overlap give better results",
+        BAD: "take more photos from other positions: 20 or more with two-thirds overlap work well",
     }
     return Finding(
         "count",
@@ -85,14 +85,20 @@ def cameras(photos: Sequence[PhotoFacts]) -> Finding:
     others = [(name, optics) for optics, names in groups.items() if names is not largest for name in names]
     verdict = GOOD if len(groups) == 1 else BAD if len(groups) > max(2, len(photos) / 4) else LOOK
     main = next(optics for optics, names in groups.items() if names is largest)
-    summary = f"one camera: {main}" if len(groups) == 1 else f"{len(groups)} kinds of camera, lens, zoom or shape"
+    summary = (
+        f"one camera: {main}"
+        if len(groups) == 1
+        else f"{len(groups)} different combinations of camera, lens, zoom and image size"
+    )
     return Finding(
         "cameras",
         verdict,
         summary if len(groups) == 1 else f"{summary}; most photos: {main}",
         len(groups),
-        "kinds: look from 2, bad from one in four photos",
-        "" if verdict == GOOD else "keep one lens and one zoom, without crops; each kind is calibrated by itself",
+        "combinations: look from 2, bad from one per four photos",
+        ""
+        if verdict == GOOD
+        else "use one lens and one zoom setting, without cropping; each combination is calibrated separately",
         tuple(others),
     )
 
@@ -107,19 +113,19 @@ def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
         if evidence.focal_px is not None and evidence.holds
     ]
     if doubtful:
-        summary = f"EXIF does not fit {several(len(doubtful), 'file')}: {doubtful[0][1]}"
+        summary = f"EXIF does not match {several(len(doubtful), 'file')}: {doubtful[0][1]}"
     elif shares:
-        summary = f"{np.median(shares):.2f} times the longer side by EXIF ({several(len(shares), 'photo')})"
+        summary = f"{np.median(shares):.2f} times the longer side, from EXIF ({several(len(shares), 'photo')})"
     else:
-        summary = "EXIF does not tell it; structure from motion estimates it"
+        summary = "not in EXIF; structure from motion will estimate it"
     return Finding(
         "focal length",
         LOOK if doubtful else GOOD,
         summary,
         len(doubtful),
-        "look from 1 photo whose EXIF is of a picture with another shape",
-        "use the photos as the camera took them, or give intrinsics: EXIF's focal length is not used, and "
-        "the principal point may be anywhere in a crop"
+        "look from 1 photo whose EXIF is for another aspect ratio",
+        "use the original files, or give --intrinsics: EXIF's focal length is not used, and a crop may shift the "
+        "principal point"
         if doubtful
         else "",
         tuple(doubtful),
@@ -139,8 +145,8 @@ def orientation(photos: Sequence[PhotoFacts]) -> Finding:
         LOOK if fewer else GOOD,
         f"{len(portrait)} portrait, {len(landscape)} landscape; EXIF orientation {tags}",
         len(fewer),
-        "look from 1 photo that is held otherwise",
-        "nothing need be done: photos are turned upright here; other programs may ignore the tag" if fewer else "",
+        "look from 1 photo with another orientation",
+        "nothing to do: nerfcli turns photos upright; other programs may ignore the tag" if fewer else "",
         tuple((name, kind) for name in fewer),
     )
 
@@ -169,10 +175,12 @@ def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
     return Finding(
         "duplicates",
         verdict_above(share, look=1e-9, bad=0.3) if exact or share > 0.1 else GOOD,
-        f"{exact} twice, {len(said) - exact} taken from the place of another" if said else "none",
+        f"{exact} exact duplicates, {len(said) - exact} taken from the same place as another" if said else "none",
         len(said),
-        "look from one file twice or a tenth from the same place, bad from 0.3 of the photos",
-        "remove them: they cost time, and a held-out photo is no test where its double is learned from" if said else "",
+        "look from 1 duplicate file or 10 % from the same place, bad from 30 % of the photos",
+        "remove them: they cost time, and a held-out photo is no test if its duplicate is used for training"
+        if said
+        else "",
         tuple(said.items()),
     )
 

@@ -20,7 +20,7 @@ from nerfcli.pages.pictures import data_uri, jpeg_bytes, picture_rule
 _SMALL_THUMBNAILS_FROM, _SMALL_THUMBNAIL_PX = 200, 120
 # Photos shown beside a finding; the others are named only.
 _SHOWN_PER_FINDING = 12
-_WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "mend this first"}
+_WORDS = {GOOD: "good", LOOK: "worth a look", BAD: "fix this first"}
 
 
 def write_page(diagnosis: Diagnosis, path: Path) -> None:
@@ -140,20 +140,20 @@ def _charts_html(diagnosis: Diagnosis) -> str:
     linked = [(pair.first, pair.second, pair.inliers) for pair in diagnosis.pairs if pair.linked]
     charts = [
         (
-            "Detail against the capture",
-            "Each bar is a photo, in the order of names. Below 0: it shows less detail than the others; "
-            f"coloured from {-BLURRED:g} down (half an octave is about a blur of 1 px at 1600 px).",
+            "Relative detail",
+            "Each bar is a photo, ordered by name. Below 0 it shows less detail than the others; coloured below "
+            f"{-BLURRED:g} (half an octave is a blur of about 1 px at 1600 px).",
             bars(names, -diagnosis.lack, marked=diagnosis.lack > BLURRED, unit="octaves"),
         ),
         (
-            "Light at the same places",
-            "Stops by which a photo shows the same places lighter or darker than the others.",
+            "Relative brightness",
+            "Brightness of the same points relative to the other photos, in stops.",
             bars(names, diagnosis.lighter, marked=np.abs(diagnosis.lighter) > STOPS_LOOK / 2, unit="stops"),
         ),
         (
             "Which photos match",
-            "Rows and columns are photos in the order of names; the stronger, the more matches. "
-            "An even band along the diagonal is a walk, a corner far from it a closed loop, separate blocks are parts.",
+            "Rows and columns are photos, ordered by name; stronger colours mean more matches. An even band along "
+            "the diagonal is a walk, a corner far from it a closed loop, separate blocks are disconnected parts.",
             match_matrix(len(photos), linked),
         ),
     ]
@@ -201,6 +201,6 @@ $findings
 <div class="charts">$charts</div>
 <h2>All photos</h2>
 <div class="grid">$grid</div>
-<footer>Photos were judged at 1600 px and matched at 800 px. Blur that vanishes at that size, movement along the line of
-sight, and things that move towards or away from the camera cannot be seen this way; repeated patterns may look like
+<footer>Photos were checked at 1600 px and matched at 800 px. Blur that vanishes at that size, camera movement along the
+line of sight, and objects moving towards or away from the camera are not detected; repeated patterns may look like
 matches.</footer>""")

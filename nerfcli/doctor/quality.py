@@ -67,12 +67,12 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
     if blurred.any():
         parts.append(f"{blurred.sum()} of {several(len(photos), 'photo')} blurred")
     if whole != GOOD:
-        parts.append("all photos are soft, as if enlarged or badly focused")
+        parts.append("all photos are soft, as if upscaled or out of focus")
     if not parts:
-        parts.append("no photo is blurred against the others")
+        parts.append("no photo is blurred compared with the others")
     advice = []
     if blurred.any():
-        advice.append("remove them where others show the same, or take them again with a shorter exposure")
+        advice.append("remove them if others show the same, or take them again with a shorter exposure time")
     if whole != GOOD:
         advice.append("train with --downscale 2 or use sharper originals")
     return Finding(
@@ -80,7 +80,7 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
         verdict,
         "; ".join(parts),
         share,
-        f"detail: look below {100 * 2**-BLURRED:.0f} % of the capture's, bad where 0.3 of the photos are",
+        f"detail: look below {100 * 2 ** (-BLURRED):.0f} % of the usual detail, bad from 30 % of the photos",
         "; ".join(advice),
         tuple(said),
     )
@@ -89,7 +89,10 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
 def texture(photos: Sequence[PhotoFacts]) -> Finding:
     """Whether the photos show enough to find again in other photos."""
     poor = [
-        (photo.name, f"{len(photo.features.pixels)} features, texture on {100 * photo.sharpness.textured:.0f} %")
+        (
+            photo.name,
+            f"{len(photo.features.pixels)} features, texture on {100 * photo.sharpness.textured:.0f} % of the image",
+        )
         for photo in photos
         if len(photo.features.pixels) < 150
     ]
@@ -97,10 +100,10 @@ def texture(photos: Sequence[PhotoFacts]) -> Finding:
     return Finding(
         "texture",
         verdict_above(share, look=1e-9, bad=0.3),
-        f"{several(len(poor), 'photo')} with hardly anything to find again" if poor else "enough in every photo",
+        f"{several(len(poor), 'photo')} with very few features" if poor else "enough in every photo",
         share,
-        "look from one photo with less than 150 features, bad from 0.3 of them",
-        "step back, or bring things with texture into the picture" if poor else "",
+        "look from 1 photo with fewer than 150 features, bad from 30 % of the photos",
+        "step back, or include textured objects" if poor else "",
         tuple(sorted(poor, key=lambda item: int(item[1].split()[0]))),
     )
 
@@ -135,11 +138,18 @@ def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
     if not known.any() and len(settings) > 1:
         verdict = verdict_above(float(np.ptp(settings)), look=STOPS_LOOK, bad=STOPS_BAD)
     fixed = len(settings) == len(photos) and np.ptp(settings) < 0.1
-    seen = f"the same places differ by up to {spread:.1f} stops" if known.any() else "no matches to compare light by"
+    seen = (
+        f"brightness differs by up to {spread:.1f} stops at the same points"
+        if known.any()
+        else "no matches to compare brightness"
+    )
     advice = (
-        "the camera's settings are fixed: it is the light or shiny surfaces; keep lamps and your shadow away"
+        "the camera settings are constant, so the lighting changes or surfaces are shiny: avoid lamps and your shadow"
         if fixed
-        else "fix exposure in the camera, or take the photos in one go; shine and shadows that move do the same"
+        else (
+            "fix the exposure in the camera and take all photos in one session; highlights and moving shadows have "
+            "the same effect"
+        )
     )
     return Finding(
         "exposure",
@@ -158,14 +168,14 @@ def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
     spread = float(np.ptp(redder[known])) if known.any() else float("nan")
     verdict = verdict_above(spread, look=_BALANCE_LOOK, bad=_BALANCE_BAD) if known.any() else GOOD
     off = [i for i in np.argsort(-np.abs(np.nan_to_num(redder))) if known[i] and abs(redder[i]) > _BALANCE_LOOK / 2]
-    seen = f"red against blue differs by up to {spread:.2f} stops at the same places"
+    seen = f"the red/blue ratio differs by up to {spread:.2f} stops at the same points"
     return Finding(
         "white balance",
         verdict,
-        seen if known.any() else "no matches to compare colours by",
+        seen if known.any() else "no matches to compare colours",
         spread,
         f"look from {_BALANCE_LOOK:g} stops, bad from {_BALANCE_BAD:g}",
-        "" if verdict == GOOD else "fix the white balance in the camera; keep coloured light out",
+        "" if verdict == GOOD else "fix the white balance in the camera; avoid coloured light",
         tuple((photos[i].name, f"{redder[i]:+.2f} stops redder") for i in off) if verdict != GOOD else (),
     )
 
@@ -189,11 +199,13 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
     return Finding(
         "clipping",
         BAD if verdicts.count(BAD) > 0.3 * len(photos) else LOOK if said else GOOD,
-        f"{several(len(said), 'photo')} of {len(photos)} with much pure white or black, or dark" if said else "little",
+        f"{several(len(said), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
+        if said
+        else "little",
         share,
-        f"a photo: look from {CLIPPED_LOOK:g} of its pixels, bad from {CLIPPED_BAD:g}; "
-        "all: bad where 0.3 of the photos are",
-        "expose so that what matters is neither; nothing can be seen or matched there; a background may stay so"
+        f"per photo: look from {100 * CLIPPED_LOOK:g} % of its pixels, bad from {100 * CLIPPED_BAD:g} %; all: bad "
+        "from 30 % of the photos",
+        "expose so that the subject is neither; such areas cannot be matched (in a background this is fine)"
         if said
         else "",
         tuple((name, what) for _, name, what in sorted(said, key=lambda item: -item[0])),

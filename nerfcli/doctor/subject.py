@@ -38,13 +38,13 @@ def find_subject(path: Path) -> Subject:
         UserError: nothing there, no photos, or a scene whose files are malformed.
     """
     if not path.exists():
-        raise UserError(f"there is no {path}", "give a folder of photos, or a scene")
+        raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")
     if path.is_file() or scenes.is_scene(path):
         return _of_scene(path)
     photos = list_images(path)
     if not photos:
         below = next((child for child in sorted(path.iterdir()) if child.is_dir() and list_images(child)), None)
-        where = f"there are photos in {below}: give that folder" if below else ""
+        where = f"there are photos in {below}; give that folder" if below else ""
         hint = where or f"expected a scene, or files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
         raise UserError(f"no photos and no scene in {path}", hint)
     return Subject(path, tuple(Source(photo.name, photo) for photo in photos), None)

@@ -21,10 +21,10 @@ def turning_object(pairs: Sequence[Pair]) -> Finding | None:
     return Finding(
         "turning object",
         LOOK,
-        "an object turns, or is moved, before a background that keeps its place in the picture, as on a turntable: "
-        f"{said.two} of {said.two + said.still + said.moved} pairs show both motions",
+        f"an object moves in front of a static background, as on a turntable: {said.two} of "
+        f"{said.two + said.still + said.moved} pairs show both motions",
         said.share,
-        f"look where {LEAST_SHARE:g} of the pairs with anything that moves also show a background that does not",
-        "poses looks for masks of the object and solves its motion alone; if it finds none, give it --masks that are "
-        "white where the object is, or cover the background with plain cloth",
+        f"look if {100 * LEAST_SHARE:g} % of the pairs with a moving object also show a static background",
+        "nerfcli poses creates masks of the object and uses only its motion; if it finds none, give --masks that are "
+        "white on the object, or use a plain cloth as background",
     )

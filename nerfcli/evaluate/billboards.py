@@ -65,12 +65,14 @@ class Shape:
 
     def in_words(self) -> str:
         """A sentence for people."""
-        compared = f"{self.field_psnr:.2f} dB against {self.psnr:.2f} dB of photos on billboards, without any shape"
+        compared = (
+            f"{self.field_psnr:.2f} dB for the field, {self.psnr:.2f} dB for billboards (a model without geometry)"
+        )
         if self.shown:
-            return f"shape: the field has {compared}"
+            return f"geometry: {compared}"
         return (
-            f"no shape is shown: the field has {compared}. These photos do not tell what is near and what is far (the "
-            "camera only turned, too few photos, a flat scene), or the field learned nothing: do not trust its depth"
+            f"no evidence of geometry: {compared}. These photos do not determine depth (the camera only turned, too "
+            "few photos, a flat scene), or the field learned nothing: do not trust its depth"
         )
 
 

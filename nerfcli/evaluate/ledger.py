@@ -33,11 +33,17 @@ def leak_ledger(config: RunConfig) -> list[Entry]:
     """
     return [
         *_cameras(config.history, str(config.scene_kind)),
-        Entry("normalisation", True, "the poses of all photos, held-out ones included, say where the scene is"),
-        _exposure(config),
-        Entry("training", False, "no pixel of a held-out photo was trained on"),
         Entry(
-            "checks while training", False, "pixels of held-out photos were measured, and nothing was chosen by them"
+            "normalisation",
+            True,
+            "the extent of the scene is computed from the poses of all photos, including held-out ones",
+        ),
+        _exposure(config),
+        Entry("training", False, "held-out photos were not used for training"),
+        Entry(
+            "checks while training",
+            False,
+            "PSNR on held-out pixels was measured after training; nothing was selected by it",
         ),
     ]
 
@@ -55,9 +61,9 @@ def _exposure(config: RunConfig) -> Entry:
     """No exposure is ever fitted to a held-out photo; what its EXIF says of it may be used."""
     chosen = config.settings.components.exposure
     how = {
-        "none": "none is fitted",
-        "exif": "by EXIF, that of the held-out photos included",
-        "learned": "fitted to training photos; of held-out ones by EXIF",
+        "none": "no exposure is fitted",
+        "exif": "from EXIF, including that of held-out photos",
+        "learned": "fitted to training photos; held-out photos use EXIF",
     }
     return Entry("exposure", False, how.get(chosen, str(chosen)))
 
@@ -65,19 +71,19 @@ def _exposure(config: RunConfig) -> Entry:
 def _cameras(history: Mapping[str, Any] | None, kind: str) -> list[Entry]:
     stages = ("poses", "intrinsics", "points")
     if history is None:
-        return [Entry(stage, None, "this run was trained before that was written down") for stage in stages]
+        return [Entry(stage, None, "this run was trained before nerfcli recorded this") for stage in stages]
     if history.get("command") != "poses":
         source = history.get("from", kind)
-        return [Entry(stage, None, f"the capture came with its cameras ({source})") for stage in stages]
+        return [Entry(stage, None, f"the cameras came with the capture ({source})") for stage in stages]
     settings = history.get("settings") or {}
     if settings.get("strict"):
-        how = "found from the training photos alone; held-out ones were placed afterwards, with all else fixed"
+        how = "estimated from training photos only; held-out photos were located afterwards with everything else fixed"
         return [Entry(stage, False, how) for stage in stages]
-    how = "found from all photos together (nerfcli poses without --strict)"
+    how = "estimated from all photos (nerfcli poses without --strict)"
     given = history.get("intrinsics") or {}
     known = given.get("use") == "fixed"
     return [
         Entry("poses", True, how),
-        Entry("intrinsics", False, "they were given and kept") if known else Entry("intrinsics", True, how),
+        Entry("intrinsics", False, "given and kept fixed") if known else Entry("intrinsics", True, how),
         Entry("points", True, how),
     ]

@@ -33,13 +33,13 @@ def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
         metric = importlib.import_module("torchmetrics.image.lpip").LearnedPerceptualImagePatchSimilarity
     # A torchvision that was built for another torch fails with a RuntimeError or OSError.
     except (ImportError, RuntimeError, OSError) as error:
-        notify(f"LPIPS is left out ({_first_line(error)}); {INSTALL} brings what it needs")
+        notify(f"LPIPS is not available ({_first_line(error)}); install it with {INSTALL}")
         return None
     try:
         with _impatient():
             network = metric(net_type="alex", normalize=True)
     except (RuntimeError, OSError) as error:  # no network (URLError is an OSError), or a file that was cut off
-        notify(f"LPIPS is left out: its weights cannot be had ({_first_line(error)})")
+        notify(f"LPIPS is not available: its weights could not be loaded ({_first_line(error)})")
         return None
 
     def measure(picture: np.ndarray, photo: np.ndarray) -> float:

@@ -108,8 +108,8 @@ def evaluate_model(
     """
     if not held_out:
         raise UserError(
-            "this run has no held-out photo to evaluate on",
-            "the default split holds out every 8th photo; check `nerfcli info RUN` and the scene's split",
+            "this run has no held-out photos to evaluate on",
+            "by default every 8th photo is held out; check the split with nerfcli info RUN",
         )
     renders = 2 if extras.align_poses else 1
     total = renders * sum(photo.pixels.shape[0] * photo.pixels.shape[1] for photo in held_out)
@@ -160,7 +160,7 @@ def evaluate_model(
 
 def _warnings(shape: Shape | None, evidence: ShapeEvidence | None) -> list[str]:
     if evidence is not None and evidence.failure is not None:
-        return [f"whether the field shows a shape could not be checked: {evidence.failure}"]
+        return [f"the comparison with a model without geometry failed: {evidence.failure}"]
     return [shape.in_words()] if shape is not None and not shape.shown else []
 
 
@@ -185,7 +185,8 @@ def compare(photo: HeldOut, picture: Picture) -> Compared:
     used = picture.valid if photo.used is None else picture.valid & photo.used
     if not used.any():
         raise UserError(
-            f"no pixel of {photo.frame.name} is left to compare", "check that its mask is white where pixels count"
+            f"no pixels of {photo.frame.name} are left to compare",
+            "check its mask: white pixels are used, black ones are ignored",
         )
     return Compared(
         photo.frame,

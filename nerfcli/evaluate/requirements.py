@@ -43,9 +43,9 @@ def parse_requirements(text: str) -> tuple[Requirement, ...]:
     for part in text.split(","):
         match = re.fullmatch(r"\s*(\w+)\s*(>=|<=|>|<)\s*(\S+)\s*", part)
         if match is None or not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", match[3]):
-            raise ValueError(f"{part.strip()!r} is no requirement; write psnr>=25,registered>=0.9")
+            raise ValueError(f"{part.strip()!r} is not a requirement; write psnr>=25,registered>=0.9")
         if match[1] not in NAMES:
-            raise ValueError(f"{match[1]!r} is not measured; choose {', '.join(NAMES)}")
+            raise ValueError(f"unknown metric {match[1]!r}; choose {', '.join(NAMES)}")
         found.append(Requirement(match[1], match[2], float(match[3])))
     return tuple(found)
 

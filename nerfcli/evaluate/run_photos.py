@@ -53,6 +53,6 @@ def training_billboards(run: Run, *, notify: Callable[[str], None]) -> Billboard
             cameras.append(photo.frame)
             small.append(over_white(photo.pixels))
     except UserError as error:
-        notify(f"no comparison with a model without shape: {error}")
+        notify(f"no comparison with a model without geometry: {error}")
         return None
     return Billboards(cameras, small)

@@ -24,8 +24,8 @@ def spread(all_metrics: Sequence[Mapping[str, Any]], names: Sequence[str]) -> di
     for name, metrics in zip(names[1:], all_metrics[1:], strict=True):
         if metrics["protocol"] != all_metrics[0]["protocol"]:
             raise UserError(
-                f"{name} and {names[0]} cannot be put together: {_first_difference(metrics, all_metrics[0])}",
-                "give runs of one scene, one split and one size, evaluated with the same options (--overwrite)",
+                f"{name} and {names[0]} cannot be compared: {_first_difference(metrics, all_metrics[0])}",
+                "give runs of the same scene, split and resolution, evaluated with the same options (--overwrite)",
             )
     result: dict[str, Any] = {"runs": list(names)}
     for key in all_metrics[0]["mean"]:
@@ -45,4 +45,4 @@ def _first_difference(metrics: Mapping[str, Any], other: Mapping[str, Any]) -> s
     """The first part of two protocols in which they differ."""
     pairs = zip(metrics["protocol"].split(", "), other["protocol"].split(", "), strict=False)
     one, two = next(((a, b) for a, b in pairs if a != b), (metrics["protocol"], other["protocol"]))
-    return f"{one!r} against {two!r}"
+    return f"{one!r} instead of {two!r}"

@@ -105,7 +105,7 @@ def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
     found = depth_meta_of(path)
     if found is not None and path.suffix in (".exr", ".npz"):
         found = found.of(output, opacity_floor=found.layers.get(output, {}).get("opacity_floor"))
-    difference = "nothing says what it means" if found is None else difference_of(meaning, found)
+    difference = "it does not state what its values mean" if found is None else difference_of(meaning, found)
     if difference:
         raise mixed(path, Path("the other frames"), difference)
     match path.suffix:

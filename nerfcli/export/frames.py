@@ -86,7 +86,7 @@ def export_frames(
     """
     order.check()
     unfinished = unfinished_of(order, folder)
-    with exclusive(unfinished.lock, f"nerfcli render is at work on {folder}"):
+    with exclusive(unfinished.lock, f"nerfcli render is working on {folder}"):
         if order.shares_pictures_with(folder):
             take_over(unfinished, order, folder)
         everything = range(len(order.frames))
@@ -101,7 +101,7 @@ def export_frames(
             levels = {"depth16": asdict(written)}
             notify(f"16-bit files: {scale_in_words(replace(meta, units_per_level=written.units_per_level))}")
             if written.pixels_beyond:
-                notify(f"{written.pixels_beyond} pixels are too far for 16-bit files and have no depth in them")
+                notify(f"{written.pixels_beyond} pixels are too distant for 16-bit files and have no depth there")
         write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
         description = {
             **order.of_pictures(),
@@ -140,7 +140,7 @@ def export_part(
     unfinished = unfinished_of(order, folder)
     _render_missing(model, order, part, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers)
     there = sum(map(unfinished.has, order.names))
-    notify(f"{there} of {len(order.names)} frames are there; without --frames the same command renders the others")
+    notify(f"{there} of {len(order.names)} frames are complete; the same command without --frames renders the others")
     return unfinished.folder
 
 
@@ -157,7 +157,7 @@ def _render_missing(
     held = {index for index in part if unfinished.has(order.names[index])}
     missing = [index for index in part if index not in held]
     if held:
-        notify(f"{len(held)} of {len(part)} frames are there already, in {unfinished.folder}")
+        notify(f"resuming: {len(held)} of {len(part)} frames are already in {unfinished.folder}")
         cameras = [order.frames[index].camera for index in held]
         on_rays(sum(camera.width * camera.height for camera in cameras))
     if workers.jobs > 1 and len(missing) > 1:

@@ -75,8 +75,8 @@ class Order:
         if len(sizes) > 1:
             listed = ", ".join(f"{width}x{height}" for width, height in sizes[:4])
             raise UserError(
-                f"the views have {len(sizes)} sizes ({listed}); a video has one",
-                "leave the video out, or choose cameras of one size",
+                f"the views have {len(sizes)} different sizes ({listed}), which cannot be combined in a video",
+                "remove the video options, or choose cameras of a single size",
             )
 
     def is_held_by(self, folder: Path) -> bool:
@@ -97,11 +97,11 @@ class Order:
             names = [name for name, value in depth.items() if there.get(name) != value]
             differing = [f"{name} {there.get(name)}, not {depth[name]}" for name in names]
             raise UserError(
-                f"{folder} holds depth of another meaning: {', '.join(differing)}",
-                "choose another place with -o; --overwrite replaces the whole folder, so that nothing is mixed",
+                f"{folder} contains depth with another definition: {', '.join(differing)}",
+                "choose another folder with -o, or add --overwrite to replace the whole folder",
             )
         if any(made.get(key) != value for key, value in wanted.items()):
-            raise UserError(f"{folder} exists", "add --overwrite to replace it, or choose another place with -o")
+            raise UserError(f"{folder} exists", "add --overwrite to replace it, or choose another folder with -o")
         presentation = self.settings.of_presentation()
         differing = [key for key, value in presentation.items() if made.get(key) != value]
         if not differing:
@@ -109,8 +109,9 @@ class Order:
         if self.shares_pictures_with(folder) and all(made.get(key) is None for key in differing):
             return False
         raise UserError(
-            f"{folder} holds the same pictures with other {' and '.join(_IN_WORDS[key] for key in differing)}",
-            "add --overwrite to make previews and videos anew from the pictures, which are kept; or choose another -o",
+            f"{folder} contains the same pictures with different {' and '.join(_IN_WORDS[key] for key in differing)}",
+            "add --overwrite to write previews and videos again from the pictures, which are kept, or choose another "
+            "folder with -o",
         )
 
     def shares_pictures_with(self, folder: Path) -> bool:
@@ -135,7 +136,7 @@ def _made(folder: Path) -> dict[str, Any] | None:
     """
     if not (folder / DESCRIPTION).exists():
         return None
-    hint = "add --overwrite to render again, or choose another place with -o"
+    hint = "add --overwrite to render again, or choose another folder with -o"
     return read_json(folder / DESCRIPTION, needed=("settings",), hint=hint)
 
 
@@ -146,4 +147,4 @@ def refuse_foreign(folder: Path) -> None:
         UserError: a file, or a folder of other things.
     """
     if folder.is_file() or (folder.is_dir() and not (folder / DESCRIPTION).exists() and any(folder.iterdir())):
-        raise UserError(f"{folder} holds something else than renders", "choose another place with -o")
+        raise UserError(f"{folder} exists and does not contain renders", "choose another folder with -o")

@@ -86,7 +86,7 @@ def write_videos(
                     yield beside([read_image(_picture(folder, output, name))[..., :3] for output in outputs])
 
             path = folder / f"{'+'.join(outputs)}{form.suffix}"
-            notify(f"encodes {path.name}, {len(names)} frames")
+            notify(f"encoding {path.name}, {len(names)} frames")
             gif = form.encoder == "gif"
             plays = (0 if gif else 1) if settings.plays is None else settings.plays
             comment = json.dumps(_comment(order, meta, outputs, ranges), ensure_ascii=False)

@@ -164,11 +164,11 @@ def _tell_death(worker: _Worker, order: Order, notify: Callable[[str], None], *,
     code, name = worker.process.exitcode or 0, order.names[worker.index]
     how = f"was ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with status {code}"
     if not last:
-        notify(f"a process of --jobs {how} while it rendered {name}; another one renders it again")
+        notify(f"a render process {how} while rendering {name}; retrying it in another process")
         return
     raise UserError(
-        f"processes of --jobs die while they render {name}: the last one {how}",
-        "if memory ran out, take fewer --jobs or smaller pictures; frames that are complete are kept",
+        f"render processes keep failing on {name}: the last one {how}",
+        "if memory ran out, use fewer --jobs or smaller pictures; completed frames are kept",
         OUT_OF_MEMORY,
     )
 

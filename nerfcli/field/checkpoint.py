@@ -52,9 +52,7 @@ def read_checkpoint(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
-        raise UserError(
-            f"{path} does not exist", "train first (nerfcli train SCENE), or give the folder that train wrote"
-        ) from error
+        raise UserError(f"{path} does not exist", "train first (nerfcli train SCENE), or give a run folder") from error
     except OSError as error:
         raise _unreadable(path, error) from error
 
@@ -73,8 +71,8 @@ def tensors_of(content: bytes, path: Path, device: str) -> tuple[dict[str, Tenso
         raise _unreadable(path, error) from error
     if (sealed or digest is not None) and digest != _digest(tensors, json.dumps(description) if sealed else entry):
         raise UserError(
-            f"{path} is damaged: its content is not what was written",
-            "train again with --overwrite, or restore the file; the disk may have more damage",
+            f"{path} is damaged: its content has changed since it was written",
+            "train again with --overwrite, or restore the file; check the disk",
         )
     return {name: tensor.to(device) for name, tensor in tensors.items()}, description
 
@@ -94,8 +92,8 @@ def refuse_non_finite(tensors: dict[str, Tensor], path: Path) -> None:
     for name, tensor in tensors.items():
         if count := int((~tensor.isfinite()).sum()):
             raise UserError(
-                f"{name} in {path} is not finite in {count} of {tensor.numel()} places",
-                "the field is broken: train again with --overwrite and, if it comes back, another --seed",
+                f"{name} in {path} has {count} non-finite values of {tensor.numel()}",
+                "train again with --overwrite and, if this happens again, with another --seed",
                 NON_FINITE,
             )
 

@@ -83,7 +83,7 @@ def work(settings: FieldSettings) -> Work:
         case FourierFieldSettings():
             return _network(settings)
         case _:
-            raise ValueError(f"the work of {type(settings).__name__} is not known")
+            raise ValueError(f"the cost of {type(settings).__name__} is unknown")
 
 
 # Of a sample whatever the field: its place, its interval, density and colour, and the weight of its colour.

@@ -21,7 +21,7 @@ def fresh_field(settings: FieldSettings) -> Field:
         case FourierFieldSettings():
             return FourierField(settings)
         case _:
-            raise ValueError(f"no field is made from {type(settings).__name__}")
+            raise ValueError(f"no field has settings of type {type(settings).__name__}")
 
 
 def settings_from_json(content: dict[str, Any]) -> FieldSettings:
@@ -39,4 +39,4 @@ def settings_from_json(content: dict[str, Any]) -> FieldSettings:
         case FourierFieldSettings.kind:
             return FourierFieldSettings(**sizes)
         case kind:
-            raise UserError(f"fields of the kind {kind!r} are not known here", "use the nerfcli that trained it")
+            raise UserError(f"unknown type of field: {kind!r}", "use the version of nerfcli that trained it")

@@ -66,7 +66,7 @@ def chosen_size(
         case FourierFieldSettings.kind:
             return largest_within(WIDTHS, network, memory_bytes or NETWORK_BYTES)
         case _:
-            raise ValueError(f"no field is of the kind {kind!r}")
+            raise ValueError(f"unknown type of field: {kind!r}")
 
 
 def cells_of_footprint(footprint: float, contraction: str) -> float:
@@ -84,7 +84,7 @@ def largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings
     limit = memory_bytes * (1 + SLACK)
     if smallest > limit:
         raise UserError(
-            f"no field fits into {memory_bytes} bytes: the smallest takes {smallest}", "give a larger --field-memory"
+            f"no field fits into {memory_bytes} bytes: the smallest needs {smallest}", "give a larger --field-memory"
         )
     fitting = [size for size in sizes if parameter_bytes(work(settings(size)).parameters) <= limit]
     return settings(fitting[-1])

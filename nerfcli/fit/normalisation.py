@@ -75,8 +75,8 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
     """
     if len(scene.points) < LEAST_POINTS:
         raise UserError(
-            f"{scene.root} has {len(scene.points)} points, which do not tell where the scene ends",
-            "choose --contraction l2",
+            f"the extent of {scene.root} cannot be estimated from its {len(scene.points)} points",
+            "use --contraction l2",
         )
     low, high = np.percentile(scene.points, (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
     centre, radius = (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)

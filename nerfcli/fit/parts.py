@@ -44,8 +44,9 @@ class Parts(nn.Module):
         kind = components.background
         if kind in LEARNED_BACKGROUNDS and pool.has_alpha:
             raise UserError(
-                f"--with background={kind}: these photos have alpha, which tells that nothing is behind",
-                "leave it out, or train on photos without alpha",
+                f"--with background={kind} does not work with these photos: their alpha channel says that the "
+                "background is empty",
+                "remove the option, or use photos without alpha",
             )
         self.background: SphereBackground | None = None
         if kind in LEARNED_BACKGROUNDS:

@@ -74,9 +74,9 @@ def backend_for(device: torch.device, dtype: torch.dtype, *, wanted: str = "auto
         return ReferenceBackend(device)
     compiled = _numba_backend() if wanted != "reference" else None
     if wanted == "numba_cpu":
-        refusal = "Numba does not work here" if compiled is None else compiled.refuses(device, dtype)
+        refusal = "Numba does not work on this machine" if compiled is None else compiled.refuses(device, dtype)
         if refusal is not None:
-            raise UserError(f"the backend numba_cpu cannot be used: {refusal}", "choose auto or reference")
+            raise UserError(f"the backend numba_cpu cannot be used: {refusal}", "use auto or reference")
     return compiled or ReferenceBackend(device)
 
 
@@ -90,7 +90,7 @@ def prepare(notify: Callable[[str], None]) -> None:
     numba_cpu = _numba_cpu()
     if numba_cpu is not None:
         if not numba_cpu.is_compiled():
-            notify("compiling the CPU kernels for this machine, once; this takes about a minute")
+            notify("compiling the CPU kernels (once per machine, about a minute)")
         numba_cpu.warm_up()
 
 
@@ -108,6 +108,9 @@ def _numba_cpu() -> ModuleType | None:
     try:
         from nerfcli.kernels import numba_cpu
     except ImportError as error:
-        warnings.warn(f"Numba does not work here ({error}); the CPU kernels fall back to plain torch", stacklevel=3)
+        warnings.warn(
+            f"Numba does not work on this machine ({error}); using plain torch instead, which is much slower",
+            stacklevel=3,
+        )
         return None
     return numba_cpu

@@ -71,4 +71,6 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except FileNotFoundError as error:
         raise UserError(f"cannot read {path}: {error.strerror}", "give a .npy or .npz file") from error
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise UserError(f"{path} is damaged, or no arrays of numbers: {error}", "render the depth map again") from error
+        raise UserError(
+            f"{path} is damaged or does not contain arrays of numbers: {error}", "render the depth map again"
+        ) from error

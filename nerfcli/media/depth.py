@@ -25,13 +25,13 @@ QUANTITIES = ("depth", "spread", "disagreement")
 CONVENTION_OF = {"spread": "standard-deviation", "disagreement": "median-conditional"}
 
 _IN_WORDS = {
-    "conditional": "the mean distance at which light ends, given that it ends before the background",
-    "moment": "the mean distance times the opacity; no distance where the ray is not opaque",
-    "background": "the mean distance, what passes counted at the background distance",
-    "max-weight": "the mean place inside the interval that stops most light",
-    "median": "the distance at which half of all light has ended",
-    "standard-deviation": "the standard deviation of the distance at which light ends, given that it ends",
-    "median-conditional": "their disagreement, large where no single depth is right (edges, glass, fog)",
+    "conditional": "the mean distance at which light is absorbed, given that it is",
+    "moment": "the mean distance multiplied by the opacity",
+    "background": "the mean distance, with light that passes counted at the background distance",
+    "max-weight": "the mean distance inside the interval that absorbs most light",
+    "median": "the distance at which half of all light is absorbed",
+    "standard-deviation": "the standard deviation of the distance at which light is absorbed",
+    "median-conditional": "|median - conditional|, large where no single depth is right (edges, glass, fog)",
 }
 _WHAT_MUST_AGREE = (
     *("quantity", "convention", "axis", "unit", "opacity_floor", "background_distance"),
@@ -118,17 +118,17 @@ class DepthMeta:
             ValueError: the entries are not those of a depth map.
         """
         if not isinstance(entries, dict) or not {"convention", "axis", "unit", "opacity_floor"} <= entries.keys():
-            raise ValueError("no description of a depth map")
+            raise ValueError("not a description of a depth map")
         return cls(**{f.name: entries[f.name] for f in fields(cls) if f.name in entries})
 
     def in_words(self) -> str:
         """One line for people: "conditional depth along the optical axis (z), in metres (gps): the mean ..."."""
         unit = "metres" if self.unit == "metre" else f"{self.unit} units"
-        source = f" (known from: {self.unit_source})" if self.unit_source else ""
+        source = f" (from: {self.unit_source})" if self.unit_source else ""
         convention, _, share = self.convention.partition(":")
         meaning = _IN_WORDS.get(convention, "")
         if convention == "quantile":
-            meaning = f"the distance at which {share} of all light has ended"
+            meaning = f"the distance at which {share} of all light is absorbed"
         return f"{self.title} {AXES[self.axis]}, in {unit}{source}" + (f": {meaning}" if meaning else "")
 
 
@@ -163,8 +163,8 @@ def refuse_mixing(metas: Iterable[tuple[Path, DepthMeta]]) -> None:
 def mixed(path: Path, other: Path, difference: str) -> UserError:
     """The two-line error for maps that would be taken for one kind and are not."""
     return UserError(
-        f"{path} and {other} do not mean the same: {difference}",
-        "keep depth of different meaning in different folders: choose another place with -o",
+        f"{path} and {other} have different definitions: {difference}",
+        "keep depth with different definitions in separate folders: choose another one with -o",
     )
 
 

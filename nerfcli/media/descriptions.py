@@ -40,11 +40,11 @@ def description_of(path: Path) -> dict[str, Any] | None:
     reader = _READERS.get(suffix)
     if reader is None:
         known = ", ".join(sorted(_READERS))
-        raise UserError(f"{path} is of no kind that carries depth or pictures", f"give one of: {known}")
+        raise UserError(f"{path} is not a supported depth, picture or video file", f"give one of: {known}")
     try:
         text = reader(path)
     except FileNotFoundError as error:
-        raise UserError(f"there is no {path}", "give a file that exists") from error
+        raise UserError(f"{path} does not exist", "check the path") from error
     except UserError:
         raise
     except _DAMAGED as error:
@@ -68,7 +68,7 @@ def depth_meta_of(path: Path) -> DepthMeta | None:
 def damaged(path: Path, error: Exception) -> UserError:
     """The two-line error for a file that cannot be decoded."""
     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return UserError(f"{path} is damaged or cut short: {reason}", "copy it once more, or render it again")
+    return UserError(f"{path} is damaged or truncated: {reason}", "copy it again, or render it again")
 
 
 def _of_tiff(path: Path) -> str | None:

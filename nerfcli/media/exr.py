@@ -82,7 +82,9 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
         except (RuntimeError, ValueError, TypeError) as error:
             reason = told() or str(error)
-            raise UserError(f"{path} is damaged or no OpenEXR file: {reason}", "render the picture again") from error
+            raise UserError(
+                f"{path} is damaged or not an OpenEXR file: {reason}", "render the picture again"
+            ) from error
 
 
 @contextlib.contextmanager

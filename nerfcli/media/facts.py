@@ -24,9 +24,9 @@ _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR", ".npz": "NPZ", ".n
 # What an export writes about itself, beside the folders of its outputs.
 RENDERS = "render.json"
 NOT_STATED = (
-    "nothing in the file says which depth this is (mean, median, ...), along the ray or the optical axis, in which unit"
+    "the file does not state the definition of depth (mean, median, ...), its axis (ray or optical axis) or its unit"
 )
-_LEVELS_NOT_STATED = "the length of a level is not stated either: often a millimetre, 0.2 mm in TUM's data sets"
+_LEVELS_NOT_STATED = "the length of a level is not stated either: often 1 mm, 0.2 mm in the TUM data sets"
 
 
 def file_facts(path: Path) -> dict[str, Any]:
@@ -70,7 +70,7 @@ def renders_facts(folder: Path) -> dict[str, Any]:
         content = json.loads((folder / RENDERS).read_text(encoding="utf-8"))
         frames, settings = content["frames"], content["settings"]
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise UserError(f"{folder / RENDERS} cannot be read: {error}", "render again with --overwrite") from error
+        raise UserError(f"cannot read {folder / RENDERS}: {error}", "render again with --overwrite") from error
     entries = content.get("depth_meaning")
     meta = _meta(folder / RENDERS, entries)
     counted = 0
@@ -114,7 +114,7 @@ def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
         return None
     stated = entries.get("format", FORMAT)
     if isinstance(stated, str) and stated.startswith("nerfcli depth") and stated > FORMAT:
-        raise UserError(f"{path} is of format {stated!r}, this version knows {FORMAT!r}", "update nerfcli")
+        raise UserError(f"{path} is of format {stated!r}, but this version reads {FORMAT!r}", "update nerfcli")
     try:
         return DepthMeta.from_json(entries)
     except (ValueError, TypeError):

@@ -45,14 +45,14 @@ def read_tiff(path: Path) -> tuple[np.ndarray, DepthMeta]:
     depth, description = read_any_tiff(path)
     if depth.dtype != np.float32 or depth.ndim != 2:
         raise UserError(
-            f"{path} holds {depth.dtype} {depth.shape}, not a float32 depth map",
+            f"{path} contains {depth.dtype} {depth.shape}, not a float32 depth map",
             "give a file that nerfcli wrote",
         )
     try:
         return depth, DepthMeta.from_json(json.loads(description))
     except ValueError as error:
         raise UserError(
-            f"{path} does not say what its depth means (ImageDescription: {description[:40]!r})",
+            f"{path} does not state its definition of depth (ImageDescription: {description[:40]!r})",
             "give a file that nerfcli wrote",
         ) from error
 
@@ -70,4 +70,4 @@ def read_any_tiff(path: Path) -> tuple[np.ndarray, str]:
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror or error}", "give a depth TIFF") from error
     except Exception as error:  # tifffile lets through whatever its decoders raise
-        raise UserError(f"{path} is damaged or no TIFF: {error}", "render the depth map again") from error
+        raise UserError(f"{path} is damaged or not a TIFF file: {error}", "render the depth map again") from error

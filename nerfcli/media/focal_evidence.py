@@ -58,7 +58,7 @@ def focal_evidence(exif: Exif) -> FocalEvidence:
         return FocalEvidence(None, not doubt, doubt, whole_px)
     shortest, longest = (share * whole_px[0] for share in _FOCAL_RANGE)
     if not shortest <= focal_px <= longest:
-        doubt = f"EXIF says {focal_px / whole_px[0]:.3g} times the longer side, which no lens has"
+        doubt = f"EXIF gives a focal length of {focal_px / whole_px[0]:.3g} times the longer side, which is implausible"
         return FocalEvidence(None, False, doubt, whole_px)
     return FocalEvidence(focal_px, not doubt, doubt, whole_px)
 
@@ -71,7 +71,7 @@ def _whole(file_px: tuple[float, float], taken_px: tuple[int, int] | None) -> tu
         shape = longer / shorter
         if any(abs(shape / usual - 1) < _SAME_SHAPE for usual in _CAMERA_SHAPES):
             return file_px, ""
-        return file_px, f"no camera takes pictures of {size} pixels: cropped after the shot"
+        return file_px, f"an unusual size of {size} pixels: probably cropped after the shot"
     taken_longer, taken_shorter = max(taken_px), min(taken_px)
     scales = longer / taken_longer, shorter / taken_shorter
     if _same(shorter, taken_shorter * scales[0]) or _same(longer, taken_longer * scales[1]):
@@ -80,7 +80,7 @@ def _whole(file_px: tuple[float, float], taken_px: tuple[int, int] | None) -> tu
     if any(_same(side, taken) for side, taken in zip(file_px, whole, strict=True)):
         return whole, ""  # one side is as the camera took it: the other one was cut, and nothing was resized
     scale = max(scales)
-    doubt = f"EXIF is of {taken_longer}x{taken_shorter} pixels, the file has {size}: cropped after the shot"
+    doubt = f"EXIF is for {taken_longer}x{taken_shorter} pixels, but the file has {size}: cropped after the shot"
     return (scale * taken_longer, scale * taken_shorter), doubt
 
 

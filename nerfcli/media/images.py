@@ -229,7 +229,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     """The file as a lazy Pillow image; what goes wrong with the file inside the block becomes a UserError."""
     try:
         if path.stat().st_size == 0:
-            raise UserError(f"{path} is empty (0 bytes)", "copy the photo once more, or remove the file")
+            raise UserError(f"{path} is empty (0 bytes)", "copy the photo again, or remove the file")
         with warnings.catch_warnings():
             # Pillow warns about odd metadata and palettes; none of it changes the pixels.
             warnings.filterwarnings("ignore", module=r"PIL\.")
@@ -237,15 +237,15 @@ def _opened(path: Path) -> Iterator[Image.Image]:
                 yield image
     except UnidentifiedImageError as error:
         raise UserError(
-            f"{path} is not a picture that can be read",
-            f"expected {_FORMATS}; convert it (HEIC and raw files too), or remove it from the folder",
+            f"{path} is not a readable picture",
+            f"supported are {_FORMATS}; convert it (HEIC and raw files, too), or remove it from the folder",
         ) from error
     except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
         raise UserError(f"cannot read {path}: {error.strerror}", f"expected a {_FORMATS} file") from error
     except _DAMAGED as error:
         raise UserError(
-            f"{path} is damaged or cut short: {error}",
-            "copy the photo once more, or remove it from the folder",
+            f"{path} is damaged or truncated: {error}",
+            "copy the photo again, or remove it from the folder",
         ) from error
 
 
@@ -260,7 +260,7 @@ def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
     if image.mode in ("I", "F"):
         kind = "integer" if image.mode == "I" else "float"
         raise UserError(
-            f"{path} has 32-bit {kind} pixels, whose white is not known",
+            f"{path} has 32-bit {kind} pixels, whose white level is unknown",
             "save it with 8 or 16 bits per channel",
         )
     if mode == "RGBA" or image.mode not in ("RGB", "L", "CMYK"):

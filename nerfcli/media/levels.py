@@ -75,10 +75,10 @@ def write_png16(path: Path, depth: np.ndarray, meta: DepthMeta, *, units_per_lev
 def scale_in_words(meta: DepthMeta) -> str:
     """ "a level is 1 mm, 0 is no value"."""
     if meta.units_per_level is None:
-        return "NaN is no value"
+        return "NaN means no value"
     if meta.unit == "metre":
-        return f"a level is {meta.units_per_level / MILLIMETRE:g} mm, 0 is no value"
-    return f"a level is {meta.units_per_level:g} {meta.unit} units, 0 is no value"
+        return f"one level is {meta.units_per_level / MILLIMETRE:g} mm, 0 means no value"
+    return f"one level is {meta.units_per_level:g} {meta.unit} units, 0 means no value"
 
 
 def depth_of_levels(levels: np.ndarray, units_per_level: float) -> np.ndarray:
@@ -95,13 +95,14 @@ def _levels(path: Path, depth: np.ndarray, units_per_level: float) -> tuple[np.n
         largest, reach = float(depth[valid].max()), LARGEST_LEVEL * units_per_level
         fits = f"--depth-scale {chosen_scale(largest, 'arbitrary'):g}, or " if math.isfinite(largest) else ""
         raise UserError(
-            f"{path}: 16 bits hold depths up to {reach:.6g} at {units_per_level:g} per level; one is {largest:.6g}",
+            f"{path}: 16 bits hold depth up to {reach:.6g} at {units_per_level:g} per level, but the maximum is "
+            f"{largest:.6g}",
             f"use {fits}a float format (--depth-format tiff)",
         )
     if (valid & (levels < 1)).any():
         smallest = float(depth[valid].min())
         raise UserError(
-            f"{path}: a depth of {smallest:.6g} would read as no depth in levels of {units_per_level:g}",
+            f"{path}: a depth of {smallest:.6g} would become 0 (no value) in levels of {units_per_level:g}",
             "use a smaller --depth-scale, --depth-axis ray, or a float format (--depth-format tiff)",
         )
     rounding = float(np.abs(exact - levels).max(initial=0)) * units_per_level

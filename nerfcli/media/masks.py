@@ -14,7 +14,7 @@ from nerfcli.media.images import IMAGE_SUFFIXES, read_exif, read_image, upright
 # Compression of these formats leaves traces around an edge, in the black and in the white.
 _LOSSY_SUFFIXES = frozenset({".jpg", ".jpeg", ".webp"})
 _MIDDLE = 128
-_HINT = "a mask has the size of its photo; pixels that are black in it are ignored"
+_HINT = "a mask must have the size of its photo; black pixels are ignored"
 
 
 def find_mask(name: str, masks: Path) -> Path | None:
@@ -53,7 +53,7 @@ def read_mask(path: Path, photo: Path) -> np.ndarray:
     if size != wanted and exif.orientation >= 5 and size == wanted[::-1]:
         levels = upright(levels, exif.orientation)
     elif size != wanted:
-        raise UserError(f"{path} is {size[0]}x{size[1]}, its photo is {wanted[0]}x{wanted[1]}", _HINT)
+        raise UserError(f"{path} is {size[0]}x{size[1]}, but its photo is {wanted[0]}x{wanted[1]}", _HINT)
     if path.suffix.lower() in _LOSSY_SUFFIXES:
         return np.where(levels >= _MIDDLE, np.uint8(255), np.uint8(0))
     return levels * np.uint8(255) if levels.max() == 1 else levels

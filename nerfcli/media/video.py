@@ -28,7 +28,7 @@ _COLOURS = (
 GIF_FASTEST_FPS = 50.0
 # Ordered dither does not crawl over areas that stand still, as error diffusion does.
 _DITHER = "[0:v][1:v]paletteuse=dither=bayer:bayer_scale=4"
-_ANOTHER_FFMPEG = "install ffmpeg, and name its program in the variable IMAGEIO_FFMPEG_EXE"
+_ANOTHER_FFMPEG = "install ffmpeg, and set the environment variable IMAGEIO_FFMPEG_EXE to its path"
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,10 @@ def check_encoders(formats: Iterable[str]) -> None:
     there = set(re.findall(r"^ V\S+ +(\S+)", listed.stdout, flags=re.MULTILINE))
     for name in formats:
         if FORMATS[name].encoder not in there:
-            able = ", ".join(other for other, form in FORMATS.items() if form.encoder in there) or "no video at all"
+            able = ", ".join(other for other, form in FORMATS.items() if form.encoder in there) or "no videos"
             raise UserError(
-                f"cannot make {name} videos: {ffmpeg} has no encoder {FORMATS[name].encoder}",
-                f"it can make {able}; choose one of these, or {_ANOTHER_FFMPEG}",
+                f"cannot write {name} videos: {ffmpeg} has no encoder {FORMATS[name].encoder}",
+                f"it supports {able}; use one of these, or {_ANOTHER_FFMPEG}",
             )
 
 
@@ -193,7 +193,7 @@ def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *,
                     process.wait()
                     raise _failure(told, log) from error
             if process is None:
-                raise ValueError(f"no frame came for {told}")
+                raise ValueError(f"there are no frames for {told}")
             process.communicate()
             if process.returncode != 0:
                 raise _failure(told, log)
@@ -219,11 +219,13 @@ def _ffmpeg() -> str:
     try:
         return imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
-        raise UserError("cannot make videos: there is no ffmpeg", f"{_ANOTHER_FFMPEG}, or leave videos out") from error
+        raise UserError(
+            "cannot write videos: ffmpeg not found", f"{_ANOTHER_FFMPEG}, or remove the video options"
+        ) from error
 
 
 def _failure(told: Path, log: IO[bytes]) -> UserError:
     log.seek(0)
     lines = log.read().decode("utf-8", errors="replace").strip().splitlines()
     reason = lines[-1] if lines else "the encoder stopped"
-    return UserError(f"cannot write {told}: {reason}", "free space on the disk, or write elsewhere")
+    return UserError(f"cannot write {told}: {reason}", "free some disk space, or write elsewhere")

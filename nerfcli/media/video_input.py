@@ -69,15 +69,15 @@ def open_video(path: Path) -> Video:
         UserError: no such file, no video in it, or none that can be decoded.
     """
     if not path.is_file():
-        raise UserError(f"there is no video {path}", "give a video file, or a folder of photos")
+        raise UserError(f"{path} does not exist", "give a video file, or a folder of photos")
     if path.stat().st_size == 0:
-        raise UserError(f"{path} is empty (0 bytes)", "copy the video once more")
+        raise UserError(f"{path} is empty (0 bytes)", "copy the video again")
     with _decoding(path, _UPRIGHT, "ppm", more=("-frames:v", "1")) as decoder:
         first = next(decoder.frames(), None)
         decoder.finish()
     head = "\n".join(decoder.head)
     if _NO_VIDEO.search(head) or "matches no streams" in decoder.said:
-        raise UserError(f"there is no video stream in {path}", "give a video file, or a folder of photos")
+        raise UserError(f"{path} contains no video stream", "give a video file, or a folder of photos")
     if first is None:
         raise _unreadable(path, decoder)
     stream = next((line for line in decoder.head if re.search(r"Stream #0:.* Video: ", line)), "")
@@ -206,7 +206,7 @@ def _decoding(path: Path, filters: str, codec: str, *, more: Sequence[str] = ())
         ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
         hint = "install ffmpeg, or name its program in the variable IMAGEIO_FFMPEG_EXE"
-        raise UserError(f"cannot read {path}: there is no ffmpeg", hint) from error
+        raise UserError(f"cannot read {path}: ffmpeg not found", hint) from error
     command = [
         *(ffmpeg, "-hide_banner", "-nostats", "-nostdin", "-loglevel", "level+info"),
         # "file:", because a colon in a name would read as a protocol; and no list of files may lead elsewhere.
@@ -262,8 +262,8 @@ def _cut_short(video: Video, decoder: _Decoder) -> UserError:
     until = f"{readable[-1]:.1f} s" if len(readable) else "the start"
     stated = f" of {video.seconds:.1f} s" if video.seconds > 0 else ""
     return UserError(
-        f"{video.path} is cut short: it can be read up to {until}{stated}",
-        "copy the video once more, or save the part that is there as a new one: ffmpeg -i OLD.mp4 -c copy NEW.mp4",
+        f"{video.path} is truncated: it can be read up to {until}{stated}",
+        "copy the video again, or save the readable part as a new file: ffmpeg -i OLD.mp4 -c copy NEW.mp4",
     )
 
 
@@ -271,6 +271,6 @@ def _unreadable(path: Path, decoder: _Decoder) -> UserError:
     said = decoder.said.splitlines()
     reason = said[0] if said else "no frame can be decoded"
     if decoder.cut_short:
-        return UserError(f"{path} is cut short: {reason}", "copy the video once more")
-    hint = "give a video or a folder of photos; copy a damaged video once more, or save it as MP4 (H.264)"
-    return UserError(f"{path} cannot be read as a video: {reason}", hint)
+        return UserError(f"{path} is truncated: {reason}", "copy the video again")
+    hint = "give a video or a folder of photos; copy a damaged video again, or convert it to MP4 (H.264)"
+    return UserError(f"{path} is not a readable video: {reason}", hint)

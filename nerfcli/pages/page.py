@@ -113,7 +113,8 @@ def refuse_foreign(path: Path, mark: Mark, *, about: str) -> None:
             if mark.html().encode() in file.read(_HEAD_BYTES):
                 return
     raise UserError(
-        f"{path} exists and is no page of this {about}", "add --overwrite to replace it, or choose another file with -o"
+        f"{path} exists and is not a page of this {about}",
+        "add --overwrite to replace it, or choose another file with -o",
     )
 
 

@@ -47,19 +47,22 @@ def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: 
 def load_photo(frame: Frame, factor: float, masks: str) -> Photo:
     """Read one photo; arguments as of `load_photos`."""
     if frame.image is None:
-        raise UserError(f"{frame.name} has no photo", "this camera can be rendered, but not trained on or evaluated")
+        raise UserError(
+            f"{frame.name} has no photo", "this view can be rendered, but not used for training or evaluation"
+        )
     if not frame.image.exists():
         raise UserError(
-            f"the photo {frame.image.resolve()} is not there",
-            "put it back; or, where photos or run were moved, put a link to the photos' folder in its place: "
-            "a run looks for them where they were as seen from itself",
+            f"photo not found: {frame.image.resolve()}",
+            "put it back; if photos or run were moved, restore their relative location or put a link to the photo "
+            "folder there",
         )
     pixels = read_image(frame.image)
     height, width = pixels.shape[:2]
     if (width, height) != (frame.camera.width, frame.camera.height):
         raise UserError(
-            f"{frame.image} is {width}x{height}, its camera says {frame.camera.width}x{frame.camera.height}",
-            "put the photo back that the poses were made from, or run nerfcli poses again",
+            f"{frame.image} is {width}x{height} pixels, but its camera is for {frame.camera.width}x"
+            f"{frame.camera.height}",
+            "restore the photo that the poses were estimated from, or run nerfcli poses again",
         )
     used = None
     if frame.mask is not None and masks == "empty":

@@ -174,7 +174,9 @@ class PixelPool:
         usable_counts = [int(usable(photo).sum()) for photo in photos]
         self.usable_count = sum(usable_counts)
         if self.usable_count == 0:
-            raise UserError("no pixel is left to train on", "check that the masks are white where pixels count")
+            raise UserError(
+                "no pixels are left to train on", "check the masks: white pixels are used, black ones are ignored"
+            )
         self.usable: Tensor | None = None
         if self.usable_count < len(self.colours):  # a list of all pixels would be larger than the photos
             numbers = room.array((self.usable_count,), np.int64)

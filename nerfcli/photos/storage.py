@@ -132,17 +132,17 @@ def room_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[Room, st
     """
     total = needs.photos + needs.rest
     if limit is None or total <= limit:
-        return IN_MEMORY, f"memory: about {_gigabytes(total)}, {_gigabytes(needs.photos)} of it photos"
+        return IN_MEMORY, f"memory: about {_gigabytes(total)}, of which photos {_gigabytes(needs.photos)}"
     if needs.rest > limit:
         raise UserError(
-            f"the training needs about {_gigabytes(needs.rest)} of memory besides the photos, "
-            f"{_gigabytes(limit)} are allowed",
-            "allow more with --memory, make the photos smaller with --downscale 4, or take fewer --threads",
+            f"training needs about {_gigabytes(needs.rest)} of memory in addition to the photos, but the limit is "
+            f"{_gigabytes(limit)}",
+            "raise --memory, reduce the photos with --downscale 4, or use fewer --threads",
             OUT_OF_MEMORY,
         )
     told = (
-        f"memory: about {_gigabytes(total)} would be needed, {_gigabytes(limit)} are allowed: the photos "
-        f"({_gigabytes(needs.photos)}) stand in files without a name in {folder}"
+        f"memory: about {_gigabytes(total)} needed, limit {_gigabytes(limit)}: the photos ({_gigabytes(needs.photos)}"
+        f") are kept in temporary files in {folder}"
     )
     # Room for the pages that a step brings back: the system maps 16 of them around each pixel that is looked at.
     return InFiles(folder, limit - (limit - needs.rest) // 2), told

@@ -128,24 +128,26 @@ def closing_notes(report: PosesReport) -> list[str]:
     placed = {image.name for image in report.images if image.registered}
     if len(report.parts) > 1 and report.registered < report.total:
         sizes = " + ".join(str(size) for size in report.parts)
-        notes.append(f"the photos fall into parts that share few verified matches: {sizes} photos")
+        notes.append(f"the photos form parts with few verified matches between them: {sizes} photos")
     for number, component in enumerate(report.components, start=1):
         if number == report.settings.component or placed.issuperset(component["photos"]):
             continue
         names = component["photos"]
         some = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
         why = f": {component['apart']}" if component["apart"] else ""
-        notes.append(f"component {number} has {component['size']} photos ({some}){why}; --component {number} takes it")
+        notes.append(
+            f"component {number} has {component['size']} photos ({some}){why}; use it with --component {number}"
+        )
     for camera in report.cameras:
         certain = camera.get("uncertainty")
         if certain and certain["weak"]:
             notes.append(
-                f"intrinsics are weakly determined (camera of {camera['images']} photos: focal length "
-                f"+-{certain['focal_percent']:.1f} %, distortion +-{certain['distortion_border_px']:.1f} px at the "
+                f"intrinsics are weakly determined (camera of {camera['images']} photos: focal length ± "
+                f"{certain['focal_percent']:.1f} %, distortion ± {certain['distortion_border_px']:.1f} px at the "
                 "corners): give --intrinsics"
             )
     for check, why in report.not_computed.items():
-        notes.append(f"a check could not be computed ({check}): {why}")
+        notes.append(f"could not compute a check ({check}): {why}")
     return notes
 
 
@@ -168,15 +170,15 @@ def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
     enough = report.registered >= max(MIN_PHOTOS, least_share * report.total)
     if failures and (enough or "baseline" in failures[0]["kind"]):
         first = failures[0]
-        text = f"the poses of {photos_dir} are not to be trusted: {first['kind']}: {first['evidence']}"
+        text = f"the poses of {photos_dir} cannot be trusted: {first['kind']}: {first['evidence']}"
         return UserError(text, first["advice"], TOO_FEW_PHOTOS)
     if enough:
         return None
-    placed = f"only {report.registered} of {report.total} photos could be placed ({photos_dir})"
+    placed = f"only {report.registered} of {report.total} photos registered ({photos_dir})"
     if sum(report.parts[1:]) > _MUCH_APART * report.total:
         sizes = " + ".join(str(size) for size in report.parts)
-        text = f"{placed}: they fall into parts of {sizes} photos that share few matches (disconnected)"
-        return UserError(text, "take photos that join the parts, or give each part by itself", TOO_FEW_PHOTOS)
+        text = f"{placed}: they form parts of {sizes} photos with few matches between them (disconnected)"
+        return UserError(text, "take photos that connect the parts, or process each part separately", TOO_FEW_PHOTOS)
     reasons = [image.reason for image in report.images if image.reason]
     kind, advice = dominant(reasons)
     example = next(text for text in reasons if text.startswith(kind))

@@ -74,7 +74,7 @@ def estimate_poses(
     photos, grouped, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
     _check_destination(scene_dir, photos_dir)
     for name, why in photos.unreadable.items():
-        notify(f"{name} is left out: {why}")
+        notify(f"{name} is skipped: {why}")
     for note in grouped.notes:
         notify(note)
     planned(plan)
@@ -95,7 +95,7 @@ def estimate_poses(
         if error := refusal(report, photos_dir):
             if not (settings.accept_refused and report.models):
                 raise _refused(advised(error, report.moving_foreground), report, scene_dir)
-            notify(f"accepted all the same, as --accept-refused says: {error.message}")
+            notify(f"accepted because of --accept-refused: {error.message}")
 
         def describe() -> None:
             write_json(scene_dir / "poses_report.json", report.to_json())
@@ -202,7 +202,7 @@ def _work(
             if not (work / UNDERWAY).exists():
                 raise
             check = _read_json(work / UNDERWAY)["check"]
-            notify(f"a check could not be computed ({check}): {error.message}; the others go on without it")
+            notify(f"could not compute a check ({check}): {error.message}; continuing with the others")
             job = replace(job, skipped_checks=(*job.skipped_checks, (check, error.message)))
 
 
@@ -263,12 +263,12 @@ def _check_destination(scene_dir: Path, photos_dir: Path) -> None:
     scene_path, photos_path = scene_dir.resolve(), photos_dir.resolve()
     hint = "choose another folder with -o"
     if photos_path.is_relative_to(scene_path):
-        raise UserError(f"the scene {scene_dir} would take the place of the photos in {photos_dir}", hint)
+        raise UserError(f"the scene {scene_dir} would overwrite the photos in {photos_dir}", hint)
     if scene_dir.exists() and not scene_dir.is_dir():
-        raise UserError(f"cannot write the scene {scene_dir}: a file has this name", hint)
+        raise UserError(f"cannot write the scene {scene_dir}: a file with this name exists", hint)
     ours = (scene_dir / scene.SCENE_FILE).is_file() or is_in_the_making(scene_dir)
     if scene_dir.is_dir() and any(scene_dir.iterdir()) and not ours:
-        raise UserError(f"cannot write the scene {scene_dir}: the folder holds something that is no scene", hint)
+        raise UserError(f"cannot write the scene {scene_dir}: the folder contains other files", hint)
 
 
 def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserError:
@@ -278,11 +278,11 @@ def _refused(error: UserError, report: PosesReport, scene_dir: Path) -> UserErro
     path = folder / "poses_report.json"
     write_json(path, report.to_json())
     if not report.models:
-        return UserError(error.message, f"{error.hint}; all numbers are in {path}", error.exit_code)
+        return UserError(error.message, f"{error.hint}; details are in {path}", error.exit_code)
     model = keep_refused(scene_dir, folder)
     hint = (
-        f"{error.hint}; the numbers are in {path}, the refused model of {report.registered} photos is in {model} "
-        f"({POINTS_FILE} opens in any viewer of meshes), and --accept-refused makes it the scene"
+        f"{error.hint}; details are in {path}, the refused model of {report.registered} photos is in {model} (open "
+        f"{POINTS_FILE} in a mesh viewer), and --accept-refused uses it anyway"
     )
     return UserError(error.message, hint, error.exit_code)
 
@@ -292,7 +292,7 @@ def _no_such_component(report: PosesReport, photos_dir: Path) -> UserError:
     count = len(report.components)
     return UserError(
         f"there is no component {report.settings.component}: the photos of {photos_dir} form {count} ({sizes} photos)",
-        f"choose --component 1 to {count}" if count else "leave out --component",
+        f"use --component 1 to {count}" if count else "remove --component",
     )
 
 

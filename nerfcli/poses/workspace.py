@@ -42,7 +42,7 @@ def workspace(scene_dir: Path) -> Iterator[Workspace]:
         UserError: another process works there, or nothing can be written there.
     """
     folder = scene_dir / "work"
-    with exclusive(folder / _LOCK, f"nerfcli poses is at work on {scene_dir}") as lock:
+    with exclusive(folder / _LOCK, f"nerfcli poses is working on {scene_dir}") as lock:
         for place in (scene_dir, folder):
             clear_leftovers(place)
         yield Workspace(folder, lock)

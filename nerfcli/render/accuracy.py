@@ -22,9 +22,9 @@ from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import render_cut_rays, uniform_cuts
 
 IN_WORDS = (
-    "these numbers are about the rendering of the field, not about how far the field is from the scene: "
-    "truncation_of_colour bounds what the early stop and negligible samples left out of a channel, "
-    "truncation_of_depth and quadrature measure on random pixels what deeper stops and finer samples change"
+    "these numbers concern the rendering, not how close the field is to the scene: truncation_of_colour bounds what "
+    "the early stop and negligible samples left out of a channel, truncation_of_depth and quadrature measure on "
+    "random pixels what deeper stops and finer samples change"
 )
 PIXELS = 256
 # Of the renderings that are compared with each other: what they leave out must not show.

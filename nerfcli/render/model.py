@@ -118,7 +118,7 @@ def load_model(path: Path, device: str) -> Model:
         description["field"]["contraction"] = "l2" if description["field"].pop("unbounded") else "none"
     if description.get("format") != FORMAT:
         raise UserError(
-            f"{path} holds {description.get('format')!r}, expected {FORMAT!r}",
+            f"{path} is of format {description.get('format')!r}, expected {FORMAT!r}",
             "train again with this version of nerfcli",
         )
     occupied = tensors.pop("occupied")

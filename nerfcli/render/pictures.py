@@ -131,7 +131,7 @@ def _refuse_non_finite(frame: Frame, maps: dict[str, np.ndarray]) -> None:
             y, x = np.argwhere(bad)[0]
             raise UserError(
                 f"{name} of {frame.name} is not finite at pixel ({x}, {y}), of {bad.sum()} in all",
-                "the field overflows there: train again with --overwrite and another --seed, and please report it",
+                "the field overflows there: train again with --overwrite and another --seed, and please report this",
                 NON_FINITE,
             )
 

@@ -95,22 +95,22 @@ class Choice:
         except ValueError as error:
             raise _wrong(name, text, "a number") from error
         if not 0.0 <= number < float("inf"):
-            raise _wrong(name, text, "a number from 0 on")
+            raise _wrong(name, text, "a number of at least 0")
         return number
 
 
 CHOICES = {
-    "background": Choice("what is behind the field", "black", "sphere", BACKGROUNDS),
-    "view": Choice("colour by direction, degree", 0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
-    "exposure": Choice("brightness and white balance of photos", "none", "learned", EXPOSURES),
-    "cameras": Choice("poses and lenses of photos", "fixed", "poses", CAMERAS),
-    "masks": Choice("the black of masks is empty space", "ignore", "empty", MASKS),
-    "points": Choice("surfaces at points that photos share, weight", 0.0, 0.1, None),
-    "entropy": Choice("rays are opaque or clear, weight", 0.0, 0.01, None),
+    "background": Choice("colour behind the field", "black", "sphere", BACKGROUNDS),
+    "view": Choice("degree of view-dependent colour", 0, MOST_DEGREES, tuple(range(MOST_DEGREES + 1))),
+    "exposure": Choice("brightness and white balance per photo", "none", "learned", EXPOSURES),
+    "cameras": Choice("camera parameters optimized with the field", "fixed", "poses", CAMERAS),
+    "masks": Choice("whether black in masks is empty space", "ignore", "empty", MASKS),
+    "points": Choice("surfaces at 3D points of matched features, weight", 0.0, 0.1, None),
+    "entropy": Choice("opaque or transparent rays, weight", 0.0, 0.01, None),
     "near": Choice("smaller gradients near cameras", False, True, (False, True)),
-    "distortion": Choice("light of a ray in one place, weight", 0.0, 0.05, None),
-    "antialias": Choice("details smaller than a pixel fade out", False, True, (False, True)),
-    "pixels": Choice("more pixels where the error is", "anywhere", "error", PIXELS),
+    "distortion": Choice("concentrated density along rays, weight", 0.0, 0.05, None),
+    "antialias": Choice("fade out details smaller than a pixel", False, True, (False, True)),
+    "pixels": Choice("more pixels where the error is large", "anywhere", "error", PIXELS),
 }
 assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
 
@@ -131,9 +131,9 @@ def choose(start: Components, *, included: Sequence[str], excluded: Sequence[str
         name, given, value = text.partition("=")
         if name not in CHOICES or (given and not on):
             option = "--with" if on else "--without"
-            raise UserError(f"{option} {text}: there is no such component", f"choose from {', '.join(CHOICES)}", 2)
+            raise UserError(f"{option} {text}: unknown component", f"choose from {', '.join(CHOICES)}", 2)
         if name in values:
-            raise UserError(f"component {name} is named twice", "name it once, with --with or with --without", 2)
+            raise UserError(f"component {name} is given twice", "give it once, with --with or --without", 2)
         choice = CHOICES[name]
         values[name] = choice.value(name, value) if given else choice.on if on else choice.off
     return replace(start, **values)
@@ -146,4 +146,4 @@ def differences(components: Components) -> dict[str, Value]:
 
 
 def _wrong(name: str, text: str, expected: str) -> UserError:
-    return UserError(f"--with {name}={text}: not {expected}", f"write for example --with {name}", 2)
+    return UserError(f"--with {name}={text}: expected {expected}", f"for example --with {name}", 2)

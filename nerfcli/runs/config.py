@@ -161,7 +161,7 @@ def read_config(run: Path) -> RunConfig:
         return RunConfig.from_json(read_sealed(run / CONFIG))
     except FileNotFoundError as error:
         raise UserError(
-            f"{run} is not a run: it has no {CONFIG}", "give the folder that nerfcli train wrote"
+            f"{run} is not a run folder: it has no {CONFIG}", "give a run folder written by nerfcli train"
         ) from error
     except UserError as error:
         raise UserError(f"{run / CONFIG} cannot be read: {error.message}", MEND) from error

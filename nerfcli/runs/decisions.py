@@ -1,4 +1,4 @@
-"""What a scene decided on: a candidate's gain, its error, and whether it is kept; and all of a search together."""
+"""Decisions of the automatic selection: per candidate its gain, the error of the gain, and whether it is kept."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -11,7 +11,7 @@ from nerfcli.runs.components import Components, Value
 
 @dataclass(frozen=True)
 class Decision:
-    """What became of a candidate.
+    """Result for one candidate component.
 
     Args:
         component, value: the change.
@@ -40,27 +40,34 @@ class Decision:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> "Decision":
-        """Read what `to_json` gave; numbers that an earlier version did not have are None."""
+        """Read the content that `to_json` returned; numbers that earlier versions did not write are None."""
         known: dict[str, Any] = {entry.name: content.get(entry.name) for entry in fields(cls)}
         return cls(**known)
 
     def in_words(self) -> str:
-        """A line for people: "exposure=learned: +1.20 +- 0.08 dB, +3 % time: kept, gains ..."."""
+        """Return a line for people: "exposure=learned: +1.20 dB (± 0.08), 3 % more time: kept, gains ..."."""
         named = f"{self.component}={str(self.value).lower()}"
         if self.gain_db is None or self.error_db is None or self.cost is None:
             return f"{named}: {'kept, ' if self.kept else ''}{self.why}"
-        measured = f"{self.gain_db:+.2f} +- {self.error_db:.2f} dB, {self.cost:+.0%} time"
+        measured = f"{self.gain_db:+.2f} dB (± {self.error_db:.2f}), {_time_in_words(self.cost)}"
         return f"{named}: {measured}: {'kept' if self.kept else 'not kept'}, {self.why}"
 
 
+def _time_in_words(cost: float) -> str:
+    per_cent = round(100.0 * abs(cost))
+    if per_cent == 0:
+        return "same time"
+    return f"{per_cent} % {'more' if cost > 0 else 'less'} time"
+
+
 def untried(component: str, value: Value, why: str, *, kept: bool = False) -> Decision:
-    """A candidate that was not tried, and the reason; or one that is kept for that reason."""
+    """Return the decision about a candidate that was not tried, or that is kept without a trial."""
     return Decision(component, value, None, None, None, None, None, kept, why)
 
 
 @dataclass(frozen=True)
 class Selection:
-    """The components that were chosen, how, and what it took.
+    """The selected components, the decisions behind them, and the seconds spent.
 
     Args:
         components: those of the model.

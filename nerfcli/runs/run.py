@@ -101,7 +101,7 @@ class Run:
         try:
             return hashlib.sha256(self.field_path.read_bytes()).hexdigest()
         except OSError as error:
-            hint = "train first, or give another run"
+            hint = "train first (nerfcli train SCENE), or give another run"
             raise UserError(f"{self.field_path} cannot be read: {error.strerror}", hint) from error
 
     def metrics(self) -> dict[str, Any] | None:
@@ -112,7 +112,7 @@ class Run:
         """
         if not self.metrics_path.exists():
             return None
-        hint = "measure again: nerfcli evaluate RUN --overwrite"
+        hint = "evaluate again: nerfcli evaluate RUN --overwrite"
         return read_json(self.metrics_path, needed=("mean",), hint=hint)
 
     def check_split(self) -> None:
@@ -123,9 +123,8 @@ class Run:
         """
         if self.config.split_sha256 != split_hash(frame.name for frame in self.cameras.test):
             raise UserError(
-                f"the held-out photos in {self.path / CAMERAS} are not those that {CONFIG} was written for "
-                "(split_sha256)",
-                "numbers on photos that may have been trained on mean nothing: train again with --overwrite",
+                f"the held-out photos in {self.path / CAMERAS} differ from those recorded in {CONFIG} (split_sha256)",
+                "photos used for training cannot be used for evaluation: train again with --overwrite",
             )
 
     def is_trained_from(self, scene: Scene, settings: TrainSettings) -> bool:

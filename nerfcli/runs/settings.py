@@ -69,23 +69,27 @@ class TrainSettings:
     def __post_init__(self) -> None:
         if min(self.levels, self.width) < 1 or not 4 <= self.log2_rows <= 24:
             sizes = f"levels {self.levels}, log2-rows {self.log2_rows}, width {self.width}"
-            raise UserError(f"no field has {sizes}", "levels and width are 1 or more, log2-rows from 4 to 24")
+            raise UserError(
+                f"invalid size of the field: {sizes}", "levels and width must be at least 1, log2-rows between 4 and 24"
+            )
         if self.budget_seconds is None and self.steps is None:
-            raise UserError("training without an end", "give --budget, --steps, or both")
+            raise UserError(
+                "no stopping criterion: neither --budget nor --steps is given", "give --budget, --steps, or both"
+            )
         if (self.budget_seconds or 1) <= 0 or (self.steps or 1) <= 0:
-            raise UserError("the training budget is not positive", "give for example --budget 2m or --steps 2000")
+            raise UserError("the training budget must be positive", "for example --budget 2m or --steps 2000")
         if self.downscale not in (None, *DOWNSCALES):
-            raise UserError(f"downscale {self.downscale} is not possible", "choose auto, 1, 2, 4 or 8")
+            raise UserError(f"invalid downscale factor {self.downscale}", "choose auto, 1, 2, 4 or 8")
         if self.field not in KINDS:
-            raise UserError(f"there is no field of the kind {self.field!r}", f"choose {', '.join(KINDS)}")
+            raise UserError(f"unknown type of field: {self.field!r}", f"choose {', '.join(KINDS)}")
         if self.components.antialias and self.field != HashFieldSettings.kind:
             raise UserError(
-                f"--with antialias --field {self.field}: a field of this kind has no levels that could fade out",
-                "train a hash grid, or leave it out",
+                f"--with antialias does not work with --field {self.field}: it needs the levels of a hash grid",
+                "use --field hash, or remove --with antialias",
                 2,
             )
         if self.contraction not in (None, *CONTRACTIONS):
-            raise UserError(f"there is no contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
+            raise UserError(f"unknown contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
 
     def to_json(self) -> dict[str, Any]:
         return {**asdict(self), "fixed": list(self.fixed)}

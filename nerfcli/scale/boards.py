@@ -38,11 +38,13 @@ class CharucoBoard:
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 2:
-            raise UserError(f"a ChArUco board of {self.columns}x{self.rows} squares", "expected 2x2 squares at least")
+            raise UserError(
+                f"invalid ChArUco board of {self.columns}x{self.rows} squares", "it needs at least 2x2 squares"
+            )
         if not 0 < self.marker < self.square < np.inf:
             raise UserError(
-                f"a ChArUco board with squares of {self.square:g} m and markers of {self.marker:g} m",
-                "expected lengths in metres, with markers smaller than squares and above 0",
+                f"invalid ChArUco board with squares of {self.square:g} m and markers of {self.marker:g} m",
+                "expected positive lengths in metres, with markers smaller than squares",
             )
 
 
@@ -61,7 +63,7 @@ def scale_from_markers(frames: Sequence[Frame], side: float, *, dictionary: str)
             photos show.
     """
     if not 0 < side < np.inf:
-        raise UserError(f"markers with a side of {side:g} m", "expected a length in metres above 0")
+        raise UserError(f"invalid side length of markers: {side:g} m", "expected a positive length in metres")
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX  # near enough for `refined_corners`
     detector = cv2.aruco.ArucoDetector(_dictionary(dictionary), parameters)
@@ -92,9 +94,9 @@ def scale_from_charuco(frames: Sequence[Frame], board: CharucoBoard) -> ScaleEst
     dictionary = _dictionary(board.dictionary)
     if board.columns * board.rows // 2 > len(dictionary.bytesList):
         raise UserError(
-            f"{board.dictionary} has {len(dictionary.bytesList)} markers, and a board of {board.columns}x{board.rows} "
-            f"squares needs {board.columns * board.rows // 2}",
-            "give the dictionary that the board was made with",
+            f"{board.dictionary} has only {len(dictionary.bytesList)} markers, but a board of {board.columns}x"
+            f"{board.rows} squares needs {board.columns * board.rows // 2}",
+            "give the dictionary of the board",
         )
     size = (board.columns, board.rows)
     printed = cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary)
@@ -118,7 +120,7 @@ def scale_from_charuco(frames: Sequence[Frame], board: CharucoBoard) -> ScaleEst
 def _dictionary(name: str) -> cv2.aruco.Dictionary:
     known = sorted(key for key in vars(cv2.aruco) if key.startswith("DICT_"))
     if name not in known:
-        raise UserError(f"there is no dictionary of markers {name!r}", f"OpenCV has {', '.join(known)}")
+        raise UserError(f"unknown dictionary of markers {name!r}", f"OpenCV has {', '.join(known)}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
@@ -134,8 +136,8 @@ def _photos(frames: Sequence[Frame]) -> Iterator[tuple[int, np.ndarray]]:
         picture = read_image(frame.image)
         if picture.shape[:2] != (frame.camera.height, frame.camera.width):
             raise UserError(
-                f"{frame.image} is {picture.shape[1]}x{picture.shape[0]} pixels large, and its camera "
+                f"{frame.image} is {picture.shape[1]}x{picture.shape[0]} pixels, but its camera is for "
                 f"{frame.camera.width}x{frame.camera.height}",
-                "give the photos that the cameras are for",
+                "give the photos that belong to these cameras",
             )
         yield index, cv2.cvtColor(np.ascontiguousarray(picture[..., :3]), cv2.COLOR_RGB2GRAY)

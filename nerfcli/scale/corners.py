@@ -89,17 +89,17 @@ def _triangulated(frames: Sequence[Frame], seen: Sequence[tuple[int, np.ndarray]
     rays = [(frames[index], *frames[index].camera.bearings(pixel)) for index, pixel in seen]
     rays = [(frame, directions[0]) for frame, directions, valid in rays if valid[0]]
     if len({frame.name for frame, _ in rays}) < 2:
-        return "seen in one photo only"
+        return "visible in only one photo"
     c = np.stack([frame.centre for frame, _ in rays])
     d = np.stack([frame.world_from_cam[:3, :3] @ direction for frame, direction in rays])
     f = np.array([frame.camera.focal_px for frame, _ in rays])
     if (d @ d.T).min() > np.cos(_LEAST_PARALLAX):
-        return "seen from nearly the same direction only"
+        return "visible only from nearly the same direction"
     point, missed = nearest_in_pixels(c, d, f)
     if np.median(missed) > _MOST_MISSED_PX:
-        return f"its directions miss each other by {np.median(missed):.1f} px"
+        return f"its rays miss each other by {np.median(missed):.1f} px"
     if np.median(np.sum((point - c) * d, axis=1)) <= 0:
-        return "its directions meet behind the cameras"
+        return "its rays intersect behind the cameras"
     return point
 
 
@@ -130,12 +130,13 @@ def nearest_in_pixels(c: np.ndarray, d: np.ndarray, f: np.ndarray) -> tuple[np.n
 def _no_scale(pattern: str, sightings: Sightings, reasons: Sequence[str]) -> UserError:
     if not sightings:
         return UserError(
-            f"no photo shows the {pattern}", "check the dictionary and the size, and that the pattern is large enough"
+            f"no photo shows the {pattern}",
+            "check the dictionary and the size, and that the pattern is large enough in the photos",
         )
     photos = len({index for seen in sightings.values() for index, _ in seen})
-    most = max(set(reasons), key=reasons.count) if reasons else "no two corners of one side are known"
+    most = max(set(reasons), key=reasons.count) if reasons else "no side has two triangulated corners"
     return UserError(
-        f"the {pattern} in {photos} photo{'s' if photos > 1 else ''} give no scale: of {len(sightings)} corners "
-        f"{len(reasons)} cannot be placed, mostly {most}",
-        "the pattern must lie still and be seen by two photos at least, from different directions",
+        f"no scale from the {pattern} in {photos} photo{'s' if photos > 1 else ''}: {len(reasons)} of {len(sightings)}"
+        f" corners cannot be triangulated, mostly {most}",
+        "the pattern must not move, and at least two photos must show it from different directions",
     )

@@ -15,7 +15,7 @@ from nerfcli.errors import UserError
 from nerfcli.scale.estimate import ScaleEstimate
 
 EXPECTED = (
-    'expected "A B METRES" with A and B names of images or points x,y,z, such as "a.jpg b.jpg 1.25" or '
+    'expected "A B METRES", where A and B are names of images or points x,y,z, such as "a.jpg b.jpg 1.25" or '
     '"0,0,0 1,0,0 0.3+-0.002"; quote names with spaces'
 )
 _POINT = re.compile(r"[^,]+,[^,]+,[^,]+")
@@ -39,13 +39,17 @@ class KnownDistance:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.units) and self.units > 0):
-            raise UserError(f"{self.name}: the two places are the same in the scene", "measure between two others")
+            raise UserError(
+                f"{self.name}: the two points coincide in the scene", "give a distance between two other points"
+            )
         if not (math.isfinite(self.metres) and self.metres > 0):
-            raise UserError(f"{self.name}: a distance of {self.metres:g} m", "expected a length in metres above 0")
+            raise UserError(
+                f"{self.name}: invalid distance of {self.metres:g} m", "expected a positive length in metres"
+            )
         if self.tolerance is not None and not 0 < self.tolerance < self.metres:
             raise UserError(
-                f"{self.name}: {self.metres:g} m +- {self.tolerance:g} m",
-                "expected a standard error above 0 and below the length",
+                f"{self.name}: invalid standard error, {self.metres:g} m ± {self.tolerance:g} m",
+                "the standard error must be positive and smaller than the length",
             )
 
 
@@ -59,9 +63,9 @@ def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
         first, second, length = shlex.split(text)
         metres, *tolerance = (float(part) for part in length.replace("±", "+-").split("+-"))
     except ValueError as error:
-        raise UserError(f"{text!r} is no known distance", EXPECTED) from error
+        raise UserError(f"{text!r} is not a valid distance", EXPECTED) from error
     if len(tolerance) > 1:
-        raise UserError(f"{text!r} is no known distance", EXPECTED)
+        raise UserError(f"{text!r} is not a valid distance", EXPECTED)
     a, b = (_place(place, frames) for place in (first, second))
     units = float(np.linalg.norm(a - b))
     return KnownDistance(f"{first} to {second}", units, metres, tolerance[0] if tolerance else None)

@@ -84,14 +84,14 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
     if len(used) < 2:
         raise UserError(
             f"only {len(used)} of {len(frames)} photos with a pose have a GPS position in their EXIF",
-            "2 at least are needed for the scale and 3 for directions; give a known distance instead",
+            "at least 2 are needed for the scale and 3 for directions; give a known distance instead",
         )
     x = centres_of(used)
     y, reference = east_north_up([positions[frame.name] for frame in used])
     if not (np.ptp(x, axis=0).max() > 0 and np.ptp(y, axis=0).max() > 0):
         which = "GPS positions" if np.ptp(x, axis=0).max() > 0 else "cameras"
         raise UserError(
-            f"the {which} of all {len(used)} photos are the same", "no scale comes from that; give a known distance"
+            f"the {which} of all {len(used)} photos are identical", "this gives no scale; give a known distance instead"
         )
     fit = align_robustly(x, y)
     keep = fit.follows
@@ -100,22 +100,23 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
     spread = float(np.sqrt(np.mean(np.sum((y[keep] - y[keep].mean(axis=0)) ** 2, axis=1))))
     noise = float(np.sqrt(3)) * sigma
     if not spread >= _SPREAD_PER_NOISE * noise:
-        how = "as the fit of the photos' poses tells" if told else f"as is taken for {int(keep.sum())} photos"
+        how = "estimated from the fit to the poses" if told else f"as assumed for {int(keep.sum())} photos"
         raise UserError(
-            f"GPS tells no scale: the photos are spread over {spread:.2g} m, and GPS is off by {noise:.2g} m, {how}",
-            f"a spread of {_SPREAD_PER_NOISE * noise:.2g} m at least is needed; give a known distance instead",
+            f"GPS is too inaccurate for a scale: the photos are spread over {spread:.2g} m, and the GPS error is "
+            f"{noise:.2g} m ({how})",
+            f"a spread of at least {_SPREAD_PER_NOISE * noise:.2g} m is needed; give a known distance instead",
         )
     scale = fit.b_from_a.scale
     residuals = np.linalg.norm(fit.b_from_a.apply(x) - y, axis=1)
     left_out = tuple(frame.name for frame, kept in zip(used, keep, strict=True) if not kept)
-    off = f"; left out, being far off: {', '.join(left_out)}" if left_out else ""
+    off = f"; outliers ignored: {', '.join(left_out)}" if left_out else ""
     estimate = ScaleEstimate(
         metres_per_unit=scale,
         standard_error=max(_jackknife(x[keep], y[keep]), scale * sigma / (np.sqrt(keep.sum()) * spread)),
         residuals=tuple((frame.name, float(r)) for frame, r in zip(used, residuals, strict=True)),
         residual_unit="metre",
         source=f"GPS of {int(keep.sum())} photos (EXIF)",
-        details=f"the photos are spread over {spread:.3g} m, and GPS is off by {noise:.2g} m{off}",
+        details=f"the photos are spread over {spread:.3g} m, and the GPS error is {noise:.2g} m{off}",
     )
     directions = fit.b_from_a if _spans_a_plane(scale * x[keep], sigma) else None
     return GpsFit(estimate, directions, reference, left_out, spread, noise)

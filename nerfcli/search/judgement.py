@@ -1,4 +1,4 @@
-"""What paired short trainings say of a change: its gain, the gain's error, and whether it is kept."""
+"""Judge a component from paired short trainings: its gain, the error of the gain, and whether it is kept."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ ROUNDING_DB = 1e-6
 
 
 class Rule(Protocol):
-    """How trials of a change are judged; see `judge_one`."""
+    """Judges the trials of a change; see `judge_one`."""
 
     def __call__(self, base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision: ...
 
@@ -42,7 +42,7 @@ def judge_one(
     standard_errors: float = STANDARD_ERRORS,
     clear_errors: float = CLEAR_ERRORS,
 ) -> Decision:
-    """What paired trials say of something added to the model: it has to gain more than the noise.
+    """Judge an added component: its gain must exceed the noise.
 
     gain = mean over photos and seeds of 10 log10(MSE of base / MSE of candidate). Its variance is that of the mean over
     photos, and that between seeds; with a single one that is SEED_DB squared, and the gain has to be the clearer. A
@@ -76,8 +76,8 @@ def judge_one(
 
 
 def judge_likely(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """What paired trials say of something that signs speak for: a gain above one standard error is enough, or above two
-    with one seed.
+    """Judge an added component that the diagnostics suggest: a gain above one standard error is enough, or above two
+    with a single seed.
 
     Arguments as of `judge_one`.
     """
@@ -85,19 +85,19 @@ def judge_likely(base: Sequence[Trial], change: Change, tried: Sequence[Trial], 
 
 
 def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """What paired trials say of something that mends a fault which is known from elsewhere: it must not lose.
+    """Judge a component that corrects an error known from other evidence: it must not lose.
 
     A trial is too short for most of its gain. Arguments as of `judge_one`.
     """
     measured = judge_one(base, change, tried, by_time=by_time)
     gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
     if gain > -error:
-        return replace(measured, kept=True, why="matched features speak for it, and it does not lose")
-    return replace(measured, kept=False, why="loses, though matched features speak for it")
+        return replace(measured, kept=True, why="supported by matched features and does not lose")
+    return replace(measured, kept=False, why="loses, although matched features support it")
 
 
 def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
-    """What paired trials say of what is left out of the model: hardly anything must be lost, noise and trend included.
+    """Judge the removal of a component: hardly anything must be lost, noise and trend included.
 
     What the model has learned by means of it is gone at once, and a model that does not need it learns that again
     within the trial. Arguments as of `judge_one`.
@@ -106,21 +106,21 @@ def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial],
     gain, error, trend = measured.gain_db or 0.0, measured.error_db or 0.0, measured.trend_db or 0.0
     worst = gain + min(0.0, trend) - STANDARD_ERRORS * error
     if worst > -MOST_LOSS_DB:
-        return replace(measured, kept=True, why=f"not needed: without it surely within {MOST_LOSS_DB:g} dB")
-    why = "needed: loses without it" if gain < -STANDARD_ERRORS * error else "may be needed"
+        return replace(measured, kept=True, why=f"not needed: the loss without it is below {MOST_LOSS_DB:g} dB")
+    why = "needed: PSNR drops without it" if gain < -STANDARD_ERRORS * error else "may be needed"
     return replace(measured, kept=False, why=why)
 
 
 def _against(gain: float, error: float, *, errors: float, trend: float, at_equal_time: float) -> str | None:
-    """What speaks against a candidate; None where nothing does."""
+    """Return the reason to reject a candidate; None if there is none."""
     if gain < -STANDARD_ERRORS * error:
         return "loses"
     if not gain > LEAST_GAIN_DB + errors * error:
         return "no gain above the noise"
     if trend < -error - ROUNDING_DB:
-        return "gains at first only"
+        return "the gain vanishes during the trial"
     if at_equal_time <= LEAST_GAIN_DB:
-        return "gains less than the steps would that it costs"
+        return "gains less than spending the same time on more steps"
     return None
 
 

@@ -1,4 +1,4 @@
-"""Candidates against one another, within a limit of time or steps: the best first, the others beside it."""
+"""Compare candidates within a limit of time or steps: the best one first, then the others together with it."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -29,8 +29,8 @@ REMOVAL_SHARE = 0.65
 # And so much of it may be spent: 2 % of a training, where a search has 15. View dependence takes 5 %
 # of the time, and was left out on one scene of three.
 REMOVAL_COST = 0.13
-NO_TIME, ONCE = "not tried, no time was left", "not clear, and no time was left to try it again"
-COSTS_MORE = "not tried, that would take longer than it may save"
+NO_TIME, ONCE = "not tried, no time left", "not clear with one seed, and no time left for a second one"
+COSTS_MORE = "not tried, the trial would take longer than it could save"
 
 
 class Purse:
@@ -182,7 +182,7 @@ class Race:
     def _judged(self, rule: Rule, change: Change, own: Sequence[Trial]) -> Decision:
         decision = rule(self._base[: len(own)], change, own, by_time=self._purse.is_time)
         others = ", ".join(name for name, _ in self.kept)
-        return replace(decision, why=f"{decision.why} beside {others}") if others else decision
+        return replace(decision, why=f"{decision.why}, in addition to {others}") if others else decision
 
     def _can_run(self, trials: int, *, share_of_time: float = 1.0) -> bool:
         return self._purse.takes(

@@ -85,25 +85,31 @@ def with_known_cameras(asked: Components, facts: Facts) -> tuple[Components, flo
         return asked, 0.0, []
     given, changed = check.misses_px
     if math.isfinite(check.error):
-        told = (
-            f"{check.matches} matched features ask for lenses {math.expm1(check.log_focal):+.2%} +- {check.error:.2%} "
-            f"as long, and miss by {given:.2f} px as they are, by {changed:.2f} px then"
+        per_cent = 100.0 * math.expm1(check.log_focal)
+        reason = (
+            f"{check.matches} matched features suggest a focal length {abs(per_cent):.2f} % (± {check.error:.2%}) "
+            f"{'longer' if per_cent > 0 else 'shorter'}; epipolar error {given:.2f} px -> {changed:.2f} px"
         )
     else:
-        told = f"{check.matches} matched features miss by {given:.2f} px, and by more with other lenses"
+        reason = (
+            f"the epipolar error of {check.matches} matched features is {given:.2f} px, more at other focal lengths"
+        )
     is_sure = abs(check.log_focal) > max(LEAST_FOCAL, FOCAL_ERRORS * check.error)
     # Wrong poses ask for any length: one that is right leaves nothing to ask for.
     is_sure = is_sure and changed < min(MISS_SHARE * given, LEAST_MISS_PX)
     if is_sure:
         value = asked.cameras if learns else "focal"
-        return replace(asked, cameras=value), check.log_focal, [untried("cameras", value, told, kept=True)]
+        return replace(asked, cameras=value), check.log_focal, [untried("cameras", value, reason, kept=True)]
     if learns:
         return asked, 0.0, []
-    decisions = [untried("cameras", "focal", f"not tried, {told}")]
+    decisions = [untried("cameras", "focal", f"not tried, {reason}")]
     if min(check.misses_px) < SURELY_MISSED_PX:
         return asked, 0.0, decisions
-    told = f"{check.matches} matched features miss by {min(check.misses_px):.2f} px, whatever the length of lenses"
-    return replace(asked, cameras="poses"), 0.0, [*decisions, untried("cameras", "poses", told, kept=True)]
+    reason = (
+        f"the epipolar error of {check.matches} matched features is at least {min(check.misses_px):.2f} px at "
+        "any focal length"
+    )
+    return replace(asked, cameras="poses"), 0.0, [*decisions, untried("cameras", "poses", reason, kept=True)]
 
 
 def tells_points(asked: Components, facts: Facts) -> bool:
@@ -126,8 +132,8 @@ def with_points(asked: Components, facts: Facts) -> tuple[Components, list[Decis
     if facts.points == 0 or "points" in facts.fixed or not tells_points(asked, facts):
         return asked, []
     value = CHOICES["points"].on
-    told = f"{facts.points} pixels see points whose distance is known"
-    return replace(asked, points=value), [untried("points", value, told, kept=True)]
+    reason = f"{facts.points} pixels see a 3D point at a known distance"
+    return replace(asked, points=value), [untried("points", value, reason, kept=True)]
 
 
 def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Change], list[Decision]]:
@@ -145,18 +151,20 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
     if signs.exposure_spread > LEAST_EXPOSURE_SPREAD:
         candidates.append(("exposure", "learned"))
     else:
-        told = f"not tried, photos differ in brightness by {math.expm1(signs.exposure_spread):.1%} only"
-        declined.append(untried("exposure", "learned", told))
+        spread = 100.0 * math.expm1(signs.exposure_spread)
+        declined.append(
+            untried("exposure", "learned", f"not tried, photos differ in brightness by only {spread:.1f} %")
+        )
     check = facts.cameras
     if facts.cameras_known is not None:
         declined.append(untried("cameras", "poses", f"not tried, {facts.cameras_known}"))
     elif check is None:
         candidates.append(("cameras", "poses"))
         # Within a trial, a right length changes as much as a wrong one: the coarse field pulls at both.
-        declined.append(untried("cameras", "focal", "not tried, photos share too few features to tell"))
+        declined.append(untried("cameras", "focal", "not tried, too few matched features to decide"))
     elif min(check.misses_px) < LEAST_MISS_PX:
-        told = f"not tried, matched features miss by {min(check.misses_px):.2f} px only"
-        declined.append(untried("cameras", "poses", told))
+        reason = f"not tried, the epipolar error of matched features is only {min(check.misses_px):.2f} px"
+        declined.append(untried("cameras", "poses", reason))
     else:
         candidates.append(("cameras", "poses"))
     against_sky = _against_sky(signs)
@@ -172,13 +180,16 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
 
 
 def _against_sky(signs: Signs) -> str | None:
-    """Why there is none to be looked for; None where there may be one."""
-    far = f"{signs.far_share:.1%} of the pixels have most of their light from far away"
+    """Return why no sky is expected; None if there may be one."""
+    far = f"{100.0 * signs.far_share:.1f} % of the pixels see mostly distant surfaces"
     if signs.far_share <= LEAST_FAR_SHARE:
-        return far
+        return f"only {far}"
     one, painted = signs.sky_psnr
     if painted < LEAST_SKY_PSNR and painted - one < LEAST_SKY_DB:
-        return f"{far}, but their colours are no matter of direction: {painted:.1f} dB by it, {one:.1f} with one colour"
+        return (
+            f"{far}, but viewing direction does not explain their colours: {painted:.1f} dB with it, {one:.1f} dB with "
+            "one colour"
+        )
     return None
 
 

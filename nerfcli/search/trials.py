@@ -127,7 +127,9 @@ class Trials:
         seen, numbers = _split(photos, room)
         self._pool = PixelPool(seen, extent.training_from_scene, device, colours=colours, room=room)
         if len(numbers) == 0:
-            raise UserError("no pixel is left to judge components by", "take the masks out, or choose --model default")
+            raise UserError(
+                "no training pixels are left to compare components on", "remove the masks, or use --model default"
+            )
         self._judged = self._pool.rays_of(torch.from_numpy(numbers).to(device))
         self._photos = self._pool.photo_of(self._judged.numbers).cpu().numpy()
         self._counts = np.bincount(self._photos, minlength=len(photos)) * 3

@@ -125,7 +125,7 @@ def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]
         UserError: another version wrote it, or it was begun with another contraction than is asked for.
     """
     if description.get("format") != STATE_FORMAT:
-        raise UserError(f"{run / STATE} was written by another version", "train again with --overwrite")
+        raise UserError(f"{run / STATE} was written by another version of nerfcli", "train again with --overwrite")
     extent = Extent.from_json(description["extent"])
     if settings.contraction not in (None, extent.contraction):
         raise UserError(
@@ -148,7 +148,7 @@ def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description
         )
     if missing := [name for name in fitting.parts.state_dict() if f"parts.{name}" not in tensors]:
         raise UserError(
-            f"{run} was trained without what --with asks for now ({missing[0]})",
+            f"{run} was trained without a component that --with now enables ({missing[0]})",
             "train into a new folder with -o, or again with --overwrite",
         )
     refuse_non_finite(that_must_be_finite(tensors), run / STATE)

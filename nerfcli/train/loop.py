@@ -103,7 +103,7 @@ def train(
             raise
         checkpoints.write()
     if fitting.rollbacks:
-        notify(f"numbers became non-finite {fitting.rollbacks} times; the states before are in {run}/failure-*")
+        notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
     measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
 
 

@@ -1,6 +1,6 @@
-"""What a training starts from: photos and their rays, the extent of the field, and the components the scene needs.
+"""Prepare a training: load photos and rays, choose the extent of the field, and select components.
 
-Of held-out photos nothing is read here but the sizes that their cameras have.
+Nothing of held-out photos is read here except the image sizes of their cameras.
 """
 
 import time
@@ -47,7 +47,7 @@ MATCHING_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Begun:
-    """What an interrupted training had decided on."""
+    """Decisions of an interrupted training."""
 
     extent: Extent
     components: Components
@@ -55,7 +55,7 @@ class Begun:
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a training goes over, and what was decided for it.
+    """The data of a training, and the decisions made for it.
 
     Args:
         settings: with the components that are taken.
@@ -83,7 +83,7 @@ class Prepared:
     points: PointRays | None
 
     def fitting(self) -> Fitting:
-        """A training at its first step."""
+        """Return the training at its first step."""
         return Fitting(
             self.pool,
             self.extent.marching,
@@ -105,7 +105,7 @@ def prepare(
     begun: Begun | None,
     notify: Callable[[str], None],
 ) -> Prepared:
-    """Read the training photos and decide what is to be decided.
+    """Load the training photos and choose extent, components and initial exposures.
 
     Args:
         scene: photos, cameras and split.
@@ -119,7 +119,10 @@ def prepare(
         UserError: too little memory, no training photo, unreadable photos.
     """
     if not scene.train_frames:
-        raise UserError(f"{scene.root} has no training photo", "every 8th photo is held out; at least 2 are needed")
+        raise UserError(
+            f"{scene.root} has no training photo",
+            "every 8th photo is held out, so at least 2 are needed; check --holdout",
+        )
     first = scene.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)
     needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
@@ -135,17 +138,17 @@ def prepare(
         if lacks_depth(scene, settings, fills_frame=album.fills_frame):
             frames = [photo.frame for photo in album.photos]
             located = replace(scene, points=triangulate(frames, shared.of_matches).known)
-            notify(f"the scene came without points; {len(located.points)} found in its photos tell how far it reaches")
+            notify(f"the scene has no 3D points; estimating its extent from {len(located.points)} triangulated ones")
         extent = choose_extent(located, settings, fills_frame=album.fills_frame)
     device = torch.device(settings.device)
     pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, room=room)
     camera = album.photos[0].frame.camera
     notify(
-        f"{len(album.photos)} photos to train on, {len(scene.test_frames)} held out, "
+        f"{len(album.photos)} training photos, {len(scene.test_frames)} held out, "
         f"{camera.width}x{camera.height} (1/{factor}), {extent}, {settings.device}, {settings.threads} threads"
     )
     if pool.without_ray:
-        notify(f"{pool.without_ray} pixels are left out: their lens model has no direction for them")
+        notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
     selection, known, log_focal = None, None, 0.0
     if begun is not None:
         settings = replace(settings, components=begun.components)
@@ -170,10 +173,10 @@ def prepare(
         known = known or point_depths(shared.tracks, pool, extent.training_from_scene)
         if len(known.numbers) == 0:
             raise UserError(
-                f"--with points: no photos of {scene.root} agree on where a point is",
-                "use a scene of nerfcli poses or a COLMAP model, or leave it out",
+                f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
+                "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
             )
-        notify(f"{len(known.numbers)} pixels see a point whose distance is known")
+        notify(f"points: {len(known.numbers)} pixels see a 3D point at a known distance")
         points = PointRays(known, pool)
     return Prepared(settings, factor, room, extent, pool, selection, reference, gains, log_focal, points)
 
@@ -188,7 +191,7 @@ def _facts(
     shared: Shared,
     notify: Callable[[str], None],
 ) -> tuple[Facts, PointDepths | None]:
-    """What is known before anything is learned, and the pixels whose distance is known, where these may be asked."""
+    """Collect facts about the scene before training, and the pixels at known distances if they may be used."""
     lacks_points = album.fills_frame and len(scene.points) == 0
     budget = settings.budget_seconds
     has_time = is_worth_a_search(budget, settings.steps) and (
@@ -198,7 +201,7 @@ def _facts(
         settings.field,
         has_alpha=album.colours.shape[-1] == 4,
         has_exif=bool(np.ptp(_exif(scene)) > 0.0),
-        cameras_known=_known(scene) or (None if has_time else "there is no time to compare photos"),
+        cameras_known=_known(scene) or (None if has_time else "the budget is too short to match photos"),
         cameras=_camera_check(album, shared, notify=notify) if lacks_points and has_time else None,
         fixed=settings.fixed,
     )
@@ -214,11 +217,11 @@ def _facts(
 
 
 def _camera_check(album: Album, shared: Shared, *, notify: Callable[[str], None]) -> CameraCheck | None:
-    """Check the cameras against matched features; a check that cannot be computed says nothing and ends no training."""
+    """Check the cameras against matched features; None, with a note, if the check cannot be computed."""
     try:
         return check_cameras(album.photos, shared.matched)
     except Exception as error:
-        notify(f"the cameras could not be checked against matched features: {reason_of(error)}")
+        notify(f"could not check the cameras against matched features: {reason_of(error)}")
         return None
 
 
@@ -234,10 +237,10 @@ def _search(
     began: float,
     notify: Callable[[str], None],
 ) -> Selection:
-    """Let the scene decide on the components, and tell how it did."""
+    """Select components for the scene and report each decision."""
     budget, steps = settings.budget_seconds, settings.steps
     if not is_worth_a_search(budget, steps):
-        notify("the training is too short to try components; those are taken that need no trial")
+        notify("the budget is too short for trials; only components that need no trial are selected")
         components, decisions = with_points(settings.components, facts)
         for decision in decisions:
             notify(decision.in_words())
@@ -254,7 +257,7 @@ def _search(
         room=room,
     )
     took = time.perf_counter() - began
-    notify(f"asks the scene which components it needs, for up to {SEARCH_SHARE:.0%} of the budget")
+    notify(f"selecting components, for up to {100 * SEARCH_SHARE:.0f} % of the budget")
     selection = select(
         trials,
         asked,
@@ -263,7 +266,7 @@ def _search(
         steps=None if steps is None else round(SEARCH_SHARE * steps),
     )
     if not selection.decisions:
-        notify("the budget is too small to try components; the default ones are taken")
+        notify("the budget is too short for trials; using the default components")
     selection = replace(
         selection,
         decisions=(*measured, *selection.decisions),
@@ -276,22 +279,22 @@ def _search(
 
 
 def _exif(scene: Scene) -> np.ndarray:
-    """(photos,) logarithms of the exposures that EXIF tells, relative to their mean."""
+    """Return the (photos,) logarithms of EXIF exposures relative to their mean."""
     return relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
 
 
 def _known(scene: Scene) -> str | None:
-    """Why nobody has to doubt the cameras; None where one may."""
+    """Return why the cameras can be trusted; None if they may be wrong."""
     if scene.kind == "blender":
-        return "the pictures were rendered with these cameras"
-    return "structure from motion has fitted cameras to points" if len(scene.points) else None
+        return "these cameras are exact: the pictures were rendered with them"
+    return "structure from motion has already optimized the cameras" if len(scene.points) else None
 
 
 def _exposures(scene: Scene, components: Components, *, notify: Callable[[str], None]) -> tuple[float | None, Tensor]:
-    """The mean exposure of the training photos, and the (photos, 3) logarithms of theirs relative to it."""
+    """Return the mean exposure of the training photos, and the (photos, 3) logarithms relative to it."""
     frames = scene.train_frames
     reference = None if components.exposure == "none" else mean_log_exposure(frames)
     if reference is not None:
-        notify(f"EXIF tells the exposure of {np.isfinite(log_exposures(frames)).sum()} of {len(frames)} photos")
+        notify(f"EXIF gives the exposure of {np.isfinite(log_exposures(frames)).sum()} of {len(frames)} photos")
     gains = torch.from_numpy(relative_log_exposures(frames, reference))
     return reference, gains[:, None].expand(-1, 3)

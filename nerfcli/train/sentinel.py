@@ -96,13 +96,13 @@ class Sentinel:
         if bad is None:
             assert result is not None
             reason = (
-                "a fault of memory or of an overclocked processor, if it comes back"
+                "if this happens again, suspect faulty memory or an overclocked processor"
                 if deterministic
-                else "sums on this device are added up in any order, and no two runs are the same"
+                else "this device does not repeat results exactly"
             )
             self._notify(
-                f"numbers were not finite at step {fitting.step}, but are when the step is repeated; training goes on "
-                f"({reason})"
+                f"numbers were not finite at step {fitting.step}, but are finite when the step is repeated; training "
+                f"continues ({reason})"
             )
             return result
         fitting.restore(*_copied(*before))
@@ -113,15 +113,15 @@ class Sentinel:
         self._go_back()
         if fitting.rollbacks == MOST_ROLLBACKS:
             raise UserError(
-                f"{told}, {MOST_ROLLBACKS} times smaller steps notwithstanding",
-                f"the last checkpoint is kept; {path} has the state before it (nerfcli info repeats the step); "
-                "try another --seed",
+                f"{told}, despite {MOST_ROLLBACKS} retries with smaller steps",
+                f"the last checkpoint is kept; {path} has the state before the failure (nerfcli info repeats the "
+                "step); try another --seed",
                 NON_FINITE,
             )
         fitting.smaller_steps()
         self._notify(
-            f"{told}; back to step {fitting.step} with {fitting.rate_factor:g} of the learning rate "
-            f"({fitting.rollbacks} of {MOST_ROLLBACKS} times); {path} has the state before it"
+            f"{told}; continuing from step {fitting.step} with {fitting.rate_factor:g} of the learning rate ("
+            f"{fitting.rollbacks} of {MOST_ROLLBACKS} retries); {path} has the state before the failure"
         )
         self._description = fitting.state()[1]  # a later failure goes back to these smaller steps
         first, self._shares = self._shares[0], []
@@ -144,8 +144,8 @@ class Sentinel:
         told = f"{bad.name} is not finite at step {fitting.step + 1}: {bad.count} of {bad.total} numbers"
         if pixels:
             name, x, y = pixels[0]
-            more = f" and {len(bad.rays) - 1} pixels more" if len(bad.rays) > 1 else ""
-            told += f", seen from {name} at pixel ({x}, {y}){more}"
+            more = f" and {len(bad.rays) - 1} more pixels" if len(bad.rays) > 1 else ""
+            told += f", in {name} at pixel ({x}, {y}){more}"
         path = self._run / f"failure-{fitting.step + 1}.safetensors"
         content = {
             "format": FAILURE_FORMAT,
@@ -197,7 +197,10 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
     """
     tensors, description = load_tensors(path, "cpu")
     if description.get("format") != FAILURE_FORMAT:
-        raise UserError(f"{path} holds {description.get('format')!r}", "give a failure-STEP.safetensors of a run")
+        raise UserError(
+            f"{path} is not a saved failure but {description.get('format')!r}",
+            "give a failure-STEP.safetensors file of a run",
+        )
     settings = replace(TrainSettings.from_json(description["settings"]), device="cpu")
     torch.set_num_threads(settings.threads)
     size = settings_from_json(description["state"]["field"])

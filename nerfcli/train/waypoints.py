@@ -68,15 +68,15 @@ def measure_waypoints(
                 room=prepared.room,
             )
         except UserError as error:
-            notify(f"the training is complete, but its held-out photos cannot be compared with: {error}")
+            notify(f"training is complete, but PSNR on held-out photos could not be measured: {error}")
             return
         measured = {}
         for step in steps:
             model = load_model(_path(run, step), device)
             measured[step] = pixels.psnr(model, log_gains=log_gains_of(held_out, model))
         add_to_log(run, {step: {"heldout_psnr": psnr} for step, psnr in measured.items()})
-        told = ", ".join(f"{psnr:.2f} at step {step}" for step, psnr in measured.items())
-        notify(f"PSNR of some held-out pixels, in dB: {told}")
+        curve = ", ".join(f"{psnr:.2f} dB at step {step}" for step, psnr in measured.items())
+        notify(f"PSNR on a sample of held-out pixels: {curve}")
     forget_waypoints(run)
 
 

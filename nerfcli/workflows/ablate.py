@@ -24,7 +24,7 @@ from nerfcli.workflows.evaluate import evaluate_run
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.train import train_scene, was_interrupted
 
-_SAME = "; the same pixels for all models of a seed, others for each seed"
+_SAME = "; the same pixels for all variants of a seed, other pixels for each seed"
 
 # Takes a run, its variant's name and its settings, and whether to measure anew.
 Measure = Callable[[Run, str, TrainSettings, bool], Measured]
@@ -68,7 +68,7 @@ def ablate_scene(
     """
     scene = scenes.load(path, holdout=holdout)
     if not scene.test_frames:
-        raise UserError(f"{path} has no held-out photo to measure on", "hold some out: --holdout every:8")
+        raise UserError(f"{path} has no held-out photos", "hold some out with --holdout every:8")
     refuse_foreign(folder)
     measure = _measured_whole if whole else _measured_pixels
 
@@ -96,7 +96,7 @@ def ablate_scene(
     rows = rows_of(measured, compared)
     write_results(folder, rows, measured, about)
     if settings.model == "auto":
-        progress(0.0, "asking the scene which components it needs")
+        progress(0.0, "selecting components for this scene")
         run = trained(AUTO, settings)
         compared.append(Variant(AUTO, settings.components))
         measured.append(measure(run, AUTO, settings, overwrite))

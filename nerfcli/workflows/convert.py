@@ -51,14 +51,14 @@ def convert_capture(
     form, found, capture = load(source, given, doubt)
     notify(f"{found}: {form.name}, {contents(capture)}")
     for text in rescaling_told(other_sizes(capture)):
-        notify(f"{text.removesuffix(': rescaled')}; {to} gets them as they are")
+        notify(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
     capture, new_from_old, scale = in_world_frame(capture, world)
     if scale is not None:
         error = "" if scale.standard_error is None else f" +- {scale.standard_error:.2g}"
         unit = "%" if scale.residual_unit == "percent" else "m"
         notify(
-            f"a unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; "
-            f"residual {scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
+            f"one scene unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; residual "
+            f"{scale.rms_residual:.2g} {unit}" + (f"; {scale.details}" if scale.details else "")
         )
     frame = {"new_from_old": new_from_old.to_json()} | ({} if scale is None else {"scale": scale.to_json()})
     wanted = replace(wanted, form=recording(wanted.form, {"source": str(found), **frame}))
@@ -68,7 +68,7 @@ def convert_capture(
     for loss in done.losses:
         warn(f"{to} cannot hold {loss}")
     if done.loss_px > wanted.tolerance_px:
-        warn(f"without the lost terms of lenses, pixels are off by up to {done.loss_px:.3g} px")
+        warn(f"dropping lens parameters shifts pixels by up to {done.loss_px:.3g} px")
     return Converted(done, _record(done, to) | frame)
 
 

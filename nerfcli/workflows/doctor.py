@@ -41,12 +41,12 @@ def examine_capture(
     subject = find_subject(path)
     calibration = None if intrinsics is None else read_calibration(intrinsics, images=path)
     if page.is_dir():
-        raise UserError(f"{page} is a folder", "give the page's file name with -o")
+        raise UserError(f"{page} is a folder", "give a file name for the page with -o")
     if not overwrite:
         refuse_foreign(page, path)
     home = next(folder for folder in page.absolute().parents if folder.exists())
     if not os.access(home, os.W_OK):  # before the work rather than after it
-        raise cannot_write(page, PermissionError(13, "no permission to write there"))
+        raise cannot_write(page, PermissionError(13, "no write permission"))
     count = len(subject.sources)
     notify(f"{path}: {count} photos, about {_time(estimated_seconds(count, threads))}")
     cv2.setNumThreads(1)  # photos and pairs are worked on in parallel; threads within them only wait for each other

@@ -90,14 +90,12 @@ def evaluate_run(
         metrics = _kept(trained.metrics_path, checkpoint, align_poses=align_poses, predictions=predictions)
         made_by = metrics["protocol"].split(":")[0]
         older = "" if made_by == PROTOCOL else f" (by {made_by})"
-        notify(f"{trained.metrics_path} is kept{older}; --overwrite measures again")
+        notify(f"{trained.metrics_path} is up to date and kept{older}; add --overwrite to evaluate again")
         return Evaluation(trained.metrics_path, metrics, is_kept=True)
 
     summary = trained.summary
     if summary is None:
-        raise UserError(
-            f"{trained.path} has no {LOG}, which tells the time of the training", "train again with --overwrite"
-        )
+        raise UserError(f"{trained.path} has no {LOG}, which records the training time", "train again with --overwrite")
     test = trained.cameras.test
     held_out = held_out_photos_of(trained.config, test, model, threads=cores)
     perceptual = find_perceptual(notify)
@@ -130,7 +128,7 @@ def check_requirements(run: Run, metrics: dict[str, Any], requirements: Sequence
     if failures:
         raise UserError(
             f"{run.path} does not meet --require {', '.join(failures)}",
-            "train longer (--budget, --resume), or find out with `nerfcli doctor` what the photos lack",
+            "train longer (--budget, --resume), or check the photos with nerfcli doctor",
             GATE_NOT_MET,
         )
 
@@ -164,9 +162,9 @@ def saved_predictions(
 
 def _kept(path: Path, checkpoint: str, *, align_poses: bool, predictions: str | None) -> dict[str, Any]:
     """The metrics that are there, if they are of this checkpoint and have all that is wanted."""
-    metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to measure again")
+    metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
     if metrics.get("checkpoint_sha256") != checkpoint:
-        raise UserError(f"{path} belongs to an earlier state of this run", "add --overwrite to replace it")
+        raise UserError(f"{path} belongs to an earlier checkpoint of this run", "add --overwrite to replace it")
     lacks = []
     if align_poses and "psnr_pose_aligned" not in metrics["mean"]:
         lacks.append("refined poses")
@@ -175,5 +173,5 @@ def _kept(path: Path, checkpoint: str, *, align_poses: bool, predictions: str | 
     ):
         lacks.append("saved predictions")
     if lacks:
-        raise UserError(f"{path} was made without {' and '.join(lacks)}", "add --overwrite to measure again")
+        raise UserError(f"{path} was written without {' and '.join(lacks)}", "add --overwrite to evaluate again")
     return metrics

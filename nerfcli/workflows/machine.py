@@ -23,9 +23,9 @@ def device_name(device: str) -> str:
     import torch
 
     if device not in ("auto", "cpu", "cuda"):
-        raise UserError(f"unknown device {device!r}", "choose --device auto, cpu or cuda", exit_code=2)
+        raise UserError(f"unknown device {device!r}", "use --device auto, cpu or cuda", exit_code=2)
     if device == "cuda" and not torch.cuda.is_available():
-        raise UserError("--device cuda: torch sees no CUDA device", "use --device cpu, or install torch with CUDA")
+        raise UserError("--device cuda: torch finds no CUDA device", "use --device cpu, or install torch with CUDA")
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return device

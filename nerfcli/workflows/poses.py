@@ -16,11 +16,11 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, war
 NAMES_SHOWN = 8
 _STAGES = {
     "read": "photos read",
-    "extract": "photos searched for features",
-    "enlarge": "photos searched for finer features",
-    "pair": "photos looked up",
+    "extract": "photos, extracting features",
+    "enlarge": "photos, extracting finer features",
+    "pair": "photos, finding similar ones",
     "match": "pairs compared",
-    "map": "photos placed",
+    "map": "photos registered",
     "check": "checks of the poses",
 }
 
@@ -63,9 +63,9 @@ def estimate_poses(
     folder, target = Path(photos), Path(scene)
     if (target / SCENE_FILE).exists() and not overwrite:
         if is_same_scene(target, folder, settings, given=intrinsics):
-            notify(f"{target} is kept: it was made from these photos; --overwrite makes it again")
+            notify(f"{target} is complete and kept: same photos and settings; add --overwrite to estimate poses again")
             return target
-        raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another place with -o")
+        raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another folder with -o")
     outlook: Outlook | None = None
 
     def planned(plan: Plan) -> None:
@@ -145,7 +145,7 @@ def folder_of_photos(
     """
     if not source.is_file():
         if frames is not None:
-            notify(f"{source} is no video: all of its photos are used, whatever --frames says")
+            notify(f"{source} is not a video: using all of its photos and ignoring --frames")
         return source
     folder = frames_folder(scene)
     extract_frames(source, folder, count=frames, overwrite=overwrite, notify=notify, progress=progress)
@@ -161,8 +161,8 @@ def folder_with_frames(source: Path, scene: Path) -> Path:
     folder = frames_folder(scene) if source.is_file() else source
     if source.is_file() and not folder.exists():
         raise UserError(
-            f"--dry-run: the frames of {source} are not in {folder} yet, and a dry run writes nothing",
-            "call it without --dry-run, or give a folder of photos",
+            f"--dry-run: the frames of {source} are not in {folder} yet, and a dry run does not extract them",
+            "run it without --dry-run, or give a folder of photos",
         )
     return folder
 

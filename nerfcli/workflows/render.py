@@ -88,10 +88,10 @@ def render_run(
     order = Order(tuple(frames), settings, provenance)
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
-        raise UserError(f"--frames: there are {len(frames)} views", "count from 0", exit_code=2)
+        raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)
     refuse_foreign(folder)
     if not overwrite and order.is_held_by(folder):
-        notify(f"{folder} is kept: it was rendered with these settings; --overwrite renders again")
+        notify(f"{folder} is complete and kept: same settings; add --overwrite to render again")
         return order.results(folder)
 
     total = sum(frames[index].camera.width * frames[index].camera.height for index in chosen)

@@ -54,7 +54,7 @@ def report_runs(
     """
     target = page or (runs[0] / REPORT if len(runs) == 1 else runs[0].resolve().parent / REPORT)
     if target.is_dir():
-        raise UserError(f"{target} is a folder", "give the page's file name with -o")
+        raise UserError(f"{target} is a folder", "give a file name for the page with -o")
     if not overwrite:
         refuse_foreign(target, mark_of(runs), about="report")
     torch.set_num_threads(thread_count(threads))
@@ -66,7 +66,7 @@ def report_runs(
         facts.append(read_facts(run, label, checkpoint_sha256=hashes[-1]))
     origin = origin_of(facts, hashes, views=views, depth=depth)
     if keep and not overwrite and is_made_from(target, origin):
-        notify(f"{target} is kept: it was made from these numbers; --overwrite makes it again")
+        notify(f"{target} is up to date and kept; add --overwrite to write it again")
         return target
     names = common_names(facts, views)
     looks, meanings = [], []
@@ -79,8 +79,8 @@ def report_runs(
         model = run.model(device_name(device))
         if model.sha256 != hashes[index]:
             raise UserError(
-                f"{run.field_path} was replaced while the report was made",
-                "give the command again when the training is over",
+                f"{run.field_path} was replaced while the report was written",
+                "run the command again when the training is complete",
             )
         frames = [frame for frame in run.cameras.test if frame.name in names]
         held_out = held_out_photos_of(run.config, frames, model, threads=thread_count(threads))

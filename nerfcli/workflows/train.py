@@ -64,19 +64,19 @@ def train_scene(
     if loaded.missing:
         listed = ", ".join(loaded.missing[:NAMES_SHOWN])
         more = f" and {len(loaded.missing) - NAMES_SHOWN} more" if len(loaded.missing) > NAMES_SHOWN else ""
-        warn(f"{len(loaded.missing)} photos of {folder} are not there and are left out: {listed}{more}")
+        warn(f"{len(loaded.missing)} photos of {folder} are missing and skipped: {listed}{more}")
     for text in rescaling_told(loaded.rescaled):
         notify(text)
 
     def is_kept() -> bool:
         if not _keeps(run, loaded, settings, resume=resume, overwrite=overwrite):
             return False
-        notify(f"{run} is kept: it was trained with these settings; --overwrite trains again")
+        notify(f"{run} is complete and kept: same settings; add --overwrite to train again")
         return True
 
     if is_kept():
         return Run(run)
-    with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
+    with exclusive(run / LOCK, f"nerfcli train is working on {run}"):
         if is_kept():  # by one that has just ended
             return Run(run)
         clear_leftovers(run)
@@ -123,14 +123,12 @@ def train_other_seeds(
     first = replace(config.settings, device=device, threads=threads)
     if not folder.exists():
         raise UserError(
-            f"the scene of {run.path} should be in {folder}, which is not there",
-            "call it from the folder that the run was trained from, or train again",
+            f"the scene of {run.path} is missing: {folder}",
+            "run the command from the folder in which the run was trained, or train again",
         )
     loaded = scenes.load(folder, holdout=config.holdout)
     if scenes.fingerprint(loaded) != config.scene_fingerprint:
-        raise UserError(
-            f"{folder} is not the scene any more that {run.path} was trained on", "train again with --overwrite"
-        )
+        raise UserError(f"{folder} has changed since {run.path} was trained on it", "train again with --overwrite")
     others = []
     for seed in range(first.seed + 1, first.seed + 1 + count):
         settings, other = replace(first, seed=seed), run.path / "seeds" / str(seed)
@@ -158,24 +156,26 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
     """
     run = Run(path)
     if resume and not run.is_trained and not (path / STATE).exists():
-        raise UserError(f"nothing to resume in {path}", "leave --resume out to start, or give the run with -o")
+        raise UserError(
+            f"there is nothing to resume in {path}", "remove --resume to start a new training, or give the run with -o"
+        )
     if resume and run.config.split_sha256 != split_hash(scene.test_names):
         before = run.config.holdout
         raise UserError(
-            f"{path} was trained with other photos held out ({before or 'as the scene says'})",
-            f"give --holdout {before}" if before else "leave --holdout out, or choose another place with -o",
+            f"{path} was trained with other held-out photos ({before or 'the split of the scene'})",
+            f"give --holdout {before}" if before else "remove --holdout, or choose another folder with -o",
         )
     if resume and run.config.scene_fingerprint != scenes.fingerprint(scene):
-        raise UserError(f"{path} was trained on another scene than {scene.root}", "choose another place with -o")
+        raise UserError(f"{path} was trained on a different scene than {scene.root}", "choose another folder with -o")
     if run.is_trained and not resume and not overwrite:
         if run.is_trained_from(scene, settings) and run.is_complete(settings):
             return True
         raise UserError(
-            f"{path} exists", "add --resume to go on, --overwrite to replace it, or choose another place with -o"
+            f"{path} exists", "add --resume to continue, --overwrite to replace it, or choose another folder with -o"
         )
     others = path.is_dir() and not (path / CONFIG).exists() and any(entry.name != LOCK for entry in path.iterdir())
     if path.is_file() or others:
-        raise UserError(f"{path} is not a run, but something else", "choose another place with -o")
+        raise UserError(f"{path} exists and is not a run folder", "choose another folder with -o")
     return False
 
 
@@ -201,5 +201,5 @@ def _fit(
     except KeyboardInterrupt:
         if (run / STATE).exists():
             paths = f"{shlex.quote(str(scene.root))} -o {shlex.quote(str(run))}"
-            notify(f"checkpoint saved; go on with: nerfcli train {paths} --resume")
+            notify(f"checkpoint saved; continue with: nerfcli train {paths} --resume")
         raise

@@ -110,9 +110,15 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     """
     cameras, through = views.cameras, views.through
     if through is not None and cameras not in PATHS:
-        raise UserError(f"--through does not fit --cameras {cameras}", f"it is for {', '.join(PATHS)}", exit_code=2)
+        raise UserError(
+            f"--through cannot be used with --cameras {cameras}", f"it works with {', '.join(PATHS)}", exit_code=2
+        )
     if views.nerfstudio_frame is not None and cameras in ("test", "train", *PATHS):
-        raise UserError(f"--nerfstudio-frame does not fit --cameras {cameras}", "it is for a file", exit_code=2)
+        raise UserError(
+            f"--nerfstudio-frame cannot be used with --cameras {cameras}",
+            "it works with a file of cameras",
+            exit_code=2,
+        )
     sets, factor = run.cameras, run.config.downscale
     known = sets.train
     if through is not None:
@@ -120,7 +126,7 @@ def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
     if cameras in ("test", "train"):
         chosen = sets.test if cameras == "test" else sets.train
         if not chosen:
-            raise UserError(f"{run.path} has no {cameras} cameras", f"choose --cameras train, {', '.join(PATHS)}")
+            raise UserError(f"{run.path} has no {cameras} cameras", f"use --cameras train, {', '.join(PATHS)}")
     elif cameras == "interpolate":
         chosen = paths.interpolate(known, count=views.count)
     elif cameras in PATHS:
@@ -145,12 +151,13 @@ def refuse_z_all_around(frames: Sequence[Frame], *, notify: Notify) -> None:
     """
     if any(frame.camera.is_spherical for frame in frames):
         raise UserError(
-            "--depth-axis z of an equirectangular picture: half of its directions are behind the camera",
-            "add --depth-axis ray: the distance along each ray",
+            "--depth-axis z cannot be used for equirectangular pictures: half of their directions are behind the "
+            "camera",
+            "use --depth-axis ray, the distance along each ray",
             exit_code=2,
         )
     if any(max(camera.fov_deg) > BEHIND_FROM_DEG for camera in {frame.camera for frame in frames}):
-        notify("pixels that look 90 degrees aside or behind have no z (NaN); --depth-axis ray has them")
+        notify("pixels 90 degrees or more off the optical axis have no z (NaN); use --depth-axis ray for them")
 
 
 def file_fps(cameras: str) -> float | None:
@@ -172,9 +179,9 @@ def write_frames(
     capture = Capture(views, np.zeros((0, 3)), (), None, "camera-path")
     listed, path = target / "cameras.json", target / "camera_path.json"
     if there := [file for file in (listed, path) if file.exists() and not overwrite]:
-        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another place with -o")
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another folder with -o")
     for loss in losses_camera_path(capture):
-        warn(f"{path.name} cannot hold {loss}; {listed.name} does")
+        warn(f"{path.name} cannot hold {loss}; use {listed.name} instead")
     try:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -187,8 +194,8 @@ def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
     """The cameras of a scene, fitted to its photos, or of any file or folder that `nerfcli convert` reads."""
     if not path.exists():
         raise UserError(
-            f"no cameras called {path}",
-            f"choose test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads",
+            f"no cameras found at {path}",
+            f"give test, train, {', '.join(PATHS)}, or a file or folder of cameras that nerfcli convert reads",
         )
     form, found = recognise(path)
     assert form.parse is not None

@@ -101,20 +101,20 @@ def parse_npz(path: Path) -> Capture:
     arrays = _Arrays(path)
     version = arrays.numbers("version", (), integer=True)
     if int(version) != ARCHIVE_VERSION:
-        raise UserError(f"{path}: version {int(version)} is not known, only {ARCHIVE_VERSION}", "update nerfcli")
+        raise UserError(f"{path}: unknown version {int(version)}, expected {ARCHIVE_VERSION}", "update nerfcli")
     names = arrays.texts("names")
     count = len(names)
     if not count or not all(names) or len(set(names)) < count:
-        raise arrays.damaged("names", "no frame, a frame without a name, or two of the same name")
+        raise arrays.damaged("names", "no frames, a frame without a name, or two frames with the same name")
     cameras = _cameras(arrays)
     camera_index = arrays.numbers("camera_index", (count,), integer=True)
     if ((camera_index < 0) | (camera_index >= len(cameras))).any():
-        raise arrays.damaged("camera_index", f"a camera that is not one of the {len(cameras)}")
+        raise arrays.damaged("camera_index", f"a camera index outside the list of {len(cameras)}")
     matrices = arrays.numbers("world_from_cam", (count, 4, 4))
     poses = rigid_poses(matrices, lambda index: f"{path}: world_from_cam[{index}]")
     splits, images, masks = (arrays.texts(name, count) for name in ("splits", "images", "masks"))
     if not set(splits) <= set(_SPLITS):
-        raise arrays.damaged("splits", "another word than train, val and test")
+        raise arrays.damaged("splits", "a value other than train, val and test")
     frames = tuple(
         Frame(
             name,
@@ -162,7 +162,7 @@ class _Arrays:
             *(OSError, EOFError, ValueError, KeyError, IndexError, OverflowError, NotImplementedError, RuntimeError),
             *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
         ) as error:
-            raise UserError(f"{path}: no readable .npz file ({type(error).__name__}: {error})", _HINT) from error
+            raise UserError(f"{path} is not a readable .npz file ({type(error).__name__}: {error})", _HINT) from error
 
     def __contains__(self, name: str) -> bool:
         return name in self._bytes
@@ -193,7 +193,7 @@ class _Arrays:
             texts = array.tolist()
             "".join(texts).encode("utf-8")
         except (ValueError, SystemError) as error:  # NumPy raises the second where a character is beyond Unicode's
-            raise self.damaged(name, "characters that are none") from error
+            raise self.damaged(name, "invalid characters") from error
         return texts
 
     def text(self, name: str) -> str:
@@ -204,12 +204,12 @@ class _Arrays:
         try:
             return str(array.item())
         except (ValueError, SystemError) as error:
-            raise self.damaged(name, "characters that are none") from error
+            raise self.damaged(name, "invalid characters") from error
 
     def _array(self, name: str) -> np.ndarray:
         if name not in self._bytes:
             raise UserError(
-                f"{self.path}: {name} is missing", "expected the .npz file of a capture, see nerfcli convert"
+                f"{self.path}: {name} is missing", "expected the .npz file of a capture, as written by nerfcli convert"
             )
         try:
             return array_from_npy(self._bytes[name])
@@ -265,9 +265,9 @@ def _observations(arrays: _Arrays, num_frames: int, *, num_points: int) -> Obser
     if not plausible(pixels).all():
         raise arrays.damaged("observation_pixels", "a position that is not finite or too large")
     if ((frame_index < 0) | (frame_index >= num_frames)).any():
-        raise arrays.damaged("observation_frames", f"a frame that is not one of the {num_frames}")
+        raise arrays.damaged("observation_frames", f"a frame index outside the list of {num_frames}")
     if ((point_index < -1) | (point_index >= num_points)).any():
-        raise arrays.damaged("observation_points", f"a point that is not one of the {num_points}")
+        raise arrays.damaged("observation_points", f"a point index outside the list of {num_points}")
     return Observations(frame_index, point_index, pixels)
 
 

@@ -105,11 +105,16 @@ def write_blender(capture: Capture, folder: Path) -> None:
     """
     spherical = [frame.name for frame in capture.frames if frame.camera.is_spherical]
     if spherical:
-        raise UserError(f"the spherical picture {spherical[0]} has no field of view", "write transforms.json instead")
+        raise UserError(
+            f"the spherical picture {spherical[0]} has no field of view, which this format requires",
+            "write transforms.json instead",
+        )
     by_split = _by_split(capture)
     stale = [_file(folder, split) for split in SPLITS if split not in by_split and _file(folder, split).exists()]
     if stale:
-        raise UserError(f"{stale[0]} is there already, of another capture", "remove it or choose another folder")
+        raise UserError(
+            f"{stale[0]} already exists and belongs to another capture", "remove it or choose another folder"
+        )
     with ExitStack() as undo:
         for split, frames in by_split.items():
             path = _file(folder, split)

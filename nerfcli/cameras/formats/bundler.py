@@ -82,7 +82,7 @@ def _lines(path: Path) -> list[Numbered]:
     if not text.startswith("# Bundle file"):
         raise malformed(str(path), "does not begin with # Bundle file", _EXPECTED)
     if not text.startswith(_HEADER):
-        raise malformed(f"{path}: line 1", "is of another version of the format", _EXPECTED)
+        raise malformed(f"{path}: line 1", "is of an unsupported version of the format", _EXPECTED)
     return filled_lines(text)
 
 
@@ -115,7 +115,7 @@ def _find_list(path: Path) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise malformed(str(path), f"there is no list of images beside it ({candidates[1]})", _LIST_EXPECTED)
+    raise malformed(str(path), f"the list of images next to it is missing ({candidates[1]})", _LIST_EXPECTED)
 
 
 def _list_lines(path: Path) -> list[Numbered]:
@@ -169,7 +169,7 @@ def _points(
     known = (table[:, 0] >= 0) & (table[:, 0] < num_cameras) & (table[:, 0] == np.floor(table[:, 0]))
     if not known.all():
         where = _line(lines, 3 * owners[int(np.argmin(known))] + 2, 0, path)[2]
-        raise malformed(where, "a view has a camera that is not there", f"expected 0 to {num_cameras - 1}")
+        raise malformed(where, "a view refers to a camera that does not exist", f"expected 0 to {num_cameras - 1}")
     return points, np.clip(np.rint(colours), 0, 255).astype(np.uint8), table
 
 

@@ -123,7 +123,7 @@ def write_camera_path(capture: Capture, path: Path, *, fps: float = _DEFAULT_FPS
         UserError: there is no view, or the place cannot be written.
     """
     if not capture.frames:
-        raise UserError(f"there is no view to write to {path}", "a camera path needs one at least")
+        raise UserError(f"there are no views to write to {path}", "a camera path needs at least one view")
     cameras = _common_cameras(capture.frames)
     width, height = _size(cameras[0])
     records = []
@@ -189,8 +189,8 @@ def _pose(record: dict[str, Any], where: str) -> np.ndarray:
     matrix = _matrix(values, 4, where)
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise UserError(
-            f"{where}: its last row is {', '.join(f'{v:.4g}' for v in matrix[3])}",
-            "expected 0, 0, 0, 1: the numbers go row by row, and the position is in the last column",
+            f"{where}: the last row is {', '.join(f'{v:.4g}' for v in matrix[3])}",
+            "expected 0, 0, 0, 1: the matrix is stored row by row, with the position in the last column",
         )
     return opencv_from_opengl_pose(rigid_pose(matrix, where))
 
@@ -213,7 +213,7 @@ def _number(record: dict[str, Any], key: str, where: str) -> float:
 def _pixels(content: dict[str, Any], key: str, path: Path) -> int:
     value = _number(content, key, str(path))
     if not 1 <= value <= _MOST_PIXELS or value != int(value):
-        raise UserError(f"{path}: {key} is {value:g}", f"expected whole pixels from 1 to {_MOST_PIXELS}")
+        raise UserError(f"{path}: {key} is {value:g}", f"expected an integer from 1 to {_MOST_PIXELS}")
     return int(value)
 
 

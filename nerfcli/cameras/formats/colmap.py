@@ -58,9 +58,9 @@ def colmap_on_disk(model: ColmapModel, image_dir: Path, measure: Measure, model_
         frames.append(Frame(image.name, camera, world_from_cam, image=path))
     if not frames:
         raise UserError(
-            f"none of the {len(missing)} images of the model {model_dir} is in {image_dir}"
+            f"none of the {len(missing)} images of the model {model_dir} exists in {image_dir}"
             + (f", such as {missing[0]}" if missing else ""),
-            "put the photos there, under the names that the model lists",
+            "put the photos there, with the names listed in the model",
         )
     return Capture(
         tuple(frames), model.points, tuple(missing), None, "colmap", pixels="upright", rescaled=counted(rescaled)
@@ -86,7 +86,7 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
     except ValueError as error:
         raise UserError(
             f"{_file(model_dir, 'images')} and {_file(model_dir, 'points3D').name} do not belong together: {error}",
-            "the files of the model are from different reconstructions; copy all of them again",
+            "the files come from different reconstructions; copy all of them again",
         ) from error
 
 
@@ -106,13 +106,14 @@ def read_model(model_dir: Path) -> ColmapModel:
         images = _parse(images_file, colmap_text.images_from_text)
         point_ids, points, colours = _parse(points_file, colmap_text.points_from_text)
     if not images:
-        raise UserError(f"{model_dir} has no registered image", "the reconstruction is empty; make it again")
+        raise UserError(f"{model_dir} has no registered images", "the reconstruction is empty; run it again")
     for image in images:
         _check_camera(image, cameras, images_file)
     twice, count = Counter(image.name for image in images).most_common(1)[0]
     if count > 1:
         raise UserError(
-            f"{model_dir}: image {twice} is registered twice", "an image has one pose; make the model again"
+            f"{model_dir}: image {twice} is registered twice",
+            "each image must have one pose; reconstruct the model again",
         )
     return ColmapModel(cameras, tuple(sorted(images, key=lambda image: image.name)), points, point_ids, colours)
 
@@ -138,8 +139,8 @@ def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
 def _check_camera(image: ColmapImage, cameras: Mapping[int, Camera], images_file: Path) -> None:
     if image.camera_id not in cameras:
         raise UserError(
-            f"{images_file}: image {image.name} has camera {image.camera_id}, which is not there",
-            "the files of the model are from different reconstructions; copy all of them again",
+            f"{images_file}: image {image.name} refers to camera {image.camera_id}, which does not exist",
+            "the files come from different reconstructions; copy all of them again",
         )
 
 
@@ -160,7 +161,7 @@ def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
         return reader(data)
     except (struct.error, ValueError, IndexError, KeyError) as error:
         raise UserError(
-            f"{path} is damaged: {error}", "the file is cut off or was changed; copy or make the model again"
+            f"{path} is damaged: {error}", "the file is truncated or was changed; copy or reconstruct the model again"
         ) from error
     except UserError as error:
         raise UserError(f"{path}: {error.message}", error.hint) from error

@@ -78,7 +78,9 @@ def images_of_parts(
     wrong = ~plausible(cam_from_world)
     if wrong.any():
         values = ", ".join(f"{value:g}" for value in cam_from_world[np.argmax(wrong)])
-        raise ValueError(f"the pose of image {names[np.argmax(wrong)]} is not 7 finite numbers of a scene: {values}")
+        raise ValueError(
+            f"the pose of image {names[np.argmax(wrong)]} is not 7 finite numbers in a plausible range: {values}"
+        )
     zero = ~cam_from_world[:, :4].any(axis=1)
     if zero.any():
         raise ValueError(f"a quaternion of length 0 in the pose of image {names[np.argmax(zero)]}")
@@ -89,7 +91,7 @@ def images_of_parts(
         image_ids, names, camera_ids, poses, features, strict=True
     ):
         if not name or not plausible(pixels.reshape(1, -1)).all():
-            raise ValueError(f"image {image_id} ({name!r}) has no name, or a feature that is nowhere")
+            raise ValueError(f"image {image_id} ({name!r}) has no name, or a feature with invalid coordinates")
         images.append(ColmapImage(image_id, name, camera_id, pose, pixels, point_ids))
     return images
 
@@ -203,5 +205,5 @@ def _point_index(ids: np.ndarray, known: np.ndarray) -> np.ndarray:
     place = np.minimum(np.searchsorted(ordered, ids), len(ordered) - 1)
     found = ordered[place] == ids
     if not (found | (ids == NO_POINT)).all():
-        raise ValueError(f"a feature has the point {ids[~found & (ids != NO_POINT)][0]}, which is not there")
+        raise ValueError(f"a feature refers to point {ids[~found & (ids != NO_POINT)][0]}, which does not exist")
     return np.where(found, order[place], -1).astype(np.int64)

@@ -123,7 +123,7 @@ def _filled(lines: list[str]) -> list[str]:
 
 def _ids(values: np.ndarray, what: str) -> np.ndarray:
     if not ((np.abs(values) < _MOST_ID) & (values == np.trunc(values)) & (values >= -1)).all():  # False at NaN
-        raise ValueError(f"{what} has an id that is no whole number")
+        raise ValueError(f"{what} has an id that is not an integer")
     return values.astype(np.int64)
 
 

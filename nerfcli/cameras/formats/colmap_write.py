@@ -27,7 +27,7 @@ def losses_colmap(capture: Capture) -> tuple[str, ...]:
 def losses_colmap_text(capture: Capture) -> tuple[str, ...]:
     """What of a capture a COLMAP model as text cannot hold: COLMAP cuts names at their first space on reading."""
     spaced = sum(" " in frame.name for frame in capture.frames)
-    names = [f"{spaced} names with spaces (COLMAP reads them up to the first space)"] if spaced else []
+    names = [f"{spaced} names with spaces (COLMAP truncates them at the first space)"] if spaced else []
     return (*losses_colmap(capture), *names)
 
 
@@ -80,8 +80,8 @@ def _write(capture: Capture, path: Path, files: dict[str, Callable[[ColmapModel]
     others = {item.name for item in path.iterdir()} - _MODEL_FILES if path.is_dir() else set()
     if others:
         raise UserError(
-            f"{path} holds other files than a COLMAP model, such as {min(others)}",
-            "give a folder of its own, such as sparse/0 in it",
+            f"{path} contains files other than a COLMAP model, such as {min(others)}",
+            "use a separate folder, such as sparse/0 in it",
         )
     model = model_of(capture)
     with atomic_folder(path) as partial:

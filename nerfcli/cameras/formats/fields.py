@@ -53,7 +53,7 @@ def read_json(path: Path, expected: str) -> Any:
         return json.loads(text)
     except json.JSONDecodeError as error:
         what = f"not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
-        raise malformed(str(path), what, "the file is cut off or was edited by hand; write it again") from error
+        raise malformed(str(path), what, "the file is truncated or was edited by hand; write it again") from error
     except (ValueError, RecursionError) as error:  # a number of thousands of digits; brackets in brackets in brackets
         raise malformed(str(path), f"not valid JSON: {error}", expected) from error
 
@@ -137,7 +137,7 @@ def size_of(width: float, height: float, where: str) -> tuple[int, int]:
     """
     if not all(1 <= side <= MOST_PIXELS and side == int(side) for side in (width, height)):
         what = f"width and height are {shown(width)} and {shown(height)}"
-        raise malformed(where, what, "expected the picture's size in whole pixels")
+        raise malformed(where, what, "expected the picture's size in pixels, as integers")
     return int(width), int(height)
 
 
@@ -164,7 +164,7 @@ def refuse_twins(names: Iterable[str], path: Path) -> None:
             raise malformed(str(path), f"image {shown(name)} is listed twice", "remove one of its two entries")
         seen.add(name)
     if not seen:
-        raise malformed(str(path), "lists no image with a pose", "the reconstruction is empty; make it again")
+        raise malformed(str(path), "lists no images with a pose", "the reconstruction is empty; run it again")
 
 
 def _is_number(value: Any) -> bool:
@@ -183,6 +183,6 @@ def _refuse_number(words: Iterable[str], where: str) -> NoReturn:
                 continue
             what = f"{shown(word)} is not finite" if not math.isfinite(float(word)) else f"{shown(word)} is too large"
         except ValueError:
-            what = f"{shown(word)} is no number"
-        raise malformed(where, what, "the file was changed or is cut off; write it again")
-    raise AssertionError("called for numbers that are all right")
+            what = f"{shown(word)} is not a number"
+        raise malformed(where, what, "the file was changed or truncated; write it again")
+    raise AssertionError("called for valid numbers")

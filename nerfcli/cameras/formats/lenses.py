@@ -91,6 +91,8 @@ def spherical_camera(size: tuple[int, int], where: str) -> Camera:
     """
     if abs(size[0] - 2 * size[1]) > 1:
         raise malformed(
-            where, f"a spherical picture of {size[0]}x{size[1]} pixels", "expected one twice as wide as it is high"
+            where,
+            f"invalid size of a spherical picture: {size[0]}x{size[1]} pixels",
+            "its width must be twice its height",
         )
     return stated_camera("EQUIRECTANGULAR", *size, (float(size[0]), float(size[1])), where=where)

@@ -28,12 +28,12 @@ def stated_camera(model: str, width: int, height: int, params: tuple[float, ...]
     """
     if max(width, height) > MOST_PIXELS:
         raise UserError(
-            f"{where}: a picture of {_short(width)}x{_short(height)} pixels",
+            f"{where}: invalid size of a picture: {_short(width)}x{_short(height)} pixels",
             f"width and height must be at most {MOST_PIXELS}",
         )
     if not all(abs(value) < MOST_PARAMETER for value in params):  # True at NaN
         raise UserError(
-            f"{where}: camera parameters {', '.join(f'{value:g}' for value in params)}",
+            f"{where}: invalid camera parameters {', '.join(f'{value:g}' for value in params)}",
             f"every parameter must be a finite number below {MOST_PARAMETER:g}",
         )
     try:

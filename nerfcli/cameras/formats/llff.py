@@ -102,7 +102,10 @@ def write_llff(capture: Capture, folder: Path) -> None:
     """
     spherical = [frame.name for frame in capture.frames if frame.camera.is_spherical]
     if spherical:
-        raise UserError(f"the spherical picture {spherical[0]} has no focal length", "write transforms.json instead")
+        raise UserError(
+            f"the spherical picture {spherical[0]} has no focal length, which this format requires",
+            "write transforms.json instead",
+        )
     bounds = _percentile_bounds(capture) if capture.depth_bounds is None else capture.depth_bounds
     poses = llff_from_opencv_pose(np.array([frame.world_from_cam for frame in capture.frames]))
     sizes = [(frame.camera.height, frame.camera.width, _focal_x(frame.camera)) for frame in capture.frames]
@@ -118,12 +121,12 @@ def _read_rows(path: Path) -> np.ndarray:
         rows = array_from_npy(path.read_bytes())
     except (OSError, ValueError) as error:
         raise UserError(
-            f"{path}: no readable NumPy array ({str(error)[:200]})",
-            "the file is cut off or something else; copy it again from the source",
+            f"{path} is not a readable NumPy array ({str(error)[:200]})",
+            "the file is truncated or of another kind; copy it again from the source",
         ) from error
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0 or rows.dtype.kind not in "fiu":
         raise UserError(
-            f"{path}: an array of {rows.shape}", "expected (images, 17): 3x5 pose and intrinsics, near and far depth"
+            f"{path}: array of shape {rows.shape}", "expected (images, 17): 3x5 pose and intrinsics, near and far depth"
         )
     return rows.astype(np.float64)
 
@@ -157,8 +160,8 @@ def _images_of_rows(folder: Path, count: int, list_images: Callable[[Path], list
             return images
         found.append(f"{name}/ has {len(images)}")
     raise UserError(
-        f"{folder / FILE} has {count} rows, but {', '.join(found) or 'there is no folder images/'}",
-        "the photos must be exactly the ones that the poses were made from, one per row, sorted by name",
+        f"{folder / FILE} has {count} rows, but {', '.join(found) or 'the folder images/ is missing'}",
+        "there must be exactly one photo per row, sorted by name",
     )
 
 
@@ -170,8 +173,8 @@ def _camera(size_and_focal: Iterable[float], where: str) -> Camera:
     height, width, focal = size_and_focal
     if not min(height, width) >= 1 or not focal > 0 or not max(height, width, focal) < np.inf:  # True at NaN
         raise UserError(
-            f"{where}: height, width and focal length are {height:g}, {width:g}, {focal:g}",
-            "expected three numbers above 0 in the fifth column of the pose",
+            f"{where}: invalid height, width or focal length: {height:g}, {width:g}, {focal:g}",
+            "expected three positive numbers in the fifth column of the pose",
         )
     params = (focal, focal, round(width) / 2, round(height) / 2)
     return stated_camera("PINHOLE", round(width), round(height), params, where=where)
@@ -194,9 +197,9 @@ def _percentile_bounds(capture: Capture) -> np.ndarray:
     known = bounds[:, 0] < bounds[:, 1]  # False at NaN
     if not known.any():
         raise UserError(
-            f"poses_bounds.npy needs depths, but no view of the {len(capture.frames)} sees two of the "
+            f"poses_bounds.npy needs depth bounds, but none of the {len(capture.frames)} views sees two of the "
             f"{len(capture.points)} points",
-            "convert from a format that has points or depth bounds, such as a COLMAP model",
+            "convert from a format with points or depth bounds, such as a COLMAP model",
         )
     bounds[~known] = bounds[known, 0].min(), bounds[known, 1].max()
     return bounds

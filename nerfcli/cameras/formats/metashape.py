@@ -82,7 +82,7 @@ def _chunk(path: Path) -> Element:
     root = _parse_xml(path)
     chunk = root if root.tag == "chunk" else root.find("chunk")
     if chunk is None:
-        raise malformed(str(path), f"has no chunk, but a {shown(root.tag)}", _EXPECTED)
+        raise malformed(str(path), f"has no chunk element, but a {shown(root.tag)}", _EXPECTED)
     return chunk
 
 
@@ -155,7 +155,7 @@ def _camera(sensor: Element, where: str) -> Camera:
         return lenses.spherical_camera(size, where)
     if kind != _FRAME and kind not in _FISHEYE:
         known = ", ".join((_FRAME, *_FISHEYE, _SPHERICAL))
-        raise malformed(where, f"a camera of type {shown(kind)} is not supported", f"expected one of {known}")
+        raise malformed(where, f"camera type {shown(kind)} is not supported", f"expected one of {known}")
     if calibration.find("f") is None:
         raise malformed(where, "has no focal length f", "align the photos before exporting the cameras")
     focal = _number(calibration, "f", where)
@@ -182,8 +182,8 @@ def _refuse_term(key: str, effect_px: float, what: str, where: str) -> None:
     if abs(effect_px) > _NEGLIGIBLE_PX:
         raise malformed(
             where,
-            f"{key} is not 0: {what}, which no camera model here has",
-            f"set {key} to 0, or leave it out of the optimisation (Optimize Cameras), and export again",
+            f"{key} is not 0: {what}, which is not supported",
+            f"set {key} to 0, or exclude it from the optimization (Optimize Cameras), and export again",
         )
 
 

@@ -29,10 +29,10 @@ def array_from_npy(data: bytes) -> np.ndarray:
             warnings.simplefilter("ignore", UserWarning)  # of headers that Python 2 wrote
             shape, by_columns, dtype = _HEADERS[version](stream)
     except (TypeError, KeyError, SyntaxError, OverflowError, RecursionError, MemoryError, tokenize.TokenError) as error:
-        raise ValueError(f"its header makes no sense ({type(error).__name__})") from error
+        raise ValueError(f"its header is invalid ({type(error).__name__})") from error
     start = stream.tell()
     if dtype.hasobject or dtype.itemsize == 0:
-        raise ValueError(f"it holds values of type {dtype}")
+        raise ValueError(f"it contains values of type {dtype}")
     if any(length < 0 for length in shape) or math.prod(shape) * dtype.itemsize != len(data) - start:
         raise ValueError(f"its header announces {shape} values of {dtype}, but {len(data) - start} bytes follow")
     if math.prod(shape) == 0:

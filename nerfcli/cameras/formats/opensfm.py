@@ -182,7 +182,7 @@ def _long_fisheye(
     s0, s1, s2, s3 = prism if len(prism) == 4 else (0.0,) * 4
     if term["k5"] or term["k6"] or s1 or s3:
         raise malformed(
-            where, "k5, k6, s1 or s3 beside p1, p2, s0 or s2", "no camera model here has all of these terms at once"
+            where, "k5, k6, s1 or s3 beside p1, p2, s0 or s2", "no supported camera model has all of these terms"
         )
     radial = (term["k1"], term["k2"], term["k3"], term["k4"])
     return lenses.fisheye_camera(size, focal, centre, radial=radial, tangential=tangential, prism=(s0, s2), where=where)

@@ -31,7 +31,7 @@ def measured_sizes(
     if not sizes:
         raise malformed(
             str(path),
-            f"none of the {len(missing)} photos that it lists is in {folder}, such as {shown(missing[0])}",
-            "the file gives no picture sizes, so the photos must be there under the names that it lists",
+            f"none of the {len(missing)} listed photos exists in {folder}, such as {shown(missing[0])}",
+            "the file does not give image sizes, so the photos are needed, with the listed names",
         )
     return sizes, tuple(missing)

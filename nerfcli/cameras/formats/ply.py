@@ -55,12 +55,12 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise UserError(f"{path}: {error.strerror or error}", "the PLY file must be there and readable") from error
+        raise UserError(f"{path}: {error.strerror or error}", "the PLY file must exist and be readable") from error
     try:
         return _points(data)
     except ValueError as error:
         raise UserError(
-            f"{path}: {error}", "expected a PLY file of vertices with x, y, z; it is cut off or something else"
+            f"{path}: {error}", "expected a PLY file of vertices with x, y, z; the file is truncated or of another kind"
         ) from error
 
 
@@ -109,14 +109,14 @@ def _points(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
     if len(set(fields)) < len(fields) or not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"its vertices have the properties {', '.join(fields) or 'none'}")
     if any(kind is None for _, kind in vertex.properties):
-        raise ValueError("its vertices hold lists")
+        raise ValueError("its vertices contain lists")
     if encoding == "ascii":
         table = _ascii_columns(data[start:], sum(element.count for element in before), vertex)
     else:
         table = _binary_columns(data, start, before=before, vertex=vertex, order=_ORDERS[encoding])
     points = np.stack([table[name].astype(np.float64) for name in "xyz"], axis=-1)
     if not plausible(points).all():
-        raise ValueError(f"vertex {int(np.argmin(plausible(points)))} has a position that is nowhere")
+        raise ValueError(f"vertex {int(np.argmin(plausible(points)))} has an invalid position")
     kinds = dict(vertex.properties)
     channels = next((names for names in _COLOURS if set(names) <= set(fields)), None)
     if channels is None:
@@ -171,7 +171,7 @@ def _binary_columns(
 ) -> dict[str, np.ndarray]:
     for element in before:
         if any(kind is None for _, kind in element.properties):
-            raise ValueError(f"its element {element.name} holds lists and stands before the vertices")
+            raise ValueError(f"its element {element.name} contains lists and precedes the vertices")
         start += element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties)
     dtype = np.dtype([(name, f"{order}{kind}") for name, kind in vertex.properties])
     if vertex.count * dtype.itemsize > len(data) - start:
@@ -184,5 +184,5 @@ def _as_bytes(channel: np.ndarray, kind: str) -> np.ndarray:
     """A colour channel as uint8."""
     most = 1.0 if kind.startswith("f") else 255.0
     if kind not in ("u1", "f4", "f8") or not ((channel >= 0) & (channel <= most)).all():
-        raise ValueError(f"its colours are no numbers from 0 to {most:g}")
+        raise ValueError(f"its colours are not numbers from 0 to {most:g}")
     return np.round(channel.astype(np.float64) * (255.0 / most)).astype(np.uint8)

@@ -29,15 +29,15 @@ def rigid_poses(matrices: np.ndarray, where: Callable[[int], str]) -> np.ndarray
     _refuse(
         ~plausible(matrices[:, :3].reshape(-1, 12)),
         where,
-        what=f"holds a number that is not finite, or above {MOST_UNITS:g}",
-        hint="the pose of this image is lost; remove its entry",
+        what=f"contains a number that is not finite or above {MOST_UNITS:g}",
+        hint="the pose of this image is invalid; remove its entry",
     )
     bend = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0)
     _refuse(
         bend > _MAX_BEND,
         where,
-        what="its upper left 3x3 is no rotation",
-        hint="rows must be perpendicular and of length 1",
+        what="the upper left 3x3 block is not a rotation",
+        hint="rows must be orthogonal and of length 1",
     )
     _refuse(
         np.linalg.det(rotations) < 0,

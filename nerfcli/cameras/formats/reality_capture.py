@@ -75,7 +75,7 @@ def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
     lines = read_text(path, _EXPECTED).splitlines()
     start = next((index for index, line in enumerate(lines) if line.lower().startswith(("#name,", "name,"))), None)
     if start is None:
-        raise malformed(str(path), "has no line #name,x,y,alt,...", _EXPECTED)
+        raise malformed(str(path), "has no header line #name,x,y,alt,...", _EXPECTED)
     header = [word.strip().lower() for word in lines[start].lstrip("#").split(",")]
     columns = {}
     for key, spellings in _COLUMNS.items():
@@ -105,7 +105,7 @@ def _cells(line: str, where: str) -> list[str]:
     try:
         return next(csv.reader([line], strict=True))
     except (csv.Error, StopIteration) as error:
-        raise malformed(where, f"is no line of a table ({error})", _EXPECTED) from error
+        raise malformed(where, f"is not a valid line of a table ({error})", _EXPECTED) from error
 
 
 def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camera:
@@ -115,7 +115,7 @@ def _camera(value: dict[str, float], size: tuple[int, int], where: str) -> Camer
     if value["k4"] != 0:
         raise malformed(
             where,
-            f"k4 is {shown(value['k4'])}: a fourth radial term, which no camera model here has",
+            f"k4 is {shown(value['k4'])}: a fourth radial term, which is not supported",
             "align with the distortion model Brown3 or Brown3 with tangential2, and export again",
         )
     return lenses.brown_camera(

@@ -15,7 +15,7 @@ from nerfcli.sealed import SEAL, read_sealed, write_sealed
 
 CAMERAS = "cameras.json"
 # What to do about a damaged file of a run.
-MEND = f"train again with --overwrite, or restore the file; if you changed it yourself, take out its {SEAL}"
+MEND = f"train again with --overwrite, or restore the file; if you edited it yourself, remove its entry {SEAL}"
 # In an entry: camera and pose as the scene had them.
 _GIVEN = "given"
 
@@ -93,10 +93,10 @@ def _read_frames(path: Path, *, given: bool) -> RunCameras:
         )
     except FileNotFoundError as error:
         raise UserError(
-            f"{run} is not a run: it has no {CAMERAS}", "give the folder that nerfcli train wrote"
+            f"{run} is not a run folder: it has no {CAMERAS}", "give a run folder written by nerfcli train"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} cannot be read: {error}", MEND) from error
+        raise UserError(f"cannot read {path}: {error}", MEND) from error
     return RunCameras(train, test)
 
 

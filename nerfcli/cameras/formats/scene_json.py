@@ -66,7 +66,9 @@ class Description:
             return None if self.masks is None else find_mask(name, self.masks)
         mask = self.masks.get(name)
         if mask is not None and not mask.is_file():
-            raise UserError(f"{self.path}: {mask}, the mask of {name}, is not there", "put it back, or list none")
+            raise UserError(
+                f"{self.path}: {mask}, the mask of {name}, does not exist", "restore it, or remove it from the file"
+            )
         return mask
 
     def _split_of(self, name: str) -> str | None:
@@ -84,8 +86,8 @@ def read_description(root: Path) -> Description:
     content = read_json_object(path)
     if content.get("version") != SCENE_VERSION:
         raise UserError(
-            f"{path}: version {content.get('version')!r} is not known, only {SCENE_VERSION}",
-            "update nerfcli, or find the poses again with nerfcli poses",
+            f"{path}: unknown version {content.get('version')!r}, expected {SCENE_VERSION}",
+            "update nerfcli, or estimate the poses again with nerfcli poses",
         )
 
     def place(text: str) -> Path:
@@ -129,7 +131,7 @@ def _listed_names(content: dict[str, Any], path: Path) -> dict[str, frozenset[st
     for part in ("test", "val", UNUSED):
         listed = split.get(part, None if part == "test" else []) if isinstance(split, dict) else None
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-            what = f"{path}: split.{part} is no list of image names"
+            what = f"{path}: split.{part} is not a list of image names"
             raise UserError(what, 'expected "split": {"test": ["a.jpg", ...]}')
         names[part] = frozenset(listed)
     return names
@@ -141,7 +143,7 @@ def _listed_bounds(content: dict[str, Any], path: Path) -> dict[str, tuple[float
         bounds = {name: (float(near), float(far)) for name, (near, far) in dict(listed).items()}
     except (TypeError, ValueError) as error:
         raise UserError(
-            f"{path}: depth_bounds are no pairs of numbers", 'expected {"a.jpg": [near, far], ...}'
+            f"{path}: depth_bounds are not pairs of numbers", 'expected {"a.jpg": [near, far], ...}'
         ) from error
     for name, (near, far) in bounds.items():
         if not 0 < near < far < math.inf:

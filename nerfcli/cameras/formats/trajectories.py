@@ -104,8 +104,8 @@ def _parse(
 ) -> Capture:
     if camera is None:
         raise UserError(
-            f"{path}: a trajectory of the {kind.upper()} format has poses only, no camera",
-            "give the camera too: its model, width, height and parameters in pixels",
+            f"{path}: a {kind.upper()} trajectory contains poses but no camera",
+            "give the camera with --intrinsics FILE",
         )
     frames = []
     for index, (number, line) in enumerate(filled_lines(read_text(path, expected))):

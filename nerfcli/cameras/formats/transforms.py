@@ -173,8 +173,8 @@ def capture_on_disk(path: Path, found: Found, *, kind: str) -> Capture:
     """The capture of `frames_on_disk`, if there are any and no two have the same name."""
     if not found.frames:
         raise UserError(
-            f"{path}: none of the {len(found.missing)} images that it lists is on disk, such as {found.missing[0]}",
-            "put the images where file_path says, relative to this file",
+            f"{path}: none of the {len(found.missing)} listed images exists, such as {found.missing[0]}",
+            "put the images where file_path points, relative to this file",
         )
     refuse_twins(path, found.frames)
     return Capture(
@@ -263,9 +263,7 @@ def _sizes(
     result = []
     for size, where, image in zip(sizes, wheres, images, strict=True):
         if size is None and len(known) != 1:
-            raise malformed(
-                where, f"w and h are missing, and {image} is not there to be measured", "put the image there"
-            )
+            raise malformed(where, f"w and h are missing, and {image} does not exist", "add the image, or w and h")
         result.append(next(iter(known)) if size is None else size)
     return result
 
@@ -309,9 +307,7 @@ def _find_mask(folder: Path, listed: Any, where: str) -> Path | None:
         return None
     mask = _find_image(folder, str(listed))
     if mask is None:
-        raise malformed(
-            where, f"mask {listed} is not on disk", "put the mask there, or remove mask_path from the entry"
-        )
+        raise malformed(where, f"mask {listed} does not exist", "add the mask, or remove mask_path from the entry")
     return mask
 
 
@@ -329,7 +325,7 @@ def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
     try:
         matrix = np.array(record["transform_matrix"], dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise malformed(where, "transform_matrix is no matrix", "expected 4 rows of 4 numbers") from error
+        raise malformed(where, "transform_matrix is not a matrix", "expected 4 rows of 4 numbers") from error
     if matrix.shape not in ((4, 4), (3, 4)):
         raise malformed(where, f"transform_matrix has shape {matrix.shape}", "expected 4 rows of 4 numbers")
     return matrix
@@ -354,6 +350,8 @@ def _listed_splits(path: Path, content: dict[str, Any]) -> dict[str, str]:
     for split in SPLITS:
         listed = content.get(f"{split}_filenames", [])
         if not isinstance(listed, list) or not all(isinstance(item, str) for item in listed):
-            raise malformed(str(path), f"{split}_filenames is no list of paths", "expected a list of file_path texts")
+            raise malformed(
+                str(path), f"{split}_filenames is not a list of paths", "expected a list of file_path texts"
+            )
         splits.update({_name_of(item, f"{path}: {split}_filenames"): split for item in listed})
     return splits

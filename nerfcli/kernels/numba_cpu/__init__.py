@@ -57,8 +57,8 @@ def warm_up() -> None:
         _run_all()
     except OSError as error:
         raise UserError(
-            f"compiled kernels cannot be kept in {machine_code.folder()}: {error.strerror or error}",
-            "free space there, or say with NUMBA_CACHE_DIR=FOLDER where there is some",
+            f"cannot cache compiled kernels in {machine_code.folder()}: {error.strerror or error}",
+            "free some disk space, or set NUMBA_CACHE_DIR to another folder",
         ) from error
 
 

@@ -27,7 +27,7 @@ class NumbaBackend(ComposedBackend):
     def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
         if device.type == "cpu" and dtype == torch.float32:
             return None
-        return f"it works on float32 on the CPU, not on {str(dtype).removeprefix('torch.')} on {device.type}"
+        return f"it supports float32 on the CPU only, not {str(dtype).removeprefix('torch.')} on {device.type}"
 
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None

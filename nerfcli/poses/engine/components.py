@@ -44,14 +44,14 @@ def _apart(photos: set[int], largest: set[int], pairs: Sequence[tuple[int, int, 
     if strong:
         count, one, other = max(strong)
         return (
-            f"{len(strong)} pairs of photos join it with the largest (the strongest is {job.names[one]} and "
-            f"{job.names[other]}, {count} matches), but no common frame fits them"
+            f"{len(strong)} pairs connect it to the largest (strongest: {job.names[one]} and {job.names[other]}, "
+            f"{count} matches), but no consistent alignment was found"
         )
     if between:
         count, one, other = max(between)
         best = f"{job.names[one]} and {job.names[other]}, {count} matches"
-        return f"no pair of photos is strong enough to join it with the largest (the best is {best})"
-    return "no photo of it matches any photo of the largest"
+        return f"no pair connects it well enough to the largest (best: {best})"
+    return "none of its photos matches a photo of the largest"
 
 
 def _joins(pair: tuple[int, int, int], photos: set[int], largest: set[int]) -> bool:

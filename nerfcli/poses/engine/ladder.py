@@ -69,7 +69,7 @@ class _Ladder:
         for rung in self.rungs[self._told :]:
             largest, *others = rung["models"] or ["none"]
             also = f" (and {len(others)} smaller models)" if len(others) > 1 else f" + {others[0]}" if others else ""
-            self._tell(f"{rung['what']}: {largest}{also} of {self._photos} photos placed")
+            self._tell(f"{rung['what']}: {largest}{also} of {self._photos} photos registered")
         self._told = len(self.rungs)
 
     def attempt(self, what: str, job: Job, start: Start) -> None:
@@ -164,9 +164,9 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     if rest and len(rest) <= _MOST_PAIRS and ladder.share(featured) < _GOOD_SHARE:
         job = replace(job, pairs=(*job.pairs, *rest))
         match(job, rest, report)
-        ladder.attempt("every pair compared", job, SMALLER_BASELINE)
+        ladder.attempt("match all pairs", job, SMALLER_BASELINE)
     if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE:
-        ladder.announce("more features, full size")
+        ladder.announce("more features from full-size photos")
         full = replace(
             job,
             rung="full-size",
@@ -177,9 +177,9 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
         extract(full, report)
         start_matching(full, full.pairs)
         match(full, full.pairs, report)
-        ladder.attempt("more features, full size", full, Start())
+        ladder.attempt("more features from full-size photos", full, Start())
         _other_starts(ladder, full)
-    ladder.find_left_out("single photos, by the points that they show")
+    ladder.find_left_out("remaining photos one by one, from the 3D points they see")
     if len(ladder.rungs) > 1:
         ladder.tell_results()
     return replace(ladder.best, attempts=ladder.rungs)
@@ -205,7 +205,7 @@ def _without_exif(ladder: _Ladder, job: Job, report: Report, *, share: float) ->
     bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
     if share >= _LITTLE_SHARE or bare.groups == job.groups:
         return job
-    what = "without the focal length of EXIF"
+    what = "without EXIF's focal length"
     ladder.announce(what)
     register_photos(bare)  # which takes out what was verified with the other focal length
     match(bare, bare.pairs, report)
@@ -242,7 +242,7 @@ def _from_left_out(ladder: _Ladder, job: Job) -> None:
     if left:
         _, one, other = max(left, key=lambda pair: (pair[0], -pair[1], -pair[2]))
         start = replace(SMALLER_BASELINE, init_pair=(one, other))
-        ladder.attempt("start from the strongest pair that was left out", job, start)
+        ladder.attempt("start from the strongest unused pair", job, start)
 
 
 def _strong_pairs(job: Job) -> list[tuple[int, int, int]]:

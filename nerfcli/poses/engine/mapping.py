@@ -110,7 +110,7 @@ def map_photos(
         write_models(output, models, key)
         found = read_models(output, key)
     if found is None:
-        raise OSError(f"the models in {output} cannot be read back")
+        raise OSError(f"cannot read back the models in {output}")
     return found[0]
 
 

@@ -65,7 +65,7 @@ def second_chance(
     start = time.perf_counter()
     pairs = first.verdict.measures["pairs"]
     against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
-    tell(f"{against}: the photos are mapped again, for {duration(_MOST_TIME * mapped.seconds)} at most")
+    tell(f"{against}: mapping again, for at most {duration(_MOST_TIME * mapped.seconds)}")
     attempts = list(mapped.attempts)
     core = _core(mapped.models[0], mapped.job)
     at_once: list[Mapped] = []  # what the global mapper gave, to build upon
@@ -74,16 +74,19 @@ def second_chance(
         return _regrown(mapped, _core(at_once[0].models[0], mapped.job), report) if at_once else None
 
     hypotheses: list[tuple[str, Callable[[], Mapped | None]]] = [
-        ("from the largest part that agrees with itself", lambda: _regrown(mapped, core, report)),
+        ("from the largest consistent part", lambda: _regrown(mapped, core, report)),
         (_ALL_AT_ONCE, lambda: _all_at_once(mapped, core)),
-        ("from the largest part of that", grown_from_all),
-        ("from nothing, from other pairs of photos", lambda: _from_nothing(mapped, core, report)),
-        ("the largest part of the first model alone", lambda: replace(mapped, models=[core.model, *mapped.models[1:]])),
+        ("from the largest consistent part of that", grown_from_all),
+        ("from scratch, with other initial pairs", lambda: _from_nothing(mapped, core, report)),
+        (
+            "only the largest consistent part of the first model",
+            lambda: replace(mapped, models=[core.model, *mapped.models[1:]]),
+        ),
     ]
     for number, (what, make) in enumerate(hypotheses):
         last = number == len(hypotheses) - 1
         if not last and time.perf_counter() - start > _MOST_TIME * mapped.seconds:
-            tell(f"not tried, for it takes too long: {what}")
+            tell(f"skipped, would take too long: {what}")
             continue
         tell(f"next: {what}")
         runner = checks()
@@ -97,7 +100,7 @@ def second_chance(
         size = 0 if examined.model is None else examined.model.num_reg_images()
         attempts.append({"what": what, "models": [size, *(m.num_reg_images() for m in found.models[1:])]})
         verdict = "accepted" if examined.verdict.accepted else examined.verdict.failures[0].kind
-        tell(f"{what}: {size} of {len(mapped.job.files)} photos placed, {verdict}")
+        tell(f"{what}: {size} of {len(mapped.job.files)} photos registered, {verdict}")
         if examined.verdict.accepted:
             return Chance(replace(found, attempts=attempts), examined)
     return Chance(replace(mapped, attempts=attempts), first)

@@ -100,7 +100,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     # Held-out photos are points of view only: they are not among the images of which the fingerprint is.
     after = fingerprint(model, without=frozenset(found.name for found in placed.values()))
     if after != before:
-        raise AssertionError("placing held-out photos has changed the model of the training photos")
+        raise AssertionError("locating held-out photos changed the model of the training photos")
     model.write_binary(str(folder))
     whole["models"][0] = sorted([*whole["models"][0], *placed])
     whole["left_out"] |= reasons
@@ -138,7 +138,7 @@ def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[t
     """Give one photo a pose in the model; or the reason why it has none."""
     camera_id = next(at for at, group in enumerate(job.groups, start=1) if number in group.photos)
     if camera_id not in model.cameras:
-        return "its camera took no photo for training"
+        return "its camera took no training photo"
     pixels, points = _seen_points(model, job, number, pairs)
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = _MOST_ERROR_PX
@@ -154,7 +154,7 @@ def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[t
         )
     if found is None or found["num_inliers"] < FEW_MATCHES:
         count = 0 if found is None else found["num_inliers"]
-        return f"matches too few points of the training photos ({count} agree of {len(points)})"
+        return f"matches too few points of the training photos ({count} inliers of {len(points)})"
     inside = np.asarray(found["inlier_mask"], dtype=bool)
     image = pycolmap.Image(name=job.names[number], camera_id=camera_id, image_id=job.image_ids[number])
     image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels[inside]])

@@ -19,13 +19,13 @@ from nerfcli.poses.input.settings import Limits
 
 _STAGES = {
     "extract": "finding features",
-    "enlarge": "finding finer features",
+    "enlarge": "extracting finer features",
     "pair": "choosing pairs",
     "match": "matching photos",
     "map": "placing photos",
     "check": "checking the poses",
 }
-_GO_ON = "what is complete is kept, and the same command goes on from there"
+_GO_ON = "completed work is kept; run the same command again to continue"
 _LESS_MEMORY = "use smaller photos (--max-size), fewer features (--max-features) or fewer threads (--threads)"
 # Memory can double in a second or two, when a photo is decoded or a bundle adjustment begins.
 _LOOK_EVERY_SECONDS = 0.1
@@ -113,12 +113,12 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
     """
     if free_bytes < _FULL_DISK_BYTES or "disk is full" in log or os.strerror(ENOSPC) in log:
         return UserError(
-            f"structure from motion cannot write on while {stage}: the disk is full ({free_bytes / 1e6:.1f} MB free)",
-            f"free space on the disk, or choose another one with -o; {_GO_ON}",
+            f"structure from motion stopped while {stage}: the disk is full ({free_bytes / 1000000.0:.1f} MB free)",
+            f"free some disk space, or choose another disk with -o; {_GO_ON}",
         )
     if returncode == -signal.SIGKILL:
         return WorkerDiedError(
-            f"structure from motion was killed while {stage}, most likely for want of memory",
+            f"structure from motion was killed while {stage}, most likely because memory ran out",
             f"{_LESS_MEMORY}; {_GO_ON}",
             OUT_OF_MEMORY,
         )
@@ -128,8 +128,8 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
         )
     how = signal.Signals(-returncode).name if returncode < 0 else f"exit status {returncode}"
     return WorkerDiedError(
-        f"structure from motion died ({how}) while {stage}: {_last_words(log)}",
-        "try once more with one thread; if it dies again, leave out the photos that came last, or report it",
+        f"structure from motion crashed ({how}) while {stage}: {_last_words(log)}",
+        "try again with --threads 1; if it crashes again, remove the last photos, or report it",
     )
 
 
@@ -169,13 +169,14 @@ def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:
         assert limits.memory_bytes is not None
         size = f"{limits.memory_bytes / 1e9:.3g} GB"
         return UserError(
-            f"structure from motion was ended while {stage}: it needed more than the {size} of --memory",
-            f"{_LESS_MEMORY}, or allow more; {_GO_ON}",
+            f"structure from motion was stopped while {stage}: it needed more than the limit of {size} (--memory)",
+            f"{_LESS_MEMORY}, or raise --memory; {_GO_ON}",
             OUT_OF_MEMORY,
         )
     return UserError(
-        f"structure from motion was ended while {stage}: the {limits.seconds:.3g} s of --time-limit are over",
-        f"allow more time or choose --quality fast; {_GO_ON}",
+        f"structure from motion was stopped while {stage}: the time limit of {limits.seconds:.3g} s is over "
+        "(--time-limit)",
+        f"allow more time or use --quality fast; {_GO_ON}",
         GATE_NOT_MET,
     )
 

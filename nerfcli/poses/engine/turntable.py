@@ -129,24 +129,22 @@ def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[st
 def sentence(facts: dict[str, Any]) -> str:
     """What was found, for the user."""
     text = (
-        f"an object turns, or is moved, before a background that keeps its place in the picture, as on a turntable "
-        f"({facts['pairs_two_motions']} of {facts['pairs']} pairs show both motions)"
+        f"an object moves in front of a static background, as on a turntable ({facts['pairs_two_motions']} of "
+        f"{facts['pairs']} pairs show both motions)"
     )
     if not facts["masked"]:
-        return f"{text}; no masks of the object could be found, for {facts['why_not']}: give them with --masks"
+        return f"{text}; no masks of the object could be created, because {facts['why_not']}: give masks with --masks"
     several = len(facts["unmasked"])
-    rest = f", {several} photos have none" if several else ""
-    return (
-        f"{text}: its masks are in {MASKS}/ of the scene{rest}, and the poses are those of a camera around the object"
-    )
+    rest = f", except for {several} photos" if several else ""
+    return f"{text}: its masks are in {MASKS}/ of the scene{rest}, and the poses are relative to the object"
 
 
 def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
     """A refusal with what to do about an object that turns before a still background, if there is one."""
     if facts is None or not facts["wide"]:
         return error
-    masks = f"those in {MASKS}/ of the scene, edited" if facts["masked"] else "white where the object is"
-    hint = f"an object turns before a still background: give masks of it with --masks, {masks}; or {error.hint}"
+    masks = f"the edited masks in {MASKS}/ of the scene" if facts["masked"] else "white where the object is"
+    hint = f"an object moves in front of a static background: give masks of it with --masks, {masks}; or {error.hint}"
     return UserError(error.message, hint, error.exit_code)
 
 
@@ -280,11 +278,11 @@ def _judged(masks: Sequence[np.ndarray | None], pairs: Sequence[Compared], place
         "background_matches_in_black": round(right[1], 4),
     }
     if not _WHITE[0] <= white[1] <= _WHITE[1]:
-        facts["why_not"] = f"they would leave {100 * white[1]:.1f} % of a photo"
+        facts["why_not"] = f"they would cover {100 * white[1]:.1f} % of a photo"
     elif min(right) < _LEAST_RIGHT:
         facts["why_not"] = (
-            f"{100 * right[0]:.0f} % of the object's matches would be in them, and {100 - 100 * right[1]:.0f} % of the "
-            "background's"
+            f"they would contain {100 * right[0]:.0f} % of the object's matches and {100 - 100 * right[1]:.0f} % of "
+            "the background's"
         )
     return facts
 

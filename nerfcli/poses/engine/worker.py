@@ -93,7 +93,7 @@ def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float
     with _timed(seconds, "motions"):
         found = checks.run(name, lambda: with_object_masks(job, training_part(job), tell), otherwise=None)
     if found is None:
-        tell(f"whether an object moves before a still background is unknown: {checks.not_computed[name]}")
+        tell(f"could not check for an object moving in front of a static background: {checks.not_computed[name]}")
         return job, None
     return found
 
@@ -157,7 +157,7 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
     key = mapping_key(job)
     mapped = read_mapped(job, key)
     if mapped is not None:
-        tell("the photos are mapped already: only the checks are left")
+        tell("the photos are already mapped: running the checks")
         return mapped
     with _timed(seconds, "extract"):
         extract(job, report)
@@ -171,7 +171,7 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
         write_mapped(replace(climbed, seconds=time.perf_counter() - start), key)
     mapped = read_mapped(job, key)
     if mapped is None:
-        raise OSError(f"the models in {job.folder} cannot be read back")
+        raise OSError(f"cannot read back the models in {job.folder}")
     return mapped
 
 

@@ -35,7 +35,7 @@ def lay_out_masks(
     found = [find_mask(name, masks) for name in photos.names]
     if not any(found):
         raise UserError(
-            f"no photo of {photos.folder} has a mask in {masks}",
+            f"{masks} contains no mask for any photo of {photos.folder}",
             f"name them after the photos: {photos.names[0]}.png or {Path(photos.names[0]).stem}.png",
         )
     folder.mkdir(parents=True, exist_ok=True)
@@ -54,15 +54,15 @@ def lay_out_masks(
         laid_out = list(readers.map(one, range(len(found))))
     wrong = [text for text in laid_out if isinstance(text, str)]
     if wrong:
-        hint = "give masks of the photos' size, upright or as the photos are stored; black is what is ignored"
-        raise UserError(f"{len(wrong)} masks do not fit: {_some(wrong, '; ')}", hint)
+        hint = "masks must have the size of their photos, upright or as stored; black is ignored"
+        raise UserError(f"{len(wrong)} masks have the wrong size: {_some(wrong, '; ')}", hint)
     without = [name for name, mask in zip(photos.names, found, strict=True) if mask is None]
     if without:
-        notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used whole: {_some(without)}")
+        notify(f"{len(without)} of {len(photos.names)} photos have no mask and are used completely: {_some(without)}")
     done = tuple(mask for mask in laid_out if isinstance(mask, LaidOutMask))
     hidden = [name for name, mask in zip(photos.names, done, strict=True) if mask.used_share == 0]
     if hidden:
-        notify(f"{len(hidden)} masks are black all over, so that nothing of the photo is used: {_some(hidden)}")
+        notify(f"{len(hidden)} masks are completely black, so their photos are not used: {_some(hidden)}")
     return done
 
 
@@ -80,9 +80,9 @@ def write_no_mask(path: Path, size: tuple[int, int]) -> LaidOutMask:
 
 def _check_folder(photos: Photos, masks: Path) -> None:
     if not masks.is_dir():
-        raise UserError(f"there is no folder of masks {masks}", "give the folder that holds a mask for each photo")
+        raise UserError(f"the mask folder {masks} does not exist", "give a folder with a mask for each photo")
     if masks.resolve() == photos.folder.resolve():
-        raise UserError(f"{masks} holds the photos themselves", "put the masks into a folder of their own")
+        raise UserError(f"{masks} contains the photos themselves", "put the masks into a separate folder")
 
 
 def _some(texts: Sequence[str], separator: str = ", ") -> str:

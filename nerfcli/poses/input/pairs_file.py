@@ -43,12 +43,10 @@ def _names(line: str, known: Container[str], place: str, folder: Path) -> tuple[
     """The two names of a line."""
     found = [(one, other) for one, other in _cuts(line) if one in known and other in known]
     if len(set(found)) > 1:
-        raise UserError(f"{place}: {line!r} can be cut into two names in more than one way", "put a tab between them")
+        raise UserError(f"{place}: {line!r} can be split into two names in more than one way", "put a tab between them")
     if not found:
         unknown = _unknown(line, known)
-        raise UserError(
-            f"{place}: {unknown}", f"write two names of photos in {folder}, as they are there, with a space between"
-        )
+        raise UserError(f"{place}: {unknown}", f"write two names of photos in {folder}, separated by a space")
     if found[0][0] == found[0][1]:
         raise UserError(f"{place}: {found[0][0]} is paired with itself", "write two different names")
     return found[0]
@@ -77,4 +75,4 @@ def _unknown(line: str, known: Container[str]) -> str:
             return f"there is no photo {other!r}"
         if other in known:
             return f"there is no photo {one!r}"
-    return f"there is no photo {cuts[0][0]!r}" if len(cuts) == 1 else f"{line!r} holds no two names of photos"
+    return f"there is no photo {cuts[0][0]!r}" if len(cuts) == 1 else f"{line!r} does not contain two names of photos"

@@ -53,7 +53,7 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
         UserError: no such folder, a file instead of a folder, no photos in it, or fewer than `MIN_PHOTOS` readable.
     """
     if not folder.exists():
-        raise UserError(f"there is no folder {folder}", "give the folder that holds the photos, or a video file")
+        raise UserError(f"the folder {folder} does not exist", "give a folder of photos, or a video file")
     if not folder.is_dir():
         raise UserError(f"{folder} is a file, not a folder", "put the photos into a folder and give that folder")
     paths = list_images(folder)
@@ -115,9 +115,9 @@ def _examine(path: Path) -> Photo | str:
 def _too_few(folder: Path, photos: list[Photo], unreadable: dict[str, str]) -> str:
     total = len(photos) + len(unreadable)
     if not unreadable:
-        return f"only {total} photo{'s' if total > 1 else ''} in {folder}, at least {MIN_PHOTOS} are needed"
+        return f"{folder} has only {total} photo{'s' if total > 1 else ''}; at least {MIN_PHOTOS} are needed"
     name, reason = next(iter(unreadable.items()))
-    readable = f"only {len(photos)} of {total} photos in {folder} can be read, at least {MIN_PHOTOS} are needed"
+    readable = f"only {len(photos)} of {total} photos in {folder} can be read; at least {MIN_PHOTOS} are needed"
     return f"{readable} ({name}: {reason})"
 
 
@@ -130,5 +130,5 @@ def _more_photos_hint(unreadable: dict[str, str]) -> str:
 def _where_photos_may_be(folder: Path) -> str:
     for child in sorted(folder.iterdir()):
         if child.is_dir() and list_images(child):
-            return f"there are photos in {child}: give that folder"
+            return f"there are photos in {child}; give that folder"
     return f"expected files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"

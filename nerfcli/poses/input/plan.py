@@ -42,7 +42,7 @@ class Plan:
         """One sentence."""
         times = ", ".join(f"{_WORDS[stage]} {duration(seconds)}" for stage, seconds in self.seconds.items())
         about = f"about {duration(sum(self.seconds.values()))}"
-        return f"{self.photos} photos, {self.pairs} pairs to compare ({self.rule}), {about}: {times}"
+        return f"{self.photos} photos, {self.pairs} pairs to match ({self.rule}), {about}: {times}"
 
 
 # In the order of the work.

@@ -84,7 +84,7 @@ def extract_frames(
     if _kept(folder, path, request, overwrite=overwrite, notify=notify):
         return
     if video.hdr:
-        notify(f"{path.name} is HDR; its colours are taken as they are stored, which looks pale")
+        notify(f"{path.name} is HDR; its colours are used as stored, which looks pale")
     meter = FrameMeter()
     measured = measure_frames(
         video,
@@ -93,10 +93,10 @@ def extract_frames(
         progress=lambda share: progress(_MEASURING_SHARE * share, "looking for sharp frames"),
     )
     if measured.errors:
-        notify(f"{path.name} is damaged in {measured.errors} places; frames near them may show blocks")
+        notify(f"{path.name} is damaged in {measured.errors} places; nearby frames may show block artifacts")
     total = len(measured.values)
     if count is not None and count > total:
-        raise UserError(f"{path} has {total} frames, {count} were asked for", f"ask for --frames {total} or fewer")
+        raise UserError(f"{path} has only {total} frames, but --frames is {count}", f"use --frames {total} or fewer")
     numbers = choose_frames(measured.seconds, measured.values, count=min(count or DEFAULT_FRAMES, total))
     with atomic_folder(folder) as partial:
         frames = _write(
@@ -108,15 +108,15 @@ def extract_frames(
         )
         if len(frames) < MIN_PHOTOS:
             raise UserError(
-                f"{path} shows only {len(frames)} different pictures, at least {MIN_PHOTOS} are needed",
-                "film while walking around the scene; a camera that stands still tells nothing about depth",
+                f"{path} has only {len(frames)} different frames; at least {MIN_PHOTOS} are needed",
+                "film while walking around the scene; a still camera gives no depth",
                 TOO_FEW_PHOTOS,
             )
         write_json(partial / FRAMES_FILE, _description(video, request, total=total, frames=frames))
     same = len(numbers) - len(frames)
     notify(
         f"{folder}: {len(frames)} of {total} frames of {path.name}"
-        + (f"; {same} more show the same as the one before" if same else "")
+        + (f"; {same} more are duplicates of the previous frame" if same else "")
     )
 
 
@@ -170,17 +170,17 @@ def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool,
         same, names = found["request"] == request, [frame["name"] for frame in found["frames"]]
         source = found["request"]["video"]["name"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        hint = "choose another place with -o, or move it away"
-        raise UserError(f"cannot write the frames of {path} to {folder}: it holds something else", hint) from error
+        hint = "choose another folder with -o, or move it away"
+        raise UserError(f"cannot write the frames of {path} to {folder}: it contains other files", hint) from error
     missing = sum(not (folder / name).is_file() for name in names)
     if same and not (missing and overwrite):
-        left = f", {missing} of them are no longer there" if missing else ""
-        notify(f"{folder} is kept: it holds the {len(names)} frames asked for{left}")
+        left = f", {missing} of which are missing" if missing else ""
+        notify(f"{folder} is complete and kept: {len(names)} frames{left}")
         return True
     if not overwrite:
         raise UserError(
-            f"{folder} holds other frames: {len(names)} of {source}",
-            "add --overwrite to replace them, or choose another place with -o",
+            f"{folder} contains other frames: {len(names)} of {source}",
+            "add --overwrite to replace them, or choose another folder with -o",
         )
     return False
 

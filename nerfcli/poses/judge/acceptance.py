@@ -227,13 +227,13 @@ def _observation_measure(model: pycolmap.Reconstruction) -> dict[str, Any]:
 
 
 def _no_baseline(turn: Turn | None, geometry: Mapping[str, Any]) -> list[Failure]:
-    advice = "take the photos while walking around the scene or sideways; turning on the spot shows no depth"
+    advice = "take the photos while walking around the scene or sideways; turning on the spot gives no depth"
     if turn is not None and turn.explains_all:
-        evidence = f"turning the camera on the spot explains all matches to {turn.parallax_px:.1f} px"
+        evidence = f"a rotation of the camera without translation explains all matches to {turn.parallax_px:.1f} px"
         return [Failure("no baseline (pure rotation)", evidence, advice)]
     spread = geometry["camera_spread_over_distance"]
     if spread is not None and spread < _LEAST_SPREAD:
-        evidence = f"the cameras are within {spread:.2%} of the distance to what they see"
+        evidence = f"the cameras are spread over only {100 * spread:.2f} % of their distance from the scene"
         return [Failure("no baseline (pure rotation)", evidence, advice)]
     return []
 
@@ -252,8 +252,9 @@ def _contradicted(
         return [
             Failure(
                 "parts of the scene look alike (repeated structure)",
-                f"{count} of {len(found)} pairs contradict the poses, as strong as those that agree",
-                "photograph the parts that look alike apart from each other, or include what tells them apart",
+                f"{count} of {len(found)} pairs contradict the poses, with as many matches as those that agree",
+                "include distinctive surroundings in photos of the parts that look alike, or photograph each part "
+                "separately",
             )
         ]
     if outweighing:
@@ -263,8 +264,9 @@ def _contradicted(
         return [
             Failure(
                 "the poses contradict the strongest matches",
-                f"the {first.matches} verified matches of {one} and {other} cannot be as the poses say{also}",
-                "take more photos between these two, with more overlap, and try again",
+                f"the {first.matches} verified matches between {one} and {other} are inconsistent with the estimated "
+                f"poses{also}",
+                "take more photos between these two, with more overlap",
             )
         ]
     return []
@@ -275,7 +277,8 @@ def _turned(rotations: Mapping[str, Any]) -> list[Failure]:
     if gross is None or gross <= _MOST_GROSS:
         return []
     evidence = (
-        f"{gross:.0%} of the matches are in pairs whose own rotation differs by more than {_GROSS_DEG:.0f} degrees"
+        f"{100 * gross:.0f} % of the matches are in pairs whose relative rotation differs from the poses by more than "
+        f"{_GROSS_DEG:.0f} degrees"
     )
     return [Failure("the poses contradict pairs of photos", evidence, "take more photos, with more overlap")]
 
@@ -297,7 +300,7 @@ def _implausible(
     ]
     advice = "take photos with more overlap while moving sideways"
     failures = [
-        Failure("the poses are not held by the photos", text.format(value), advice)
+        Failure("the photos do not constrain the poses", text.format(value), advice)
         for value, limit, above, text in checks
         if value is not None and (value > limit if above else value < limit)
     ]
@@ -305,10 +308,12 @@ def _implausible(
     for camera in _cameras_in_use(model):
         focal = _focal_measure(camera)
         if camera.camera_id not in given and not camera.is_perspective_fisheye() and not low < focal < high:
-            evidence = f"the focal length came out as {focal:.2f} times the longer side"
+            evidence = f"the estimated focal length is {focal:.2f} times the longer side"
             failures.append(
                 Failure(
-                    "the lens makes no sense", evidence, "give the lens with --intrinsics, or keep the photos' EXIF"
+                    "the intrinsics are implausible",
+                    evidence,
+                    "give the intrinsics with --intrinsics, or use photos with EXIF data",
                 )
             )
     return failures

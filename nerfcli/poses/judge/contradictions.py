@@ -64,10 +64,12 @@ def leave_out_contradicting(
     for photo in (photo for side in sides for photo in side if photo not in far):
         pair = next((c for c in contradicting if model.image(photo).name in (c.one, c.other)), None)
         if pair is None:
-            reasons[photo] = "contradicts the rest: hangs on a photo that does"
+            reasons[photo] = "contradicts the rest: connected only through a photo that does"
         else:
             other = pair.other if pair.one == model.image(photo).name else pair.one
-            reasons[photo] = f"contradicts the rest: its {pair.matches} matches with {other} cannot be"
+            reasons[photo] = (
+                f"contradicts the rest: its {pair.matches} matches with {other} are inconsistent with the poses"
+            )
     if len(reasons) > _MOST_LEFT_OUT * len(placed):
         return model, {}
     rest = pycolmap.Reconstruction(model)
@@ -110,7 +112,7 @@ def _far_away(model: pycolmap.Reconstruction) -> dict[int, str]:
     distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
     radius = np.median(distances)
     return {
-        photo: f"contradicts the rest: {distance / radius:.0f} times as far away as the others"
+        photo: f"contradicts the rest: {distance / radius:.0f} times as far away as the other cameras"
         for photo, distance in zip(photos, distances, strict=True)
         if radius > 0 and distance > _FARTHEST * radius
     }

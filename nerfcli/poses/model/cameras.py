@@ -50,7 +50,7 @@ def group_photos(photos: Photos, *, model: str) -> Grouped:
         evidence = focal_evidence(first.exif)
         if evidence.doubt and (first.exif.focal_mm or first.exif.focal_35mm):
             which = f"{first.name} and {len(names) - 1} more photos" if len(names) > 1 else first.name
-            notes.append(f"no focal length is taken from EXIF for {which}: {evidence.doubt}")
+            notes.append(f"EXIF's focal length is not used for {which}: {evidence.doubt}")
         groups.append(
             CameraGroup(
                 photos=tuple(numbers[name] for name in names),
@@ -83,7 +83,7 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:
     if any(one.camera.is_spherical for one in found):
         raise UserError(
             f"{calibration.path} has a spherical camera (EQUIRECTANGULAR)",
-            "structure from motion needs perspective or fisheye pictures; cut the panoramas into such",
+            "structure from motion needs perspective or fisheye pictures; convert the panoramas first",
         )
     optics = {name: number for number, names in enumerate(camera_groups(photos.photos)) for name in names}
     members: dict[tuple[Any, ...], list[int]] = {}

@@ -140,7 +140,7 @@ def uncertainty(
     if camera_id in fixed:
         return nothing | {"reason": "the intrinsics are given"}
     if not free:
-        return nothing | {"reason": f"not examined for {camera.model.name}"}
+        return nothing | {"reason": f"not supported for {camera.model.name}"}
     try:
         evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
         found = evidence.estimate([*free, *(_PRINCIPAL_POINT if principal_point else ())])

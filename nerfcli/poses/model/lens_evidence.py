@@ -71,7 +71,7 @@ class LensEvidence:
         information = self.information[np.ix_(index, index)]
         scale = np.sqrt(np.diag(information))
         if not (scale > 0).all() or np.linalg.cond(information / np.outer(scale, scale)) > 1e10:
-            raise UndeterminedError(f"the observations leave {', '.join(names)} open")
+            raise UndeterminedError(f"the observations do not determine {', '.join(names)}")
         inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
         change = inverse @ self.scores[0][:, index].sum(axis=0)
         covariances = [self.noise_px**2 * inverse]

@@ -126,7 +126,7 @@ def localise(
             for image_id in left:
                 photo = _photo(grown, database, image_id)
                 if photo is None:
-                    attempts[image_id] = Attempt(image_id, refused="nothing is known of its camera")
+                    attempts[image_id] = Attempt(image_id, refused="its camera is unknown")
                     continue
                 placed, attempts[image_id] = _place(photo, known, seed=job.seed)
                 if placed is not None:
@@ -181,10 +181,10 @@ def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[Verifi
     """What speaks against a photo's place after the adjustment, "" if nothing does."""
     observations = model.image(image_id).num_points3D
     if observations < _LEAST_KEPT * _LEAST_FOUND:
-        return f"only {observations} of its points are left after the adjustment"
+        return f"only {observations} of its points remain after the adjustment"
     own = [pair for pair in pairs if image_id in (pair.one, pair.other)]
     against = [agreement for agreement in agreements(model, own) if agreement.contradicts]
-    return f"{against[0].matches} verified matches contradict its place" if against else ""
+    return f"{against[0].matches} verified matches contradict its pose" if against else ""
 
 
 def _known(model: pycolmap.Reconstruction, database: pycolmap.Database) -> _Known:
@@ -229,11 +229,13 @@ def _place(photo: _Photo, known: _Known, *, seed: int) -> tuple[_Placed | None, 
     agreeing = 0 if first is None else len(first.features)
     attempt = Attempt(photo.image_id, len(features), agreeing)
     if first is None or agreeing < _LEAST_VOTES:
-        return None, replace(attempt, refused=f"only {agreeing} of {len(features)} features agree on a place")
+        return None, replace(attempt, refused=f"only {agreeing} of {len(features)} features agree on a pose")
     others = ~np.isin(features, first.features)
     second = _pose(photo, known, features[others], points[others], seed=seed)
     if second is not None and len(second.features) >= _RIVAL_SHARE * agreeing and not _alike(first, second, known):
-        return None, replace(attempt, refused=f"{len(second.features)} features agree on another place than {agreeing}")
+        return None, replace(
+            attempt, refused=f"{len(second.features)} features agree on a different pose than the {agreeing} others"
+        )
     placed = first
     for within in _WITHIN:
         found = _pose(photo, known, *_expected(photo, known, placed.pose, within=within), seed=seed)
@@ -243,14 +245,14 @@ def _place(photo: _Photo, known: _Known, *, seed: int) -> tuple[_Placed | None, 
     count, *beside = (len(_expected(photo, known, placed.pose, beside=step)[0]) for step in (np.zeros(2), *_steps()))
     attempt = replace(attempt, found=count, beside=max(beside))
     if count < _LEAST_FOUND or count < _CLEARLY * max(beside):
-        said = f"{count} features are where it expects them, and {max(beside)} where none should be"
+        said = f"{count} features match the expected positions, but {max(beside)} match wrong ones by chance"
         return None, replace(attempt, refused=said)
     area = _area(photo, placed.features)
     if area < _LEAST_AREA:
-        return None, replace(attempt, refused=f"only {area:.0%} of the picture agrees with the model")
+        return None, replace(attempt, refused=f"only {100 * area:.0f} % of the picture agrees with the model")
     turn_deg, shift = _deviations(photo, known, placed)
     if turn_deg > _MOST_TURN_DEG or shift > _MOST_SHIFT:
-        return None, replace(attempt, refused=f"its place is uncertain by {shift:.1%} of the distance")
+        return None, replace(attempt, refused=f"its position is uncertain by {100 * shift:.1f} % of the distance")
     return placed, attempt
 
 

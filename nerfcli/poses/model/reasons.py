@@ -39,10 +39,10 @@ _ADVICE = {
     "unreadable": "copy the damaged files again",
     "too few features": "take sharper photos of a textured scene",
     "matches no other photo well": "take photos with more overlap, two thirds from one to the next",
-    "in another model": "take photos that join the parts of the scene",
-    "contradicts the rest": "take photos with more overlap around this one, or leave it away",
-    "matches too few points": "hold out photos that overlap with the others, see --holdout",
-    "its camera took no photo": "hold out photos of cameras that took others, too, see --holdout",
+    "in another model": "take photos that connect the parts of the scene",
+    "contradicts the rest": "take photos with more overlap around this one, or remove it",
+    "matches too few points": "hold out photos that overlap with training photos, see --holdout",
+    "its camera took no photo": "hold out only photos of cameras that also took training photos, see --holdout",
     "rejected by the mapper": "take photos with more overlap and while moving sideways, or allow more features",
 }
 
