@@ -121,7 +121,7 @@ def test_json_is_written_whole_and_without_nan(tmp_path):
 def test_json_of_ours_that_is_damaged_is_told(content, tmp_path):
     path = tmp_path / "metrics.json"
     path.write_bytes(content)
-    with pytest.raises(UserError, match=r"metrics\.json cannot be read"):
+    with pytest.raises(UserError, match=r"cannot read .*metrics\.json"):
         read_json(path, needed=("mean",), hint="measure again")
     write_json(path, {"mean": 1})
     assert read_json(path, needed=("mean",), hint="measure again") == {"mean": 1}

@@ -140,8 +140,8 @@ def test_pairs_are_read(tmp_path: Path, text: str, pairs: set[tuple[int, int]]):
     ("text", "words"),
     [
         ("a.jpg b.jpg\na.jpg e.jpg", r"pairs.txt, line 2: there is no photo 'e.jpg'"),
-        ("a.jpg", r"line 1: 'a.jpg' holds no two names of photos"),
-        ("x y z", r"line 1: 'x y z' holds no two names of photos"),
+        ("a.jpg", r"line 1: 'a.jpg' does not contain two names of photos"),
+        ("x y z", r"line 1: 'x y z' does not contain two names of photos"),
         ("\n\na.jpg a.jpg", r"line 3: a.jpg is paired with itself"),
         ("# nothing", r"lists no pairs"),
     ],

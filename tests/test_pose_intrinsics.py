@@ -199,7 +199,7 @@ def test_what_matches_no_photo_is_told():
     ("name", "content", "said"),
     [
         ("cameras.txt", "# no camera\n", "cameras.txt has no cameras"),
-        ("cameras.txt", "1 PINHOLE 64 48 nan 50 32 24\n", "cameras.txt: camera 1: camera parameters nan"),
+        ("cameras.txt", "1 PINHOLE 64 48 nan 50 32 24\n", "cameras.txt: camera 1: invalid camera parameters nan"),
         ("cameras.txt", "1 PINHOLE 64 48 50\n", "PINHOLE has 4 parameters, got 1"),
         ("cameras.bin", "half a file", "cameras.bin is damaged"),
         (

@@ -48,7 +48,7 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
     with pytest.raises(UserError, match=r"colour of samples is not finite at step 2: \d+ of \d+ numbers") as caught:
         fit(views, tmp_path / "run", replace(FEW, learning_rate=1e12, warmup_steps=1))
     assert caught.value.exit_code == NON_FINITE
-    assert "seen from train/r_00" in caught.value.message
+    assert "in train/r_00" in caught.value.message
     assert "failure-2.safetensors has the state before the failure" in caught.value.hint
     description, bad = replay(tmp_path / "run" / "failure-2.safetensors")
     assert bad is not None
@@ -186,7 +186,7 @@ def test_gradients_are_looked_at_in_the_order_in_which_they_come():
 
 
 def test_replay_of_something_else_is_refused(spheres_run):
-    with pytest.raises(UserError, match="holds 'nerfcli field 2'"):
+    with pytest.raises(UserError, match="is not a saved failure but 'nerfcli field 2'"):
         replay(spheres_run / "field.safetensors")
 
 
