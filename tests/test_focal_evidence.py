@@ -112,6 +112,37 @@ def test_cameras_start_from_exif_only_where_it_holds():
     assert not any(camera.has_prior_focal_length for camera in bare)
 
 
+def test_few_cameras_are_listed_and_many_are_summed_up():
+    def notes(exifs: list[Exif]) -> tuple[str, ...]:
+        photos = [photo(f"{n}.jpg", exif, size=(exif.width, exif.height)) for n, exif in enumerate(exifs)]
+        return group_photos(Photos(Path(), tuple(photos), {}), model="auto").notes
+
+    big, small = sized(NO_EXIF, 4000, 3000), sized(NO_EXIF, 640, 480)
+    assert notes([big, big]) == ()
+    assert notes([big, big, small]) == (
+        "2 cameras, by EXIF and size: 2 photos of 4000x3000 (SIMPLE_RADIAL), 1 photo of 640x480 (SIMPLE_RADIAL)",
+    )
+    each_its_own = [sized(NO_EXIF, 600 + n, 480) for n in range(23)]
+    assert notes(each_its_own) == (
+        "23 cameras, by EXIF and size: one photo each, 23 sizes from 600x480 to 622x480 (SIMPLE_RADIAL)",
+    )
+    zooms = [replace(CAMERA, focal_mm=float(20 * n)) for n in range(1, 6)]
+    assert notes([*zooms, *zooms]) == ("5 cameras, by EXIF and size: 2 photos each, 5472x3648 (SIMPLE_RADIAL)",)
+    fisheye = replace(zooms[0], lens="8mm Fisheye")
+    assert notes([*zooms, *zooms, fisheye]) == (
+        "6 cameras, by EXIF and size: 1 to 2 photos each, 5472x3648 (5 SIMPLE_RADIAL, 1 OPENCV_FISHEYE)",
+    )
+
+
+def test_doubts_about_exif_are_one_note_for_a_reason_and_few_in_all():
+    crops = [sized(CAMERA, 640 + 8 * (n // 2), 640) for n in range(14)]
+    photos = [photo(f"{n:02}.jpg", exif, size=(exif.width, exif.height)) for n, exif in enumerate(crops)]
+    _, *doubts = group_photos(Photos(Path(), tuple(photos), {}), model="auto").notes
+    assert len(doubts) == 5
+    assert doubts[0].startswith("EXIF's focal length is not used for 00.jpg and 1 more photo: EXIF is for 5472x3648")
+    assert doubts[-1] == "nor for 6 more photos, for reasons like these"
+
+
 def test_crops_of_other_pictures_are_other_cameras_and_autofocus_is_not():
     a, b = sized(CAMERA, 640, 640), replace(sized(CAMERA, 640, 640), taken_px=(4000, 3000))
     photos = [

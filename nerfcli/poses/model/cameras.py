@@ -1,6 +1,7 @@
 """Which photos share a camera, and where its intrinsics start: by EXIF and size, or as they are known beforehand."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,8 @@ from nerfcli.poses.model.intrinsics import START_FISHEYE, START_MODEL
 
 # How intrinsics that are given are used: as they are, or as where the adjustment starts.
 USES = ("fixed", "prior")
+# So many cameras are named one by one.
+_MOST_LISTED = 4
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,13 @@ def group_photos(photos: Photos, *, model: str) -> Grouped:
     Where EXIF is of another picture than the file, its focal length is where the adjustment starts, but no prior.
     """
     numbers = {name: number for number, name in enumerate(photos.names)}
-    groups, notes = [], []
+    groups: list[CameraGroup] = []
+    doubted: dict[str, list[str]] = {}
     for names in camera_groups(photos.photos):
         first = photos.photos[numbers[names[0]]]
         evidence = focal_evidence(first.exif)
         if evidence.doubt and (first.exif.focal_mm or first.exif.focal_35mm):
-            which = f"{first.name} and {len(names) - 1} more photos" if len(names) > 1 else first.name
-            notes.append(f"EXIF's focal length is not used for {which}: {evidence.doubt}")
+            doubted.setdefault(evidence.doubt, []).extend(names)
         groups.append(
             CameraGroup(
                 photos=tuple(numbers[name] for name in names),
@@ -62,10 +65,10 @@ def group_photos(photos: Photos, *, model: str) -> Grouped:
                 focal_is_prior=evidence.focal_px is not None and evidence.holds,
             )
         )
+    notes = _doubts(doubted)
     if len(groups) == 1:
-        return Grouped(tuple(groups), tuple(notes))
-    described = ", ".join(f"{len(g.photos)} photos {g.width}x{g.height} {g.model}" for g in groups)
-    return Grouped(tuple(groups), (f"{len(groups)} cameras, by EXIF and size: {described}", *notes))
+        return Grouped(tuple(groups), notes)
+    return Grouped(tuple(groups), (f"{len(groups)} cameras, by EXIF and size: {_summary(groups)}", *notes))
 
 
 def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:
@@ -111,6 +114,37 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:
 def start_model(exif: Exif) -> str:
     """The COLMAP camera model that the mapper starts from: one distortion term, or a fisheye if the lens says so."""
     return START_FISHEYE if "fisheye" in (exif.lens or "").lower() else START_MODEL
+
+
+def _doubts(doubted: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Return a note for each reason why EXIF is not believed; of many, for the first ones, and how many more."""
+    notes = []
+    for doubt, names in list(doubted.items())[:_MOST_LISTED]:
+        which = names[0] if len(names) == 1 else f"{names[0]} and {_photos(len(names) - 1, 'more ')}"
+        notes.append(f"EXIF's focal length is not used for {which}: {doubt}")
+    rest = sum(len(names) for names in list(doubted.values())[_MOST_LISTED:])
+    return (*notes, f"nor for {_photos(rest, 'more ')}, for reasons like these") if rest else tuple(notes)
+
+
+def _summary(groups: Sequence[CameraGroup]) -> str:
+    """Return the cameras one by one if they are few, else how many photos they took, in which sizes."""
+    counts = [len(group.photos) for group in groups]
+    if len(groups) <= _MOST_LISTED:
+        return ", ".join(f"{_photos(len(g.photos))} of {g.width}x{g.height} ({g.model})" for g in groups)
+    each = "one photo" if max(counts) == 1 else f"{min(counts)} to {max(counts)} photos"
+    if min(counts) == max(counts) > 1:
+        each = f"{max(counts)} photos"
+    sizes = sorted({(group.width, group.height) for group in groups}, key=lambda size: (size[0] * size[1], size))
+    of_size = "{}x{}".format(*sizes[-1])
+    if len(sizes) > 1:
+        of_size = f"{len(sizes)} sizes from {'{}x{}'.format(*sizes[0])} to {of_size}"
+    models = Counter(group.model for group in groups).most_common()
+    of_model = ", ".join(name if len(models) == 1 else f"{count} {name}" for name, count in models)
+    return f"{each} each, {of_size} ({of_model})"
+
+
+def _photos(count: int, more: str = "") -> str:
+    return f"{count} {more}photo{'' if count == 1 else 's'}"
 
 
 def _notes(given: GivenIntrinsics, found: Sequence[Calibrated]) -> tuple[str, ...]:
