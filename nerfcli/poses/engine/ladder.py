@@ -19,6 +19,7 @@ from nerfcli.poses.engine.mapped import Mapped
 from nerfcli.poses.engine.mapping import Start, map_photos
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
+from nerfcli.poses.input.plan import extraction_seconds, matching_seconds
 from nerfcli.poses.input.settings import FULL_SIZE
 from nerfcli.poses.model.intrinsics import field_of_view_deg
 from nerfcli.poses.model.lens_family import as_fisheye
@@ -36,6 +37,8 @@ _LITTLE_SHARE = 0.5
 _MOST_PAIRS = 12_000
 _MOST_FULL_SIZE = 150
 _MORE_FEATURES = 8192
+# Searching larger pictures may take so many times as long as the first search, times the share of photos missing.
+_MOST_FOR_MORE = 10.0
 # A perspective lens from here on may be a fisheye.
 _WIDE_DEG = 100.0
 # Each takes some seconds; where more are missing, it is not single photos that are.
@@ -57,11 +60,12 @@ class _Ladder:
         self._told = 0
         self._announced = ""
 
-    def announce(self, what: str) -> None:
-        """Tell what the rungs so far gave, and once what comes next."""
+    def announce(self, what: str, *, takes: float = 0.0) -> None:
+        """Tell what the rungs so far gave, and once what comes next, and how much longer than before that takes."""
         self.tell_results()
         if what != self._announced:
-            self._tell(f"next: {what}")
+            longer = f" (takes about {takes:.1f} times as long as the first features and matches)" if takes else ""
+            self._tell(f"next: {what}{longer}")
         self._announced = what
 
     def tell_results(self) -> None:
@@ -166,23 +170,38 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
         match(job, rest, report)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)
     if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE:
-        ladder.announce("more features from full-size photos")
-        full = replace(
-            job,
-            rung="full-size",
-            max_image_size=FULL_SIZE,
-            max_features=_MORE_FEATURES,
-            pairs=all_pairs(len(job.files)),
-        )
-        extract(full, report)
-        start_matching(full, full.pairs)
-        match(full, full.pairs, report)
-        ladder.attempt("more features from full-size photos", full, Start())
-        _other_starts(ladder, full)
+        _with_more_features(ladder, job, report, missing=1 - ladder.share(featured))
     ladder.find_left_out("remaining photos one by one, from the 3D points they see")
     if len(ladder.rungs) > 1:
         ladder.tell_results()
     return replace(ladder.best, attempts=ladder.rungs)
+
+
+def _with_more_features(ladder: _Ladder, job: Job, report: Report, *, missing: float) -> None:
+    """Search larger pictures for more features, for at most as long as the missing share of the photos is worth."""
+    longest = max(max(group.width, group.height) for group in job.groups)
+    more = replace(job, rung="full-size", max_features=_MORE_FEATURES, pairs=all_pairs(len(job.files)))
+    so_far = _search_seconds(job)
+    matching = _search_seconds(replace(more, max_image_size=0))
+    full = _search_seconds(replace(more, max_image_size=FULL_SIZE)) - matching
+    allowed = _MOST_FOR_MORE * missing * so_far - matching
+    share = min(1.0, max(allowed, 0.0) / full) ** 0.5  # of the longer side: the time goes with the area
+    size = max(round(share * longest), job.max_image_size)
+    what = "more features from full-size photos" if share == 1 else f"more features from photos of {size} pixels"
+    more = replace(more, max_image_size=FULL_SIZE if share == 1 else size)
+    ladder.announce(what, takes=_search_seconds(more) / so_far)
+    extract(more, report)
+    start_matching(more, more.pairs)
+    match(more, more.pairs, report)
+    ladder.attempt(what, more, Start())
+    _other_starts(ladder, more)
+
+
+def _search_seconds(job: Job) -> float:
+    """CPU seconds, about, of a job's features and matches."""
+    sizes = ((group.width, group.height) for group in job.groups for _ in group.photos)
+    features = extraction_seconds(sizes, max_image_size=job.max_image_size)
+    return features + matching_seconds(len(job.pairs), max_features=job.max_features)
 
 
 def _other_starts(ladder: _Ladder, job: Job) -> None:

@@ -1,7 +1,7 @@
 """What structure from motion is about to do and about how long it will take: said before it starts."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -54,14 +54,11 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
     count = len(photos.photos)
     all_pairs = count * (count - 1) // 2
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
-    megapixels = 0.0
-    for photo in photos.photos:
-        scale = min(1.0, settings.max_image_size / max(photo.width, photo.height))
-        megapixels += photo.width * photo.height * scale**2 / 1e6
+    sizes = [(photo.width, photo.height) for photo in photos.photos]
     seconds = {
-        "extract": megapixels * _SECONDS_PER_MEGAPIXEL / threads,
+        "extract": extraction_seconds(sizes, max_image_size=settings.max_image_size) / threads,
         "pair": all_pairs * _SECONDS_PER_LOOK / threads if pairing.neighbours else 0.0,
-        "match": pairs * _SECONDS_PER_PAIR * settings.max_features / _FEATURES_PER_PAIR / threads,
+        "match": matching_seconds(pairs, max_features=settings.max_features) / threads,
         "map": count * (_MAP_SECONDS_PER_PHOTO + count * _MAP_SECONDS_PER_TWO),
         "check": _CHECK_SECONDS + count * _CHECK_SECONDS_PER_PHOTO,
     }
@@ -73,6 +70,17 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
         pairs=pairs,
         seconds={stage: round(value, 1) for stage, value in seconds.items() if value > 0},
     )
+
+
+def extraction_seconds(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> float:
+    """CPU seconds to find features in photos of these sizes (width, height)."""
+    scaled = (width * height * min(1.0, max_image_size / max(width, height)) ** 2 for width, height in sizes)
+    return sum(scaled) / 1e6 * _SECONDS_PER_MEGAPIXEL
+
+
+def matching_seconds(pairs: int, *, max_features: int) -> float:
+    """CPU seconds to match so many pairs of photos."""
+    return pairs * _SECONDS_PER_PAIR * max_features / _FEATURES_PER_PAIR
 
 
 class Outlook:
