@@ -396,6 +396,31 @@ def observed_model(
     return model
 
 
+def bent(model: pycolmap.Reconstruction, first: int) -> pycolmap.Reconstruction:
+    """The photos from `first` on and half of the points turned by 40 degrees about an axis outside the scene.
+
+    All residuals within either half stay as they are; observations across are deleted, as a mapper would.
+    """
+    wrong = pycolmap.Reconstruction(model)
+    angle = np.radians(40)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    move = pycolmap.Rigid3d(np.column_stack([turn, [2.0, 0.0, 0.5]]))
+    for point_id in sorted(wrong.point3D_ids()):
+        elements = [(element.image_id, element.point2D_idx) for element in wrong.point3D(point_id).track.elements]
+        moved = sum(image_id >= first for image_id, _ in elements) > len(elements) / 2
+        for image_id, index in elements:
+            if (image_id >= first) != moved and wrong.exists_point3D(point_id):
+                wrong.delete_observation(image_id, index)
+        if moved and wrong.exists_point3D(point_id):
+            wrong.point3D(point_id).xyz = move * wrong.point3D(point_id).xyz
+    for image_id in wrong.reg_image_ids():
+        if image_id >= first:
+            frame = wrong.frame(wrong.image(image_id).frame_id)
+            frame.rig_from_world = wrong.image(image_id).cam_from_world() * move.inverse()
+    wrong.update_point_3d_errors()
+    return wrong
+
+
 def photo_name(number: int) -> str:
     """As the worker numbers photos."""
     return f"{number:05d}.jpg"

@@ -112,34 +112,9 @@ def test_every_rotation_of_a_pair_agrees_with_a_right_result(solved: Solved):
     assert max(error.degrees for error in errors) < 6
 
 
-def bent(model: pycolmap.Reconstruction, first: int) -> pycolmap.Reconstruction:
-    """The photos from `first` on and half of the points turned by 40 degrees about an axis outside the scene.
-
-    All residuals within either half stay as they are; observations across are deleted, as a mapper would.
-    """
-    wrong = pycolmap.Reconstruction(model)
-    angle = np.radians(40)
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    move = pycolmap.Rigid3d(np.column_stack([turn, [2.0, 0.0, 0.5]]))
-    for point_id in sorted(wrong.point3D_ids()):
-        elements = [(element.image_id, element.point2D_idx) for element in wrong.point3D(point_id).track.elements]
-        moved = sum(image_id >= first for image_id, _ in elements) > len(elements) / 2
-        for image_id, index in elements:
-            if (image_id >= first) != moved and wrong.exists_point3D(point_id):
-                wrong.delete_observation(image_id, index)
-        if moved and wrong.exists_point3D(point_id):
-            wrong.point3D(point_id).xyz = move * wrong.point3D(point_id).xyz
-    for image_id in wrong.reg_image_ids():
-        if image_id >= first:
-            frame = wrong.frame(wrong.image(image_id).frame_id)
-            frame.rig_from_world = wrong.image(image_id).cam_from_world() * move.inverse()
-    wrong.update_point_3d_errors()
-    return wrong
-
-
 def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     """Two halves, each right in itself: what the reprojection error praises, the matches between them refuse."""
-    wrong = bent(solved.model, 6)
+    wrong = synthetic.bent(solved.model, 6)
     assert wrong.compute_mean_reprojection_error() < 1.05 * solved.model.compute_mean_reprojection_error()
     with pycolmap.Database.open(str(solved.job.database)) as database:
         pairs = read_verified_pairs(database, min_matches=15)
@@ -155,7 +130,9 @@ def wrongly_mapped(solved: Solved, folder: Path) -> Mapped:
     """The whole capture with photos 8, 9 and 10 in a wrong place, as a mapper leaves it that was misled."""
     shutil.copytree(solved.job.database.parent, folder)
     job = replace(solved.job, folder=str(folder / "work"))
-    return Mapped([bent(solved.model, 8)], job, [{"what": "default thresholds", "models": [10]}], seconds=1000.0)
+    return Mapped(
+        [synthetic.bent(solved.model, 8)], job, [{"what": "default thresholds", "models": [10]}], seconds=1000.0
+    )
 
 
 def test_a_contradicted_model_is_mapped_again_from_its_sound_part(solved: Solved, tmp_path: Path):
@@ -216,7 +193,7 @@ def test_groups_hold_together_against_what_speaks_against_them():
 
 def test_one_photo_that_contradicts_is_left_out(solved: Solved):
     """A tenth of the photos; the others are accepted."""
-    wrong = bent(solved.model, 10)
+    wrong = synthetic.bent(solved.model, 10)
     with pycolmap.Database.open(str(solved.job.database)) as database:
         pairs = read_verified_pairs(database, min_matches=15)
     rest, left_out = leave_out_contradicting(wrong, pairs)

@@ -138,14 +138,16 @@ def closing_notes(report: PosesReport) -> list[str]:
         notes.append(
             f"component {number} has {component['size']} photos ({some}){why}; use it with --component {number}"
         )
-    for camera in report.cameras:
-        certain = camera.get("uncertainty")
-        if certain and certain["weak"]:
-            notes.append(
-                f"intrinsics are weakly determined (camera of {camera['images']} photos: focal length ± "
-                f"{certain['focal_percent']:.1f} %, distortion ± {certain['distortion_border_px']:.1f} px at the "
-                "corners): give --intrinsics"
-            )
+    weak = [camera for camera in report.cameras if (camera.get("uncertainty") or {}).get("weak")]
+    if weak:
+        worst = max(weak, key=lambda camera: camera["uncertainty"]["focal_percent"])
+        certain, images = worst["uncertainty"], worst["images"]
+        which = f"{len(weak)} cameras; the worst, with" if len(weak) > 1 else "camera with"
+        notes.append(
+            f"intrinsics are weakly determined ({which} {images} photo{'' if images == 1 else 's'}: focal length ± "
+            f"{certain['focal_percent']:.1f} %, distortion ± {certain['distortion_border_px']:.1f} px at the corners): "
+            "give --intrinsics"
+        )
     for check, why in report.not_computed.items():
         notes.append(f"could not compute a check ({check}): {why}")
     return notes

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from nerfcli.atomic import atomic_folder, clear_leftovers
 from nerfcli.exclusive import exclusive
-from nerfcli.poses.engine.mapped import FIRST
+from nerfcli.poses.engine.mapped import COMPONENTS, FIRST
 from nerfcli.poses.input.job import database_path
 from nerfcli.scene import SCENE_FILE
 
@@ -69,7 +69,7 @@ def publish(scene_dir: Path, describe: Callable[[], None], *, keep_models: bool)
         shutil.copytree(work / "sparse" / "0", sparse / "0")
     describe()
     shutil.rmtree(scene_dir / REFUSED, ignore_errors=True)
-    kept = {FIRST} if keep_models else set()
+    kept = {FIRST, COMPONENTS} if keep_models else set()
     for path in work.iterdir():
         if path.name in kept or (path.suffix in (".json", ".lock") and path.stem not in ("job", "result")):
             continue

@@ -21,6 +21,8 @@ from nerfcli.poses.input.stages import file_key, read_stage, stage_key, write_st
 
 # Of the attempts that the ladder makes.
 FIRST = "mapped"
+# After the second chance of the largest model.
+COMPONENTS = "components"
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import pycolmap
 from nerfcli.poses.engine.database import keep_geometries
 from nerfcli.poses.engine.ladder import SMALLER_BASELINE
 from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.mapping import Start, map_globally, map_photos
+from nerfcli.poses.engine.mapping import Start, map_globally, map_photos, photo_numbers
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import capture_order
 from nerfcli.poses.input.plan import duration
@@ -48,16 +48,23 @@ class Chance:
 
 
 def second_chance(
-    mapped: Mapped, first: Examined, report: Report, tell: Tell, *, checks: Callable[[], Checks]
+    mapped: Mapped,
+    first: Examined,
+    report: Report,
+    tell: Tell,
+    *,
+    checks: Callable[[], Checks],
+    component: int = 1,
 ) -> Chance:
     """Map again under one hypothesis after the other until the checks accept a model.
 
     Args:
-        mapped: the models that the checks refused.
+        mapped: the model that the checks refused, and the smaller ones.
         first: what they said.
         report: called with (stage, done, total).
         tell: called with what the user should know.
         checks: makes the runner of the checks of one more model.
+        component: what the user calls this model. From 2 on, its photos are mapped again by themselves.
 
     Returns:
         The first accepted model; else the largest part of a model that is accepted by itself; else what was given.
@@ -65,7 +72,11 @@ def second_chance(
     start = time.perf_counter()
     pairs = first.verdict.measures["pairs"]
     against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
-    tell(f"{against}: mapping again, for at most {duration(_MOST_TIME * mapped.seconds)}")
+    which = "" if component == 1 else f" the photos of component {component}"
+    tell(f"{against}: mapping{which} again, for at most {duration(_MOST_TIME * mapped.seconds)}")
+    if component > 1:
+        mapped = replace(mapped, job=_job_of(mapped.models[0], mapped.job))
+    names = "second-chance" if component == 1 else f"component-{component}-second-chance"
     attempts = list(mapped.attempts)
     core = _core(mapped.models[0], mapped.job)
     at_once: list[Mapped] = []  # what the global mapper gave, to build upon
@@ -90,7 +101,7 @@ def second_chance(
             continue
         tell(f"next: {what}")
         runner = checks()
-        found = runner.run(what, partial(_kept, mapped.job, f"second-chance-{number}", make), otherwise=None)
+        found = runner.run(what, partial(_kept, mapped.job, f"{names}-{number}", make), otherwise=None)
         if found is None or not found.models:
             tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
             continue
@@ -104,6 +115,12 @@ def second_chance(
         if examined.verdict.accepted:
             return Chance(replace(found, attempts=attempts), examined)
     return Chance(replace(mapped, attempts=attempts), first)
+
+
+def _job_of(model: pycolmap.Reconstruction, job: Job) -> Job:
+    """Return the job without the pairs of photos that the model does not place."""
+    photos = set(photo_numbers(model, job))
+    return replace(job, pairs=tuple(pair for pair in job.pairs if photos.issuperset(pair)))
 
 
 def is_contradicted(verdict: Verdict) -> bool:

@@ -25,6 +25,7 @@ from typing import Any
 import pycolmap
 
 from nerfcli.finite import finite
+from nerfcli.poses.engine.chosen import choose_component
 from nerfcli.poses.engine.components import describe_components
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images
 from nerfcli.poses.engine.features import extract, match, start_matching
@@ -32,13 +33,11 @@ from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
 from nerfcli.poses.engine.retrieval import with_neighbours
-from nerfcli.poses.engine.second_chance import is_contradicted, second_chance
 from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import recalled, with_object_masks
 from nerfcli.poses.input.job import Job, Report, Tell, read_job
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.judge.checks import Checks
-from nerfcli.poses.judge.examine import examine
 
 # The last stage's file: what the report needs. The model stands beside it, in sparse/0.
 RESULT = "result.json"
@@ -112,20 +111,14 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     """Write `sparse/0` if there is a model, and return what the report needs."""
     seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
     mapped = _mapped(job, report, tell, seconds=seconds)
-    checks = Checks(Path(job.folder), skip=dict(job.skipped_checks))
+
+    def checks() -> Checks:
+        return Checks(Path(job.folder), skip=dict(job.skipped_checks))
+
     with _timed(seconds, "check"):
-        wanted, others = _split(mapped.models, job.component)
-        examined = examine(wanted, mapped.job, report, localised=mapped.localised, checks=checks)
-        if job.component == 1 and is_contradicted(examined.verdict):
-            chance = second_chance(
-                mapped,
-                examined,
-                report,
-                tell,
-                checks=lambda: Checks(Path(job.folder), skip=dict(job.skipped_checks)),
-            )
-            mapped, examined = chance.mapped, chance.examined
-            others = mapped.models[1:]
+        chosen = choose_component(mapped, report, tell, component=job.component, checks=checks)
+    mapped, examined = chosen.mapped, chosen.examined
+    others = [*mapped.models[: job.component - 1], *mapped.models[job.component :]]
     model = examined.model
     placed = [] if model is None else photo_numbers(model, job)
     result: dict[str, Any] = {
@@ -142,7 +135,9 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
         **examined.details,
     }
     if model is not None:
-        model = _coloured(model, job, checks)
+        colouring = checks()
+        model = _coloured(model, job, colouring)
+        result["not_computed"] |= colouring.not_computed
         result["mean_reprojection_error_px"] = model.compute_mean_reprojection_error()
         result["cameras"] = describe_cameras(model, job, examined.uncertainty)
         result["points"] = model.num_points3D()
@@ -177,13 +172,6 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
 
 def _coloured(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> pycolmap.Reconstruction:
     return checks.run("colours of points", lambda: with_colours(model, job), otherwise=model)
-
-
-def _split(
-    models: list[pycolmap.Reconstruction], component: int
-) -> tuple[list[pycolmap.Reconstruction], list[pycolmap.Reconstruction]]:
-    """Return the wanted model, as a list of one or none, and the others."""
-    return models[component - 1 : component], [*models[: component - 1], *models[component:]]
 
 
 def _is_complete(job: Job, key: str) -> bool:

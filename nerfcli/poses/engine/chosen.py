@@ -1,0 +1,107 @@
+"""Judge the component that becomes the scene, and keep the numbers by which the report lists all of them.
+
+Components are numbered by size, after the second chance of the largest: it may take in photos of the others, or lose
+some. So whoever asks for a smaller one gets the one that the report lists under this number.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pycolmap
+
+from nerfcli.poses.engine.mapped import COMPONENTS, FIRST, Mapped, mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.second_chance import is_contradicted, second_chance
+from nerfcli.poses.input.job import Job, Report, Tell
+from nerfcli.poses.input.stages import read_stage, write_stage
+from nerfcli.poses.judge.checks import Checks
+from nerfcli.poses.judge.examine import Examined, examine
+
+# As many photos of its own make a component.
+_LEAST_PHOTOS = 3
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What was examined, and the models in the order of their numbers, the examined one among them."""
+
+    mapped: Mapped
+    examined: Examined
+
+
+def choose_component(
+    mapped: Mapped, report: Report, tell: Tell, *, component: int, checks: Callable[[], Checks]
+) -> Chosen:
+    """Examine one component, and give it a second chance if pairs of photos contradict it.
+
+    Args:
+        mapped: the models of the first mapping.
+        report: called with (stage, done, total).
+        tell: called with what the user should know.
+        component: its number, from 1 on; there may be none of that number.
+        checks: makes the runner of the checks of one model.
+    """
+    if component == 1:
+        return _largest(mapped, report, tell, checks=checks)
+    numbered = _numbered(mapped)
+    if numbered is None:
+        tell("component 1 is checked first, as the others are numbered after it")
+        numbered = _largest(mapped, report, tell, checks=checks).mapped
+    index = component - 1
+    wanted, others = numbered.models[index : index + 1], [*numbered.models[:index], *numbered.models[index + 1 :]]
+    examined = examine(wanted, numbered.job, report, checks=checks())
+    if not is_contradicted(examined.verdict):
+        return Chosen(numbered, examined)
+    size, placed = wanted[0].num_reg_images(), sum(model.num_reg_images() for model in numbered.models)
+    alone = replace(numbered, models=[*wanted, *others], seconds=numbered.seconds * size / placed, localised=())
+    chance = second_chance(alone, examined, report, tell, checks=checks, component=component)
+    models = [*numbered.models[:index], chance.mapped.models[0], *numbered.models[index + 1 :]]
+    return Chosen(replace(numbered, models=models, attempts=chance.mapped.attempts), chance.examined)
+
+
+def _largest(mapped: Mapped, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> Chosen:
+    known = _numbered(mapped) or mapped
+    examined = examine(known.models[:1], known.job, report, localised=known.localised, checks=checks())
+    if not is_contradicted(examined.verdict):
+        if known is mapped:
+            _keep_numbers(mapped.job, FIRST)
+        return Chosen(known, examined)
+    chance = second_chance(mapped, examined, report, tell, checks=checks)
+    if not chance.examined.verdict.accepted:
+        _keep_numbers(mapped.job, FIRST)
+        return Chosen(chance.mapped, chance.examined)
+    first, *found = chance.mapped.models
+    numbered = replace(chance.mapped, models=[first, *_with_photos_of_their_own(first, [*found, *mapped.models[1:]])])
+    write_mapped(numbered, mapping_key(mapped.job), name=COMPONENTS)
+    _keep_numbers(mapped.job, COMPONENTS)
+    return Chosen(numbered, chance.examined)
+
+
+def _with_photos_of_their_own(
+    first: pycolmap.Reconstruction, others: Sequence[pycolmap.Reconstruction]
+) -> list[pycolmap.Reconstruction]:
+    """Return the models of which most photos are in no larger one, the largest first."""
+    taken, kept = set(first.reg_image_ids()), []
+    for model in sorted(others, key=lambda model: -model.num_reg_images()):
+        photos = set(model.reg_image_ids())
+        own = photos - taken
+        if len(own) >= _LEAST_PHOTOS and 2 * len(own) > len(photos):
+            kept.append(model)
+            taken |= photos
+    return kept
+
+
+def _numbered(mapped: Mapped) -> Mapped | None:
+    """Return the models in the order in which an earlier call has listed them; None if none has, or they are gone."""
+    name = read_stage(_stage(mapped.job), mapping_key(mapped.job))
+    if name is None or name == FIRST:
+        return None if name is None else mapped
+    return read_mapped(mapped.job, mapping_key(mapped.job), name=name)
+
+
+def _keep_numbers(job: Job, name: str) -> None:
+    write_stage(_stage(job), mapping_key(job), name)
+
+
+def _stage(job: Job) -> Path:
+    return Path(job.folder) / "numbering.json"
