@@ -51,7 +51,8 @@ def test_one_step_is_where_an_adjustment_goes():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_highlights_free_no_parameter_that_is_not_there(seed: int):
-    found = determine(robot_capture(seed=seed, shiny=0.4), 1, seed=0)
+    model = robot_capture(seed=seed, shiny=0.4)
+    found = determine(model, 1, mapped=model, seed=0)
     assert not found.principal_point
     assert found.camera.model.name in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pycolmap
 import pytest
 import synthetic_captures as synthetic
-from synthetic_captures import Lens
+from synthetic_captures import WIDE, Lens
 
 from nerfcli.poses.judge.uncertainty import pose_blur_px
 from nerfcli.poses.model import held_out
@@ -84,6 +84,25 @@ def test_a_principal_point_off_the_centre_is_found():
     lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1)
     assert camera_of(lenses.model).params[1:3] == pytest.approx((527.0, 380.0), abs=2.0)
     assert any(candidate.principal_point and candidate.kept for candidate in lenses.candidates)
+
+
+@pytest.mark.parametrize(("exif", "seed"), [(800.0, 0), (790.0, 1), (None, 2), (None, 3)])
+def test_a_focal_length_that_flat_ground_from_above_leaves_open_stays_at_exif(exif: float | None, seed: int):
+    """Height and focal length trade off. With EXIF's, distortion is right too; without it, the lens stays plausible."""
+    views = synthetic.above(16, WIDE, seed=seed)
+    points, noise_px = (300, 0.7) if exif is None else (600, 0.5)
+    ground = synthetic.wall(points, seed=seed, size=9.0)
+    noisy = synthetic.observed_model(views, ground, noise_px=noise_px, seed=seed)
+    focal_px = {} if exif is None else {1: exif}
+    lenses = choose_lenses(started_from(noisy, "SIMPLE_RADIAL"), seed=0, threads=1, exif_focal_px=focal_px)
+    camera, certain = camera_of(lenses.model), lenses.uncertainty[1]
+    assert certain["weak"]
+    assert certain["focal_percent"] > 3
+    if exif is None:
+        assert camera.mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.4)
+    else:
+        assert camera.mean_focal_length() == exif
+        assert camera.params[3] == pytest.approx(WIDE.params[3], abs=0.006)
 
 
 def test_intrinsics_that_are_given_stay():

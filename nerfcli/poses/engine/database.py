@@ -16,7 +16,7 @@ from typing import Any
 
 import pycolmap
 
-from nerfcli.poses.input.job import CameraGroup, Job
+from nerfcli.poses.input.job import CameraGroup, Job, usual_focal_px
 
 # In pycolmap a pair's id is this times the smaller image id, plus the larger one.
 _PAIR_FACTOR = 2147483647
@@ -74,7 +74,7 @@ def camera_of_group(group: CameraGroup) -> pycolmap.Camera:
         camera.params = list(group.params)
         camera.has_prior_focal_length = True
         return camera
-    focal_px = 1.2 * max(group.width, group.height) if group.focal_px is None else group.focal_px
+    focal_px = usual_focal_px(group.width, group.height) if group.focal_px is None else group.focal_px
     camera = pycolmap.Camera.create_from_model_name(1, group.model, focal_px, group.width, group.height)
     camera.has_prior_focal_length = group.focal_is_prior
     return camera

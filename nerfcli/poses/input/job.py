@@ -36,6 +36,11 @@ class CameraGroup:
         return replace(self, focal_px=None, focal_is_prior=False)
 
 
+def usual_focal_px(width: int, height: int) -> float:
+    """Return the focal length to start from where nothing is known of it, as COLMAP does."""
+    return 1.2 * max(width, height)
+
+
 @dataclass(frozen=True)
 class LaidOutMask:
     """Of one photo: a hash of which pixels are used, "" without a mask, and their share."""

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from scipy.stats import chi2
 
+from nerfcli.poses.input.job import usual_focal_px
 from nerfcli.poses.model.lens_evidence import (
     NAMES,
     Estimate,
@@ -28,8 +29,11 @@ _CHANCE = 5e-4
 # Where one distortion term moves the corner by less than this share of its distance from the centre, one way or the
 # other, it may be free without being sure of it: it does no harm.
 _HARMLESS = 0.003
-# Standard deviation of a focal length by EXIF; and from where on a focal length is said to be uncertain.
+# Standard deviation of a focal length by EXIF, and of one of which nothing is known, between a fisheye and a small
+# telephoto lens; from where on one without EXIF is held; and from where on it is said to be uncertain.
 _EXIF_DEVIATION = 0.03
+_UNKNOWN_DEVIATION = 0.35
+_OPEN_DEVIATION = 0.05
 _WEAK_FOCAL = 0.01
 _WEAK_BORDER = 0.005
 # A principal point farther than this from the centre, as a share of the size, is a fit to something else.
@@ -66,7 +70,7 @@ class Determined:
     Args:
         camera: the camera with the parameters as estimated in one step, from which an adjustment starts.
         principal_point: whether it is free.
-        held: whether all intrinsics stay as they are, since the observations leave the focal length open.
+        held: whether the focal length stays as it is in `camera`, since the observations leave it open.
         steps: the decisions, in their order.
     """
 
@@ -80,6 +84,7 @@ def determine(
     model: pycolmap.Reconstruction,
     camera_id: int,
     *,
+    mapped: pycolmap.Reconstruction,
     seed: int,
     fixed: Sequence[int] = (),
     named: bool = False,
@@ -88,6 +93,7 @@ def determine(
     """What a converged model determines of a perspective camera's lens.
 
     Args:
+        mapped: the model before it was adjusted to the end, when a focal length that is left open had not yet strayed.
         seed: see `lens_evidence`.
         fixed: cameras whose intrinsics are exact.
         named: whether the camera keeps its model; its principal point may still become free.
@@ -110,15 +116,13 @@ def determine(
         steps.append(_step(tried, distance, taken=distance > 1, camera=camera if named else None))
         free = tried if distance > 1 else free
     found = evidence.estimate(free)
-    if not named and "k2" not in free:
-        free, found = _with_or_without_distortion(evidence, free, found, camera, steps)
+    # Where the focal length is open, so is distortion with it: without the one, the other would go astray.
     share = found.deviation("f") / camera.mean_focal_length()
-    if exif_focal_px is not None and share > _EXIF_DEVIATION and not named:
-        held = pycolmap.Camera.create_from_model_name(
-            camera_id, "SIMPLE_PINHOLE", exif_focal_px, camera.width, camera.height
-        )
-        held.has_prior_focal_length = True
-        return Determined(held, False, True, tuple(steps))
+    if not named and not share <= (_OPEN_DEVIATION if exif_focal_px is None else _EXIF_DEVIATION):
+        focal_px = exif_focal_px or _between_px(mapped, camera_id, seed=seed, fixed=fixed)
+        return Determined(_held(mapped.cameras[camera_id], focal_px), False, True, tuple(steps))
+    if not named and "k2" not in free and share <= _EXIF_DEVIATION:
+        free, found = _with_or_without_distortion(evidence, free, found, camera, steps)
     return Determined(_camera(camera, found, named=named), "cx" in free, False, tuple(steps))
 
 
@@ -181,14 +185,54 @@ def _with_or_without_distortion(
     evidence: LensEvidence, free: list[str], found: Estimate, camera: pycolmap.Camera, steps: list[Step]
 ) -> tuple[list[str], Estimate]:
     """The free parameters without k1, if it is neither sure nor harmless."""
-    harmless = _border_px(evidence, found, "k1") < _HARMLESS * np.hypot(camera.width, camera.height) / 2
     distance = found.distance(["k1"]) / float(chi2.isf(_CHANCE, 1))
-    if harmless or distance > 1:
+    if _is_harmless(evidence, found, camera) or distance > 1:
         return free, found
     free = [name for name in free if name != "k1"]
     # What the model has of it now goes to zero, and the others follow.
     steps.append(_step(free, distance, taken=True, camera=None))
     return free, evidence.without("k1").estimate(free)
+
+
+def _between_px(mapped: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int]) -> float:
+    """Return a focal length between that of a mapped model and a usual one, each by its uncertainty (in logarithms)."""
+    camera = mapped.cameras[camera_id]
+    focal_px, usual_px = camera.mean_focal_length(), usual_focal_px(camera.width, camera.height)
+    try:
+        found = lens_evidence(mapped, camera_id, seed=seed, fixed=fixed).estimate(parameters_of(camera))
+    except (UndeterminedError, np.linalg.LinAlgError):
+        return usual_px
+    weights = np.array([found.deviation("f") / focal_px, _UNKNOWN_DEVIATION]) ** -2.0
+    return float(np.exp(weights @ np.log([focal_px, usual_px]) / weights.sum()))
+
+
+def _held(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
+    """Return the camera with another focal length and the same distortion in pixels: k1 r^3 / f^2 at a radius r."""
+    held = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, "SIMPLE_RADIAL", focal_px, camera.width, camera.height
+    )
+    if "k1" in parameters_of(camera):
+        k1 = camera.params[camera.extra_params_idxs()[0]]
+        _set(held, held.extra_params_idxs(), [k1 * (focal_px / camera.mean_focal_length()) ** 2])
+    held.has_prior_focal_length = True
+    return held
+
+
+def has_open_distortion(
+    model: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int] = ()
+) -> bool:
+    """Whether the one distortion term of a camera is neither sure nor harmless, its focal length being as it is."""
+    camera = model.cameras[camera_id]
+    try:
+        evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
+        found = evidence.estimate(["k1"])
+    except (UndeterminedError, np.linalg.LinAlgError):
+        return True
+    return not _is_harmless(evidence, found, camera) and found.distance(["k1"]) <= float(chi2.isf(_CHANCE, 1))
+
+
+def _is_harmless(evidence: LensEvidence, found: Estimate, camera: pycolmap.Camera) -> bool:
+    return _border_px(evidence, found, "k1") < _HARMLESS * float(np.hypot(camera.width, camera.height)) / 2
 
 
 def _border_px(evidence: LensEvidence, found: Estimate, name: str) -> float:

@@ -75,6 +75,7 @@ def adjust(
     *,
     threads: int,
     principal_points: bool = False,
+    focal_lengths: bool = True,
     fixed: Sequence[int] = (),
     robust_px: float | None = None,
 ) -> pycolmap.CeresBundleAdjuster:
@@ -84,12 +85,14 @@ def adjust(
         model: what is adjusted.
         threads: -1 for all.
         principal_points: whether they are adjusted too.
+        focal_lengths: whether they are adjusted too.
         fixed: camera ids whose intrinsics stay as they are.
         robust_px: where observations begin to count less (Cauchy's loss); None: all count by their square.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_principal_point = principal_points
+    options.refine_focal_length = focal_lengths
     options.ceres.solver_options.num_threads = threads
     # To the end: of two models that are compared, the one that was adjusted longer must not look better for that.
     options.ceres.solver_options.max_num_iterations = 200

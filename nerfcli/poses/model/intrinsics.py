@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from nerfcli.poses.model import held_out
-from nerfcli.poses.model.determined import Determined, determine, is_centred, uncertainty
+from nerfcli.poses.model.determined import Determined, determine, has_open_distortion, is_centred, uncertainty
 from nerfcli.poses.model.lens_evidence import UndeterminedError, parameters_of
 
 Array = NDArray[np.float64]
@@ -103,44 +103,55 @@ def choose_lenses(
     cameras = sorted((c for c in photos if c not in fixed and photos[c] >= _LEAST_PHOTOS), key=lambda c: -photos[c])
     candidates: list[Candidate] = []
     freed: list[int] = []
-    held: list[int] = []
+    held: dict[int, Determined] = {}
     result = pycolmap.Reconstruction(model)
     held_out.adjust(result, threads=threads, fixed=fixed)
     for camera_id in cameras[:_MOST_CAMERAS]:
         camera = result.cameras[camera_id]
-        if not parameters_of(camera) or field_of_view_deg(camera) > _FISHEYE_FROM_DEG:
-            free, tried = _by_trials(result, camera_id, seed=seed, threads=threads, fixed=fixed, named=named)
-            candidates.extend(tried)
-        else:
+        exif = (exif_focal_px or {}).get(camera_id)
+        wide = _field_by_exif_deg(camera, exif) > _FISHEYE_FROM_DEG
+        found = None
+        if parameters_of(camera):
             try:
                 found = determine(
                     result,
                     camera_id,
+                    mapped=model,
                     seed=seed,
                     fixed=fixed,
                     named=camera_id in named,
-                    exif_focal_px=(exif_focal_px or {}).get(camera_id),
+                    exif_focal_px=exif,
                 )
             except (UndeterminedError, np.linalg.LinAlgError):
-                continue  # the uncertainty says why
+                if not wide:
+                    continue  # the uncertainty says why
+        if found is not None and found.held:
+            held[camera_id] = found
+            continue
+        if found is None or wide:
+            free, tried = _by_trials(result, camera_id, seed=seed, threads=threads, fixed=fixed, named=named)
+            candidates.extend(tried)
+        else:
             free = found.principal_point
             candidates.extend(_decisions(camera_id, found))
             camera.model = found.camera.model
             camera.params = found.camera.params.tolist()
-            held += [camera_id] if found.held else []
         freed += [camera_id] if free else []
-    adjusted_fixed = [*fixed, *held]
+    if held:
+        return _with_held(
+            model, held, seed=seed, threads=threads, fixed=fixed, named=named, exif_focal_px=exif_focal_px
+        )
     # pycolmap frees the principal points of all cameras or of none; those of some are found first and then stay.
     everywhere = bool(freed) and len(freed) == len(photos)
     if freed and not everywhere:
         held_out.adjust(result, threads=threads, principal_points=True, fixed=[c for c in photos if c not in freed])
-    settle(result, threads=threads, principal_points=everywhere, fixed=adjusted_fixed)
+    settle(result, threads=threads, principal_points=everywhere, fixed=fixed)
     strayed = [c for c in freed if not is_centred(result.cameras[c])]
     if strayed:
         for camera_id in strayed:
             camera = result.cameras[camera_id]
             camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
-        settle(result, threads=threads, fixed=adjusted_fixed)
+        settle(result, threads=threads, fixed=fixed)
     certain = {
         camera_id: uncertainty(
             result, camera_id, principal_point=camera_id in freed and camera_id not in strayed, seed=seed, fixed=fixed
@@ -148,6 +159,43 @@ def choose_lenses(
         for camera_id in sorted(photos)[:_MOST_DESCRIBED]
     }
     return Lenses(result, candidates, certain)
+
+
+def _with_held(
+    model: pycolmap.Reconstruction,
+    held: Mapping[int, Determined],
+    *,
+    seed: int,
+    threads: int,
+    fixed: Sequence[int],
+    named: Sequence[int],
+    exif_focal_px: Mapping[int, float] | None,
+) -> Lenses:
+    """Choose the lenses anew, with the focal lengths that are left open where they are believed to be.
+
+    Only distortion follows them, and then stays; or it goes, where it is as open.
+    """
+    start = pycolmap.Reconstruction(model)
+    for camera_id, found in held.items():
+        start.cameras[camera_id].model = found.camera.model
+        start.cameras[camera_id].params = found.camera.params.tolist()
+    held_out.adjust(start, threads=threads, focal_lengths=False, fixed=[c for c in start.cameras if c not in held])
+    for camera_id in held:
+        if has_open_distortion(start, camera_id, seed=seed, fixed=[*fixed, *(c for c in held if c != camera_id)]):
+            camera = start.cameras[camera_id]
+            kept = camera.params[:3].tolist()
+            camera.model = pycolmap.CameraModelId.SIMPLE_PINHOLE
+            camera.params = kept
+    chosen = choose_lenses(
+        start, seed=seed, threads=threads, fixed=[*fixed, *held], named=named, exif_focal_px=exif_focal_px
+    )
+    decided = [decision for camera_id, found in held.items() for decision in _decisions(camera_id, found)]
+    certain = {
+        camera_id: uncertainty(chosen.model, camera_id, principal_point=False, seed=seed, fixed=fixed)
+        for camera_id in held
+        if camera_id in chosen.uncertainty
+    }
+    return Lenses(chosen.model, [*decided, *chosen.candidates], chosen.uncertainty | certain)
 
 
 def _decisions(camera_id: int, found: Determined) -> list[Candidate]:
@@ -235,6 +283,13 @@ def field_of_view_deg(camera: pycolmap.Camera) -> float:
         return 180.0
     cosine = rays[0] @ rays[1] / np.linalg.norm(rays[0]) / np.linalg.norm(rays[1])
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def _field_by_exif_deg(camera: pycolmap.Camera, exif_focal_px: float | None) -> float:
+    """Return the field of view by the focal length of EXIF; without one, by what came out, which may have strayed."""
+    if exif_focal_px is None:
+        return field_of_view_deg(camera)
+    return float(2 * np.degrees(np.arctan(np.hypot(camera.width, camera.height) / 2 / exif_focal_px)))
 
 
 class _Choice:
