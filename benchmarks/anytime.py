@@ -22,11 +22,11 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels
-from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.field.cost import field_bytes
 from nerfcli.fit.fitting import Fitting
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.train.heldout import PIXELS
+from nerfcli.train.held_out_pixels import PIXELS
 
 # Where in its budget a training is looked at.
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
@@ -81,7 +81,7 @@ def measure(capture: Capture, *, budget: float, seed: int, clock: str, threads: 
     """Train, and look at all of every held-out photo."""
     settings = TrainSettings(budget_seconds=budget, seed=seed, threads=threads)
     fitting, curve = fit(capture, settings, budget=budget, clock=clock)
-    photos = [HeldOut(photo.frame, photo.pixels, photo.used) for photo in capture.test_photos]
+    photos = [HeldOutPhoto(photo.frame, photo.pixels, photo.used) for photo in capture.test_photos]
     mean = evaluate_model(capture.model(fitting), photos, on_image=lambda done, total: None)["mean"]
     last = curve[-1]
     line = Line(

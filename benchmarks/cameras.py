@@ -32,7 +32,7 @@ from nerfcli import kernels, scene
 from nerfcli.cameras.formats.run_cameras import read_cameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, inverse, rotation_from_vector, vector_from_rotation
-from nerfcli.evaluate.protocol import Extras, HeldOut, evaluate_model
+from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
 from nerfcli.runs.components import Components
@@ -159,7 +159,7 @@ def fit(given: Scene, truth: Scene, choice: str, *, seed: int, steps: int, downs
         train(capture, run, settings, resume=False, notify=lambda text: None, on_progress=clock)
         model, cameras = load_model(run / FIELD, "cpu"), read_cameras(run)
         held_out = [  # while the run is there: it says where the photos are from where it is
-            HeldOut(photo.frame, photo.pixels, photo.used)
+            HeldOutPhoto(photo.frame, photo.pixels, photo.used)
             for photo in load_photos(cameras.test, factor=downscale, threads=1)
         ]
     pictures = Pictures(truth.train_frames)

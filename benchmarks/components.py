@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels, scene
-from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.photos.held_out_exposure import log_gains_of
 from nerfcli.photos.loading import load_photos
 from nerfcli.render.model import load_model
@@ -91,7 +91,7 @@ def fit(folder: Path, choice: str, *, seed: int, steps: int, downscale: int, sam
     photos = load_photos(capture.test_frames, factor=downscale, threads=1, masks=components.masks)
     gains = log_gains_of(capture.test_frames, model).tolist()
     held_out = [
-        HeldOut(photo.frame, photo.pixels, photo.used, log_gains=tuple(gain))
+        HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gain))
         for photo, gain in zip(photos, gains, strict=True)
     ]
     mean = evaluate_model(model, held_out, on_image=lambda done, total: None)["mean"]

@@ -29,7 +29,7 @@ from nerfcli.photos.loading import load_photos
 from nerfcli.photos.pool import PixelPool
 from nerfcli.render.model import Model
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
-from nerfcli.train.heldout import HeldoutPixels
+from nerfcli.train.held_out_pixels import HeldoutPixels
 
 # A step of a network of megabytes takes longer than the whole budget with the samples of a hash grid's.
 NETWORK_SAMPLES = 2**13

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from nerfcli.media.arrays import write_npy, write_npz
-from nerfcli.media.depth import DepthMeta
+from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.exr import write_exr
 from nerfcli.media.float_tiff import write_tiff
 from nerfcli.media.levels import write_png16

@@ -8,12 +8,12 @@ import pytest
 from conftest import SPHERES
 from typer.testing import CliRunner
 
-from nerfcli.ablate.results import Measured, half_interval, rows_of
-from nerfcli.ablate.variants import CHOSEN, Capture, Variant, variants
+from nerfcli.ablate.results import MeasuredTraining, half_interval, rows_of
+from nerfcli.ablate.variants import CHOSEN, CaptureTraits, Variant, variants
 from nerfcli.cli import app
 from nerfcli.runs.components import CHOICES, Components
 
-ALL = Capture(has_alpha=False, has_points=True, has_exif=True)
+ALL = CaptureTraits(has_alpha=False, has_points=True, has_exif=True)
 
 
 def test_every_component_is_varied_but_those_that_change_what_is_measured():
@@ -31,7 +31,7 @@ def test_every_component_is_varied_but_those_that_change_what_is_measured():
 
 
 def test_what_the_capture_cannot_have_is_not_tried():
-    found = {variant.name for variant in variants(Components(), Capture(True, False, False))}
+    found = {variant.name for variant in variants(Components(), CaptureTraits(True, False, False))}
     assert not {"background=sphere", "points=0.1", "exposure=exif"} & found
     assert [v.name for v in variants(Components(view=0), ALL, only=("view",))] == ["view=3"]
 
@@ -47,7 +47,7 @@ def test_differences_are_taken_seed_by_seed_and_get_a_verdict():
     models.append(Variant("entropy=0.01", Components(entropy=0.01), True))
     psnr = {CHOSEN: (20.0, 22.0, 21.0), "view=0": (19.0, 21.1, 19.9), "entropy=0.01": (20.5, 21.5, 21.1)}
     measured = [
-        Measured(name, seed, value, None, 60.0, 100, "as told")
+        MeasuredTraining(name, seed, value, None, 60.0, 100, "as told")
         for name, values in psnr.items()
         for seed, value in enumerate(values)
     ]

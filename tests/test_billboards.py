@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
 from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, ShapeEvidence, random_pixels
 from nerfcli.evaluate.metrics import to_8_bit
-from nerfcli.evaluate.protocol import Extras, HeldOut, evaluate_model, over_white
+from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model, over_white
 from nerfcli.photos.loading import load_photos
 from nerfcli.photos.psnr import psnr_of
 from nerfcli.render.model import load_model
@@ -101,7 +101,7 @@ def test_the_distance_of_a_round_wall_is_found():
 def test_the_spheres_have_a_shape(spheres_run):
     scene = scenes.load(SPHERES)
     photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
-    held_out = [HeldOut(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames, factor=1, threads=1)]
+    held_out = [HeldOutPhoto(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames, factor=1, threads=1)]
     metrics = evaluate_model(
         load_model(spheres_run / "field.safetensors", "cpu"),
         held_out,
@@ -117,7 +117,9 @@ def test_a_comparison_that_cannot_be_computed_ends_no_evaluation(spheres_run, mo
     """The photos' own numbers are those without the comparison, and the warning says why it is missing."""
     scene = scenes.load(SPHERES)
     photos = [over_white(photo.pixels) for photo in load_photos(scene.train_frames, factor=1, threads=1)]
-    held_out = [HeldOut(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames[:1], factor=1, threads=1)]
+    held_out = [
+        HeldOutPhoto(p.frame, p.pixels, p.used) for p in load_photos(scene.test_frames[:1], factor=1, threads=1)
+    ]
     model = load_model(spheres_run / "field.safetensors", "cpu")
     billboards = Billboards(scene.train_frames, photos)
 

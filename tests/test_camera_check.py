@@ -12,8 +12,8 @@ from nerfcli.cameras.lens_change import FOCAL, changed
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.multiview.camera_check import FARTHEST, FEWEST_MATCHES, CameraCheck, check_cameras
 from nerfcli.multiview.features import Matches
-from nerfcli.multiview.matching import LONGER_SIDE_PX, chosen_pairs
-from nerfcli.photos.loading import Photo
+from nerfcli.multiview.training_matches import LONGER_SIDE_PX, chosen_pairs
+from nerfcli.photos.loading import LoadedPhoto
 
 PINHOLE = Camera.pinhole(600, 450, 550.0)
 LENSES = {
@@ -23,7 +23,7 @@ LENSES = {
 }
 
 
-def ring(camera: Camera, *, turned_deg: float = 0.0) -> list[Photo]:
+def ring(camera: Camera, *, turned_deg: float = 0.0) -> list[LoadedPhoto]:
     """Cameras on an arc that look at its middle, each turned by so much about an axis of its own."""
     rng = np.random.default_rng(1)
     photos = []
@@ -35,11 +35,11 @@ def ring(camera: Camera, *, turned_deg: float = 0.0) -> list[Photo]:
         pose[:3, :3] = rotation_from_vector(np.array([0.0, angle, 0.0])) @ wrong
         pose[:3, 3] = 4.0 * np.array([-math.sin(angle), 0.05 * math.cos(5.0 * angle), 1.0 - math.cos(angle) - 1.0])
         black = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
-        photos.append(Photo(Frame(f"{index}.png", camera, pose), black, None))
+        photos.append(LoadedPhoto(Frame(f"{index}.png", camera, pose), black, None))
     return photos
 
 
-def matched(photos: list[Photo], *, noise_px: float, wrong: float) -> list[Matches]:
+def matched(photos: list[LoadedPhoto], *, noise_px: float, wrong: float) -> list[Matches]:
     """What pairs of photos see of points in a ball; a share of it is wrong by tens of pixels."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(400, 3)) * 0.8
@@ -57,14 +57,14 @@ def matched(photos: list[Photo], *, noise_px: float, wrong: float) -> list[Match
     return made
 
 
-def with_lens(photos: list[Photo], log_factor: float) -> list[Photo]:
+def with_lens(photos: list[LoadedPhoto], log_factor: float) -> list[LoadedPhoto]:
     return [
         replace(photo, frame=replace(photo.frame, camera=changed(photo.frame.camera, (FOCAL,), np.array([log_factor]))))
         for photo in photos
     ]
 
 
-def checked(photos: list[Photo], matches: list[Matches]) -> CameraCheck:
+def checked(photos: list[LoadedPhoto], matches: list[Matches]) -> CameraCheck:
     check = check_cameras(photos, matches)
     assert check is not None
     return check

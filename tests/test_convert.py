@@ -23,9 +23,9 @@ from nerfcli.cameras.formats.archive import write_npz
 from nerfcli.cameras.formats.ply import write_ply
 from nerfcli.cameras.frame import Capture, Observations
 from nerfcli.cli.convert import FORMATS_WRITTEN
-from nerfcli.convert import lenses
+from nerfcli.convert import opencv_lenses
 from nerfcli.convert.axes import Convention, all_axes, expressed, opencv_from_axes, reinterpreted
-from nerfcli.convert.conversion import Doubt, Wanted, convert, load
+from nerfcli.convert.conversion import Doubt, TargetOptions, convert, load
 from nerfcli.convert.formats import FORMATS, Given, format_named, recognise
 from nerfcli.convert.verify import _ROUNDINGS
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
@@ -103,12 +103,12 @@ def test_reading_in_a_convention_undoes_writing_in_it(axes, centre):
 
 
 def test_the_other_side_projects_fisheyes_as_opencv_does():
-    lens = lenses.Lens(FISHEYE.model, FISHEYE.width, FISHEYE.height, FISHEYE.params)
+    lens = opencv_lenses.FileLens(FISHEYE.model, FISHEYE.width, FISHEYE.height, FISHEYE.params)
     points = np.random.default_rng(0).normal((0, 0, 3), (1, 1, 0.5), (200, 3))
     fx, fy, cx, cy, *terms = FISHEYE.params
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     expected, _ = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(terms))
-    np.testing.assert_allclose(lenses.project(lens, points), expected[:, 0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(opencv_lenses.project(lens, points), expected[:, 0], rtol=0, atol=1e-9)
 
 
 # Round trips
@@ -167,7 +167,7 @@ def test_points_and_observations_survive(form, tmp_path):
     capture = replace(
         capture, frames=tuple(replace(f, name=name) for f, name in zip(capture.frames, names, strict=True))
     )
-    done = convert(capture, tmp_path / "out", source_format="made", wanted=Wanted(format_named(form)))
+    done = convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(format_named(form)))
     assert done.losses == ()
     _, _, again = load(done.path, Given(), Doubt())
     np.testing.assert_array_equal(again.points, capture.points)
@@ -415,7 +415,7 @@ def test_half_a_pixel_is_half_a_pixel(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("moved", ["max_deg", "max_centre_shift", "max_point_shift"])
 def test_poses_count_even_where_no_point_is_seen(moved, tmp_path):
-    wanted = Wanted(format_named("npz"))
+    wanted = TargetOptions(format_named("npz"))
     checked = convert(capture_of([SQUARE]), tmp_path / "out.npz", source_format="made", wanted=wanted).verification
     assert checked is not None
     assert checked.holds
@@ -449,7 +449,7 @@ def test_coordinates_of_the_globe_are_compared_as_finely_as_float64_can(tmp_path
         replace(f, world_from_cam=rigid.from_parts(f.world_from_cam[:3, :3], f.centre + 5e6)) for f in capture.frames
     )
     capture = replace(capture, frames=moved, points=capture.points + 5e6)
-    done = convert(capture, tmp_path / "out", source_format="made", wanted=Wanted(format_named("colmap")))
+    done = convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(format_named("colmap")))
     assert done.verification is not None
     assert 1e-6 < done.verification.tolerance_px <= _ROUNDINGS * 505 * 5000010 / 0.9
 
@@ -464,7 +464,7 @@ def test_points_alone(tmp_path):
     shifted = replace(capture, points=capture.points + 1e-9)
     wrong = replace(format_named("ply"), write=lambda _, path: write_ply(shifted, path))
     with pytest.raises(UserError, match="its points are off by"):
-        convert(capture, tmp_path / "2.ply", source_format="npz", wanted=Wanted(wrong, allow_loss=True))
+        convert(capture, tmp_path / "2.ply", source_format="npz", wanted=TargetOptions(wrong, allow_loss=True))
 
 
 def test_points_beside_a_transforms_json_are_compared_too(tmp_path, monkeypatch):
@@ -549,7 +549,7 @@ def test_photos_of_a_model_are_found_whatever_its_names_are_relative_to(prefix, 
     capture = replace(capture_of([PINHOLE]), observations=None)
     write_photos(tmp_path / "images", capture)
     capture = replace(capture, frames=tuple(replace(f, name=prefix + f.name) for f in capture.frames))
-    convert(capture, tmp_path / "sparse" / "0", source_format="made", wanted=Wanted(format_named("colmap")))
+    convert(capture, tmp_path / "sparse" / "0", source_format="made", wanted=TargetOptions(format_named("colmap")))
     result = nerfcli("convert", tmp_path, tmp_path / "elsewhere" / "transforms.json", "--to", "transforms")
     assert result.exit_code == 0, result.stderr
     content = json.loads((tmp_path / "elsewhere" / "transforms.json").read_text())

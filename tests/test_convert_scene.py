@@ -18,10 +18,10 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture
-from nerfcli.convert.conversion import Doubt, Wanted, convert, load
+from nerfcli.convert.conversion import Doubt, TargetOptions, convert, load
 from nerfcli.convert.formats import Given, format_named
-from nerfcli.convert.pixels import in_pixels
 from nerfcli.convert.scene_folder import write_scene
+from nerfcli.convert.stored_pixels import in_pixels
 from nerfcli.errors import BAD_INPUT, GATE_NOT_MET, UserError
 from nerfcli.media.images import read_image
 
@@ -346,9 +346,9 @@ def test_what_stands_beside_the_cameras_is_compared(form, fault, told, tmp_path)
     assert write is not None
     spoiled = replace(right, write=lambda c, path: write(replace(c, **wrong[part][kind]), path))
     with pytest.raises(UserError, match=told) as caught:
-        convert(capture, tmp_path / "out", source_format="made", wanted=Wanted(spoiled, allow_loss=True))
+        convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(spoiled, allow_loss=True))
     assert caught.value.exit_code == GATE_NOT_MET
-    done = convert(capture, tmp_path / "out", source_format="made", wanted=Wanted(right, allow_loss=True))
+    done = convert(capture, tmp_path / "out", source_format="made", wanted=TargetOptions(right, allow_loss=True))
     assert done.verification is not None
     assert done.verification.holds
 

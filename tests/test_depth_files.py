@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.depth import DepthMeta, difference_of, refuse_mixing
+from nerfcli.media.depth_pictures import DepthMeta, difference_of, refuse_mixing
 from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import linear_light, write_exr
 from nerfcli.media.float_tiff import read_tiff, write_tiff

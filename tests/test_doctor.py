@@ -19,14 +19,14 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.calibration import Calibration
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.doctor import consensus, coverage, graph, inventory, quality, two_views
+from nerfcli.doctor import camera_motion, connectivity, consensus, coverage, inventory, quality
+from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.examination import Diagnosis, compare_all, content, estimated_seconds, examine, judged
 from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding
-from nerfcli.doctor.matching import Pair
 from nerfcli.doctor.page import page_html, refuse_foreign
-from nerfcli.doctor.photos import PhotoFacts, Source, read_photo
+from nerfcli.doctor.photo_facts import PhotoFacts, Source, read_photo
+from nerfcli.doctor.photo_list import ExaminedCapture, find_subject
 from nerfcli.doctor.sharpness import measure
-from nerfcli.doctor.subject import Subject, find_subject
 from nerfcli.errors import UserError
 from nerfcli.media.images import Exif
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
@@ -47,7 +47,9 @@ class Examined:
     pairs: tuple[Pair, ...]
 
     def diagnosis(self) -> Diagnosis:
-        subject = Subject(self.folder, tuple(Source(fact.name, self.folder / fact.name) for fact in self.facts), None)
+        subject = ExaminedCapture(
+            self.folder, tuple(Source(fact.name, self.folder / fact.name) for fact in self.facts), None
+        )
         return judged(subject, list(self.facts), list(self.pairs), unreadable={})
 
     def spoilt(self, photo: np.ndarray, tmp_path: Path) -> Diagnosis:
@@ -66,7 +68,7 @@ class Examined:
 def examined(folder: Path, photos: list[np.ndarray]) -> Examined:
     write(folder, photos)
     facts = [read_photo(Source(path.name, path), FEATURES) for path in sorted(folder.iterdir())]
-    places = graph.choose_pairs(facts)
+    places = connectivity.choose_pairs(facts)
     pairs = compare_all(facts, places, [FOCAL_PX] * len(facts), threads=2, progress=lambda done: None)
     return Examined(folder, tuple(photos), tuple(facts), tuple(pairs))
 
@@ -258,7 +260,7 @@ def seen(points: np.ndarray, turn_deg: float, centre: tuple[float, float, float]
 def test_turning_is_known_whatever_the_focal_length(focal_px):
     points, noise = two_view_points()
     x, y = seen(points, 0, (0, 0, 0)) + noise[0], seen(points, 12, (0, 0, 0)) + noise[1]
-    views = two_views.estimate(x, y, (focal_px, focal_px))
+    views = camera_motion.estimate(x, y, (focal_px, focal_px))
     assert views is not None
     assert views.flat
     assert views.baseline_over_depth < 0.02
@@ -268,7 +270,7 @@ def test_turning_is_known_whatever_the_focal_length(focal_px):
 def test_the_baseline_over_the_depth_is_measured(baseline):
     points, noise = two_view_points()
     x, y = seen(points, 0, (0, 0, 0)) + noise[0], seen(points, 5, (baseline, 0, 0)) + noise[1]
-    views = two_views.estimate(x, y, (700.0, 700.0))
+    views = camera_motion.estimate(x, y, (700.0, 700.0))
     assert views is not None
     assert not views.flat
     np.testing.assert_allclose(views.baseline_over_depth, baseline / np.median(points[:, 2]), rtol=0.1)
@@ -279,7 +281,7 @@ def test_a_plane_gives_no_more_than_its_baseline_over_its_distance():
     """It is 0.2; where the focal length may be 1.45 times the given, 0.2 / 1.45 explains the same pixels."""
     points, _ = two_view_points()
     flat = np.column_stack([points[:, :2], np.full(len(points), 5.0)])
-    views = two_views.estimate(seen(flat, 0, (0, 0, 0)), seen(flat, 0, (1.0, 0, 0)), (700.0, 700.0))
+    views = camera_motion.estimate(seen(flat, 0, (0, 0, 0)), seen(flat, 0, (1.0, 0, 0)), (700.0, 700.0))
     assert views is not None
     assert views.flat
     assert 0.2 / 1.46 < views.baseline_over_depth < 0.201
@@ -319,8 +321,8 @@ def test_sets_of_connected_photos():
 def test_large_captures_are_not_compared_exhaustively(clean):
     few = replace(clean.facts[0].features, descriptors=clean.facts[0].features.descriptors[:20], scales=np.ones(20))
     photos = [replace(clean.facts[0], features=few)] * 70
-    pairs = graph.choose_pairs(photos)
-    assert len(pairs) <= graph.pair_count(70) < 1000
+    pairs = connectivity.choose_pairs(photos)
+    assert len(pairs) <= connectivity.pair_count(70) < 1000
     assert {(i, i + 1) for i in range(69)} <= set(pairs)
     # Linear in the photos from here on: the time for a thousand is told before it starts.
     np.testing.assert_allclose(estimated_seconds(1000, 2), 4 * estimated_seconds(250, 2))

@@ -8,7 +8,7 @@ import torch
 
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.fit.error_map import BLOCK_PX, GUIDED_SHARE, ErrorMap
-from nerfcli.photos.loading import Photo, load_photos
+from nerfcli.photos.loading import LoadedPhoto, load_photos
 from nerfcli.photos.pool import PixelPool
 from nerfcli.scene import Scene
 
@@ -16,7 +16,7 @@ SAME = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
 @pytest.fixture(scope="module")
-def photos(spheres: Scene) -> list[Photo]:
+def photos(spheres: Scene) -> list[LoadedPhoto]:
     """Two photos; their last blocks are not whole, and a mask hides a part of the second one."""
     first, second = load_photos(spheres.frames[:2], factor=1, threads=1)
     used = np.ones(second.pixels.shape[:2], bool)

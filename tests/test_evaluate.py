@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit, whole_windows
-from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
+from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, over_white
 
 EVERYTHING = np.ones((24, 32), dtype=bool)
 # Full coverage of the picture by an empty grid: what is seen is the background.
@@ -133,8 +133,8 @@ def frame(name: str, width: int = 16, height: int = 12) -> Frame:
 def test_evaluation_of_an_empty_model_is_the_distance_to_its_background():
     # Photos without alpha are compared on the model's background (0.2 grey), photos with alpha on white.
     model = fog(NOWHERE, Similarity.identity(), background=(0.2, 0.2, 0.2))
-    opaque = HeldOut(frame("a.png"), np.full((12, 16, 3), 102, dtype=np.uint8), None)
-    clear = HeldOut(frame("b.png"), np.zeros((12, 16, 4), dtype=np.uint8), None)
+    opaque = HeldOutPhoto(frame("a.png"), np.full((12, 16, 3), 102, dtype=np.uint8), None)
+    clear = HeldOutPhoto(frame("b.png"), np.zeros((12, 16, 4), dtype=np.uint8), None)
     calls: list[tuple[int, int]] = []
     metrics = evaluate_model(model, [opaque, clear], on_image=lambda done, total: calls.append((done, total)))
     first, second = metrics["images"]
@@ -156,7 +156,7 @@ def test_evaluation_of_fog_in_closed_form():
     model = fog(foggy_cells((-1, -1, -1), (1, 1, 1)), Similarity.identity())
     seen = 0.5 * (1 - math.exp(-2)) + math.exp(-2)
     narrow = Frame("a", Camera.pinhole(3, 3, 3000.0), frame("a").world_from_cam)
-    photo = HeldOut(narrow, np.zeros((3, 3, 4), dtype=np.uint8), None)  # white
+    photo = HeldOutPhoto(narrow, np.zeros((3, 3, 4), dtype=np.uint8), None)  # white
     error, unrounded = 1 - round(255 * seen) / 255, 1 - seen
     metrics = evaluate_model(model, [photo], on_image=lambda done, total: None)
     assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(error))
@@ -168,7 +168,7 @@ def test_masked_pixels_do_not_count():
     pixels, used = noise(0, (12, 16, 3)), np.zeros((12, 16), dtype=bool)
     used[4, 5] = True
     pixels[4, 5] = 51
-    metrics = evaluate_model(model, [HeldOut(frame("a"), pixels, used)], on_image=lambda done, total: None)
+    metrics = evaluate_model(model, [HeldOutPhoto(frame("a"), pixels, used)], on_image=lambda done, total: None)
     assert metrics["images"][0]["psnr"] == pytest.approx(-20 * math.log10(0.2))
     assert (metrics["images"][0]["pixels"], metrics["images"][0]["masked_pixels"]) == (1, 12 * 16 - 1)
     assert metrics["images"][0]["whole_windows"] == 0
@@ -176,19 +176,19 @@ def test_masked_pixels_do_not_count():
 
 
 def test_a_mask_that_hides_a_whole_photo_is_told():
-    hidden = HeldOut(frame("a.png"), noise(0, (12, 16, 3)), np.zeros((12, 16), dtype=bool))
+    hidden = HeldOutPhoto(frame("a.png"), noise(0, (12, 16, 3)), np.zeros((12, 16), dtype=bool))
     with pytest.raises(UserError, match=r"no pixels of a\.png are left to compare"):
         evaluate_model(fog(NOWHERE, Similarity.identity()), [hidden], on_image=lambda done, total: None)
 
 
 def test_protocol_says_what_was_measured():
     model = fog(NOWHERE, Similarity.identity())
-    photos = [HeldOut(frame(name), np.zeros((12, 16, 4), dtype=np.uint8), None) for name in ("x.png", "y.png")]
+    photos = [HeldOutPhoto(frame(name), np.zeros((12, 16, 4), dtype=np.uint8), None) for name in ("x.png", "y.png")]
     protocol = evaluate_model(model, photos, on_image=lambda done, total: None)["protocol"]
     names = hashlib.sha256(b"x.png\ny.png").hexdigest()[:12]
     assert protocol.startswith(f"nerfcli-2: 2 held-out photos (names sha256 {names}) at 16x12, area-averaged")
     assert "RGBA on white" in protocol
-    small = HeldOut(frame("x.png", 8, 6), np.zeros((6, 8, 3), dtype=np.uint8), None)
+    small = HeldOutPhoto(frame("x.png", 8, 6), np.zeros((6, 8, 3), dtype=np.uint8), None)
     protocol = evaluate_model(model, [small], on_image=lambda done, total: None)["protocol"]
     assert "1 held-out photos" in protocol
     assert "at 8x6" in protocol

@@ -16,10 +16,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, apply, inverse, look_at, transform_from_twist
 from nerfcli.errors import UserError
 from nerfcli.evaluate import perceptual
-from nerfcli.evaluate.alignment import align_pose, halves
 from nerfcli.evaluate.colour import colour_aligned
 from nerfcli.evaluate.ledger import leak_ledger, told
 from nerfcli.evaluate.novelty import novelty
+from nerfcli.evaluate.pose_refinement import align_pose, halves
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
 from nerfcli.evaluate.spread import spread
 from nerfcli.kernels import RaysSeen
@@ -133,7 +133,7 @@ class Wall:
 def test_a_pose_is_found_again_from_half_of_the_picture(monkeypatch):
     # Closed form: a wall, seen from a pose that is off by some 2 pixels of turn and 2 of translation.
     wall = Wall()
-    monkeypatch.setattr("nerfcli.evaluate.alignment.render_rays", wall.render)
+    monkeypatch.setattr("nerfcli.evaluate.pose_refinement.render_rays", wall.render)
     pose = look_at(np.array([0.5, -0.4, -3.0]), np.array([0.2, 0.1, 0.0]), UP)
     truth = Frame("a", Camera.pinhole(96, 72, 90.0), pose)
     everything = np.ones((72, 96), dtype=bool)

@@ -20,12 +20,12 @@ from nerfcli.export.depth_files import Levels, map_path, read_map, write_levels,
 from nerfcli.export.frames import export_frames
 from nerfcli.export.order import Order
 from nerfcli.export.settings import MEASURED, ExportSettings, depth_meta, floor_of
-from nerfcli.media.depth import DepthMeta
+from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import linear_light
 from nerfcli.media.float_tiff import write_tiff
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import DepthRequest, Picture, render_picture
+from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
 
 CAMERA = Camera.pinhole(10, 8, 8.0)
 DEPTH = DepthRequest("conditional", "z", min_opacity=0.1)
@@ -56,7 +56,7 @@ def export(model: Model, order: Order, folder: Path) -> list[str]:
     return notes
 
 
-def pictured(model: Model, name: str = "a", distance: float = 2.0) -> Picture:
+def pictured(model: Model, name: str = "a", distance: float = 2.0) -> RenderedPicture:
     return render_picture(model, frame(name, distance), background=model.background, depth=DEPTH)
 
 

@@ -12,13 +12,13 @@ from PIL import ExifTags, Image
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.evaluate.protocol import HeldOut, evaluate_model
+from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model
 from nerfcli.field.background import SphereBackground, colours_behind
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.exposure import Exposure, exposed, linear_from_srgb, srgb_from_linear
-from nerfcli.fit.parts import Parts
+from nerfcli.fit.appearance import Appearance
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
-from nerfcli.photos.loading import Photo
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import Drawn, PixelPool
 from nerfcli.render.model import load_model
 from nerfcli.render.pictures import render_picture
@@ -150,17 +150,17 @@ def test_a_sphere_interpolates_its_grid_and_one_vertex_is_one_colour():
     )
 
 
-def parts_of(components: Components, colours: torch.Tensor, gains: list[float]) -> tuple[Parts, Drawn]:
+def parts_of(components: Components, colours: torch.Tensor, gains: list[float]) -> tuple[Appearance, Drawn]:
     """Parts over photos of one pixel each."""
     photos = [
-        Photo(Frame(f"{i}", Camera("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5)), np.eye(4)), level.numpy(), None)
+        LoadedPhoto(Frame(f"{i}", Camera("SIMPLE_PINHOLE", 1, 1, (1.0, 0.5, 0.5)), np.eye(4)), level.numpy(), None)
         for i, level in enumerate((colours * 255).round().to(torch.uint8)[:, None, None])
     ]
     from nerfcli.cameras.rigid import Similarity
 
     pool = PixelPool(photos, Similarity(1.0, np.eye(3), np.zeros(3)), torch.device("cpu"))
     log_gains = torch.tensor(gains)[:, None].expand(-1, 3)
-    return Parts(components, pool, log_gains=log_gains), pool.rays_of(torch.arange(len(photos)))
+    return Appearance(components, pool, log_gains=log_gains), pool.rays_of(torch.arange(len(photos)))
 
 
 def test_a_ray_sees_the_background_through_what_the_field_lets_pass_as_its_photo_is_exposed():
@@ -241,7 +241,7 @@ def test_empty_space_shows_the_background_by_direction_whatever_the_tile(capture
     assert np.array_equal(render_picture(empty, frame, background=empty.background).rgb, picture.rgb)
     # Held-out photos of known exposure are compared as they were exposed, and the protocol says so.
     truth = np.round(255 * exposed(torch.from_numpy(picture.rgb), torch.tensor(0.5)).clamp(0, 1).numpy())
-    photo = HeldOut(frame, truth.astype(np.uint8), None, log_gains=(0.5, 0.5, 0.5))
+    photo = HeldOutPhoto(frame, truth.astype(np.uint8), None, log_gains=(0.5, 0.5, 0.5))
     measured = evaluate_model(empty, [photo], on_image=lambda done, total: None)
     assert measured["mean"]["psnr"] > 50
     assert "exposures by EXIF or training photos around" in measured["protocol"]

@@ -12,9 +12,9 @@ from nerfcli.cameras.formats.blender import parse_blender, write_blender
 from nerfcli.cameras.formats.colmap import parse_colmap
 from nerfcli.cameras.formats.colmap_write import write_colmap_binary, write_colmap_text
 from nerfcli.cameras.formats.llff import parse_llff, write_llff
-from nerfcli.cameras.formats.losses import lost_to_pinhole
 from nerfcli.cameras.formats.transforms import parse_transforms, write_transforms
 from nerfcli.cameras.formats.transforms_cameras import lost_to_transforms
+from nerfcli.cameras.formats.unsupported import lost_to_pinhole
 from nerfcli.cameras.frame import Capture
 
 TOLERANCE_PX = 1e-6

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nerfcli.errors import UserError
-from nerfcli.pages import page, pictures, tables
+from nerfcli.pages import embedded_pictures, page, tables
 
 EVIL = "</script><script>alert(1)</script><b>\u2028&\"'"
 
@@ -67,12 +67,14 @@ def test_pictures_read_back_by_another_reader():
     """PNG exactly, channels in order; JPEG within what its quality allows, and no larger than asked for."""
     ramp = np.linspace(0, 255, 64).astype(np.uint8)
     picture = np.stack([np.tile(ramp, (48, 1)), np.full((48, 64), 30, np.uint8), np.zeros((48, 64), np.uint8)], axis=-1)
-    uri = pictures.data_uri(pictures.png_bytes(picture), "png")
+    uri = embedded_pictures.data_uri(embedded_pictures.png_bytes(picture), "png")
     data = base64.b64decode(uri.removeprefix("data:image/png;base64,"))
     again = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert again is not None
     np.testing.assert_array_equal(again[..., ::-1], picture)
-    small = cv2.imdecode(np.frombuffer(pictures.jpeg_bytes(picture, longest_px=32), np.uint8), cv2.IMREAD_COLOR)
+    small = cv2.imdecode(
+        np.frombuffer(embedded_pictures.jpeg_bytes(picture, longest_px=32), np.uint8), cv2.IMREAD_COLOR
+    )
     assert small is not None
     assert small.shape == (24, 32, 3)
     wanted = picture.reshape(24, 2, 32, 2, 3).mean((1, 3))

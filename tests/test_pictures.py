@@ -17,7 +17,7 @@ from nerfcli.render import pictures
 from nerfcli.render.accuracy import IN_WORDS, measure_error, refined, truncation_bounds
 from nerfcli.render.depth import CONVENTIONS, DepthRequest
 from nerfcli.render.model import Model, load_model
-from nerfcli.render.pictures import Picture, Quality, render_picture, straight_rgba
+from nerfcli.render.pictures import Quality, RenderedPicture, render_picture, straight_rgba
 from nerfcli.render.rays import places_in_pixel
 from nerfcli.runs.files import FIELD
 
@@ -32,7 +32,7 @@ def trained(spheres_run: Path) -> tuple[Model, Frame]:
     return load_model(spheres_run / FIELD, "cpu"), replace(frame, camera=frame.camera.resized(16, 12))
 
 
-def same_bits(one: Picture, other: Picture) -> list[str]:
+def same_bits(one: RenderedPicture, other: RenderedPicture) -> list[str]:
     """The maps that differ."""
     return [name for name in MAPS if not np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)]
 

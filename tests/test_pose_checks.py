@@ -26,9 +26,9 @@ from nerfcli import scene as scenes
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.finite import finite
 from nerfcli.poses.engine import worker
-from nerfcli.poses.engine.components import describe_components
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.engine.separate_models import describe_components
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.judge import acceptance, examine

@@ -23,8 +23,8 @@ from test_poses import similarity
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Capture
+from nerfcli.convert.camera_files import read_calibration
 from nerfcli.convert.formats import format_named
-from nerfcli.convert.intrinsics import read_calibration
 from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.model.cameras import GivenIntrinsics

@@ -11,7 +11,7 @@ from matplotlib import colormaps
 from skimage.color import rgb2lab
 
 from nerfcli.media.colour_maps import COLOUR_MAPS, levels_of
-from nerfcli.media.depth import DepthMeta
+from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.preview import beside, preview
 
 META = DepthMeta("conditional", "ray", "arbitrary", 0.5)

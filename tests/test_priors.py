@@ -20,8 +20,8 @@ from nerfcli.fit.point_depth import LAST_SHARE, PointRays, fading, point_depth_l
 from nerfcli.kernels import reference
 from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.multiview.correspondences import Shared
-from nerfcli.multiview.matching import chosen_pairs
 from nerfcli.multiview.tracks import Tracks, tracks_of_model
+from nerfcli.multiview.training_matches import chosen_pairs
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.loading import load_photos
 from nerfcli.photos.pool import PixelPool

@@ -11,7 +11,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts, look_at, rotation_from_quaternion
 from nerfcli.render.depth import CONVENTIONS
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import DepthRequest, Picture, render_picture
+from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
 from nerfcli.render.rays import frame_rays
 
 # From a scene that is turned, moved and four times as large as the training frame.
@@ -53,7 +53,7 @@ def inside_slab(far: float = 2.4) -> np.ndarray:
     return (np.abs(0.01 + far * x / 14) < 0.99) & (np.abs(-0.02 + far * y / 14) < 0.99)
 
 
-def picture_of(model: Model, frame: Frame, depth: DepthRequest | None = None) -> Picture:
+def picture_of(model: Model, frame: Frame, depth: DepthRequest | None = None) -> RenderedPicture:
     return render_picture(model, frame, background=BACKGROUND, depth=depth)
 
 

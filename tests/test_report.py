@@ -15,13 +15,13 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.run_cameras import RunCameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
-from nerfcli.evaluate.protocol import HeldOut
+from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.export.settings import depth_meta
 from nerfcli.media.colour_maps import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.report.drawings import Curve, curves, from_above
-from nerfcli.report.facts import RunFacts, labels_of, mismatches_of, warnings_of
 from nerfcli.report.page import page_html
+from nerfcli.report.run_facts import RunFacts, labels_of, mismatches_of, warnings_of
 from nerfcli.report.views import ERROR_RANGE, Seen, common_names, depth_range, error_map, spread_evenly
 from nerfcli.report.views import look_at as look_through
 from nerfcli.runs.components import Components
@@ -81,7 +81,7 @@ def seen() -> tuple[list[Seen], np.ndarray]:
     model = fog(cells, Similarity.identity(), background=(0.2, 0.4, 0.6), step=1 / 32)
     photo = np.full((8, 10, 3), 128, np.uint8)
     shares: list[float] = []
-    held_out = [HeldOut(camera_at(name, (0.0, 0.0, -2.0)), photo, None) for name in ("a.png", EVIL)]
+    held_out = [HeldOutPhoto(camera_at(name, (0.0, 0.0, -2.0)), photo, None) for name in ("a.png", EVIL)]
     look = look_through(model, held_out, depth=DEPTH, on_share=shares.append)
     assert shares == [0.5, 1.0]
     return look, photo

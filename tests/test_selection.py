@@ -35,7 +35,7 @@ from nerfcli.search.selection import (
     tells_points,
     with_known_cameras,
 )
-from nerfcli.search.trials import Start, Trial
+from nerfcli.search.trials import Trial, TrialStart
 
 PHOTOS = 20
 FITTED = Facts("hash", has_alpha=False, has_exif=False, cameras_known="they are exact")
@@ -214,15 +214,17 @@ class Scripted:
         self.begun: list[Components] = []
         self.from_psnr: set[float] = set()
 
-    def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start | None:
+    def begin(
+        self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0
+    ) -> TrialStart | None:
         self.begun.append(components)
         if steps < fewest:
             return None
-        return Start(
+        return TrialStart(
             {}, {}, 1.0, replace(trial(20.0 + self.gain(components)), steps=steps), signs(self.spread, self.far)
         )
 
-    def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:
+    def go_on(self, start: TrialStart, components: Components, *, seed: int, steps: int) -> Trial:
         self.asked.append((components, seed, steps))
         self.from_psnr.add(start.trial.psnr)
         return trial(20.0 + seed + self.gain(components))

@@ -16,7 +16,7 @@ from nerfcli.errors import GATE_NOT_MET
 from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.reference import compositing, depth
 from nerfcli.selftest import suite, textbook
-from nerfcli.selftest.cases import Intervals, Ray
+from nerfcli.selftest.cases import Ray, Segments
 from nerfcli.selftest.measure import MET, NOT_MET, Errors, Precision, Row, by_formula, largest_error
 
 SINGLE = Precision("float32", torch.float32, "cpu")
@@ -166,7 +166,7 @@ def test_other_textbook_formulas_are_caught(monkeypatch):
 
 def test_the_decimal_gradient_is_the_difference_quotient_in_sixty_digits():
     """Independent of the closed form: loss(density + h) - loss(density - h) over 2 h, with h = 1e-20."""
-    ray, rgb, h = Intervals((0.7, 2.5, 1.25), (0.5, 0.25, 1.0)), [[0.3], [0.9], [0.1]], Decimal("1e-20")
+    ray, rgb, h = Segments((0.7, 2.5, 1.25), (0.5, 0.25, 1.0)), [[0.3], [0.9], [0.1]], Decimal("1e-20")
     getcontext().prec = 60
 
     def loss(density):

@@ -26,7 +26,7 @@ from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.rigid import Similarity, apply, rotation_from_quaternion
 from nerfcli.convert.formats import Given, recognise
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.evaluate.protocol import HeldOut, evaluate_model, over_white
+from nerfcli.evaluate.protocol import HeldOutPhoto, evaluate_model, over_white
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image, write_png
@@ -76,9 +76,9 @@ def weights(run: Path) -> dict[str, bytes]:
     return {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
 
 
-def held_out_photos(scene: Scene) -> list[HeldOut]:
+def held_out_photos(scene: Scene) -> list[HeldOutPhoto]:
     photos = load_photos(scene.test_frames, factor=1, threads=1)
-    return [HeldOut(photo.frame, photo.pixels, photo.used) for photo in photos]
+    return [HeldOutPhoto(photo.frame, photo.pixels, photo.used) for photo in photos]
 
 
 def test_held_out_views_are_far_better_than_one_colour(spheres, spheres_run):

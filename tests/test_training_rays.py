@@ -17,7 +17,7 @@ from nerfcli.fit.losses import colour_losses, over_background
 from nerfcli.fit.normalisation import box_frame, contracted_frame, object_frame
 from nerfcli.media.images import downscale, write_png
 from nerfcli.memory import resident_bytes
-from nerfcli.photos.loading import Photo, downscaled_camera, load_photos
+from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.photos.pool import Album, PixelPool, load_album
 from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, Room, room_for
 from nerfcli.render.rays import frame_rays
@@ -170,11 +170,11 @@ def test_a_downscaled_camera_fits_the_area_averaged_picture(size, factor):
     np.testing.assert_allclose(small[..., 1].ravel(), pixels[:, 1] * 3, atol=1.0)
 
 
-def numbered_photo(index: int, camera: Camera, frame: Frame, channels: int = 3) -> Photo:
+def numbered_photo(index: int, camera: Camera, frame: Frame, channels: int = 3) -> LoadedPhoto:
     """A photo whose colours say which pixel of which photo it is: (photo, row, column)."""
     rows, columns = np.indices((camera.height, camera.width))
     layers = [np.full_like(rows, index), rows, columns, np.full_like(rows, 255)][:channels]
-    return Photo(replace(frame, camera=camera), np.stack(layers, axis=-1).astype(np.uint8), None)
+    return LoadedPhoto(replace(frame, camera=camera), np.stack(layers, axis=-1).astype(np.uint8), None)
 
 
 FISHEYE = Camera("OPENCV_FISHEYE", 33, 21, (20.0, 21.0, 16.0, 11.0, 0.1, -0.02, 0.0, 0.0))
@@ -297,7 +297,7 @@ def test_a_pixel_is_found_again_by_its_number():
         pixels = np.zeros((height, width, 3), dtype=np.uint8)
         pixels[..., 0] = np.arange(first, first + width * height).reshape(height, width)
         camera = Camera("SIMPLE_PINHOLE", width, height, (5.0, width / 2, height / 2))
-        photos.append(Photo(Frame(name, camera, np.eye(4)), pixels, None))
+        photos.append(LoadedPhoto(Frame(name, camera, np.eye(4)), pixels, None))
     pool = PixelPool(photos, SIMILARITY, CPU)
     by_name = {photo.frame.name: photo.pixels for photo in photos}
     for number in range(len(pool.colours)):

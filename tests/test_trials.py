@@ -18,7 +18,7 @@ from nerfcli.photos.storage import IN_MEMORY
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.search.diagnostics import signs_of
-from nerfcli.search.trials import Start, Trials
+from nerfcli.search.trials import Trials, TrialStart
 
 SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
 
@@ -31,7 +31,7 @@ def trials(spheres) -> Trials:
 
 
 @pytest.fixture(scope="module")
-def start(trials) -> Iterator[Start]:
+def start(trials) -> Iterator[TrialStart]:
     """Early in a schedule: cells that close within a few dozen steps would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nerfcli.search.trials.FORK_SHARE", 0.02)

@@ -16,10 +16,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import rotation_from_vector
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
 from nerfcli.multiview.features import Matches
-from nerfcli.multiview.matching import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.multiview.tracks import Tracks, places_of, tracks_of_matches
+from nerfcli.multiview.training_matches import MOST_PHOTOS, chosen_pairs, match
 from nerfcli.multiview.triangulation import triangulate
-from nerfcli.photos.loading import Photo
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 
@@ -28,7 +28,7 @@ WALL_Z = 3.0
 SETTINGS = TrainSettings(budget_seconds=None, steps=1)
 
 
-def wall_photo(x: float, turned: float, *, used: np.ndarray | None = None) -> Photo:
+def wall_photo(x: float, turned: float, *, used: np.ndarray | None = None) -> LoadedPhoto:
     """What a camera at (x, 0, 0), turned about its vertical axis, sees of a wall with spots at z = 3."""
     rng = np.random.default_rng(0)
     spots = cv2.GaussianBlur(rng.uniform(0, 255, (600, 800)).astype(np.float32), (0, 0), 3)
@@ -43,22 +43,22 @@ def wall_photo(x: float, turned: float, *, used: np.ndarray | None = None) -> Ph
     to_index = np.array([[1.0, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
     shown = cv2.warpPerspective(texture, to_index @ matrix @ world_to_cam, (320, 240), flags=cv2.INTER_CUBIC)
     name = f"{x:.3f}.png"
-    return Photo(Frame(name, CAMERA, pose), np.repeat(shown[..., None], 3, axis=2), used)
+    return LoadedPhoto(Frame(name, CAMERA, pose), np.repeat(shown[..., None], 3, axis=2), used)
 
 
-def scene_of(photos: list[Photo]) -> Scene:
+def scene_of(photos: list[LoadedPhoto]) -> Scene:
     frames = tuple(photo.frame for photo in photos)
     return Scene(Path("walls"), "transforms", frames, frozenset(), np.zeros((0, 3)), ())
 
 
-def found_in(photos: list[Photo], *, threads: int = 1) -> np.ndarray:
+def found_in(photos: list[LoadedPhoto], *, threads: int = 1) -> np.ndarray:
     """Points that photos agree on by their own features."""
     tracks = tracks_of_matches(photos, match(photos, threads=threads))
     return triangulate([photo.frame for photo in photos], tracks).known
 
 
 @pytest.fixture(scope="module")
-def photos() -> list[Photo]:
+def photos() -> list[LoadedPhoto]:
     """Five of a wall at z = 3, from places 0.3 apart, with axes that meet at z = 1."""
     return [wall_photo(0.3 * i, 0.3 * (2 - i)) for i in range(5)]
 

@@ -16,11 +16,11 @@ from nerfcli import scene as scenes
 from nerfcli.cameras.alignment import align
 from nerfcli.doctor.examination import Diagnosis, examine
 from nerfcli.doctor.findings import LOOK
-from nerfcli.doctor.subject import find_subject
+from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import UserError
 from nerfcli.multiview.stationary import Motions, Stationary, motions, still_px, together
 from nerfcli.poses.engine.turntable import advised, sentence
-from nerfcli.poses.input import background as still
+from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.settings import PoseSettings
 from nerfcli.poses.structure_from_motion import estimate_poses
 

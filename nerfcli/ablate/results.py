@@ -21,7 +21,7 @@ CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredTraining:
     """One training: means over the held-out photos of PSNR and, on whole photos, SSIM; `protocol` says how."""
 
     variant: str
@@ -34,7 +34,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Row:
+class ResultRow:
     """A variant against the chosen model.
 
     Args:
@@ -62,7 +62,7 @@ class Row:
     protocol: str
 
 
-def rows_of(measured: Sequence[Measured], variants: Sequence[Variant]) -> list[Row]:
+def rows_of(measured: Sequence[MeasuredTraining], variants: Sequence[Variant]) -> list[ResultRow]:
     """A row for each variant that was trained at least once, in the order of the variants."""
     reference = {entry.seed: entry.psnr for entry in measured if entry.variant == CHOSEN}
     rows = []
@@ -76,7 +76,7 @@ def rows_of(measured: Sequence[Measured], variants: Sequence[Variant]) -> list[R
         half = half_interval(differences) if compared else None
         ssims = [entry.ssim for entry in own if entry.ssim is not None]
         rows.append(
-            Row(
+            ResultRow(
                 variant.name,
                 statistics.fmean(entry.psnr for entry in own),
                 statistics.fmean(ssims) if ssims else None,
@@ -117,7 +117,9 @@ def _verdict(variant: Variant, difference: float | None, half: float | None) -> 
     return "not needed: better without it" if difference > 0 else "needed: worse without it"
 
 
-def write_results(folder: Path, rows: Sequence[Row], measured: Sequence[Measured], about: dict[str, Any]) -> None:
+def write_results(
+    folder: Path, rows: Sequence[ResultRow], measured: Sequence[MeasuredTraining], about: dict[str, Any]
+) -> None:
     """Write FOLDER/ablation.json and ablation.csv.
 
     Args:
@@ -134,7 +136,7 @@ def write_results(folder: Path, rows: Sequence[Row], measured: Sequence[Measured
     }
     write_json(folder / RESULT, content)
     with atomic_path(folder / TABLE) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(Row.__dataclass_fields__))
+        writer = csv.DictWriter(file, list(ResultRow.__dataclass_fields__))
         writer.writeheader()
         writer.writerows(asdict(row) for row in rows)
 
@@ -145,10 +147,10 @@ def refuse_foreign(folder: Path) -> None:
         raise UserError(f"{folder} exists and is not an ablation folder", "choose another folder with -o")
 
 
-def table_of(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+def table_of(rows: Sequence[ResultRow]) -> list[tuple[str, ...]]:
     """The cells of a table for people, as `COLUMNS` names them."""
 
-    def difference(row: Row) -> str:
+    def difference(row: ResultRow) -> str:
         if row.difference_db is None:
             return ""
         return f"{row.difference_db:+.2f}" + ("" if row.interval_db is None else f" +- {row.interval_db:.2f}")

@@ -25,7 +25,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Capture:
+class CaptureTraits:
     """What a capture offers to components.
 
     Args:
@@ -39,7 +39,7 @@ class Capture:
     has_exif: bool
 
 
-def variants(chosen: Components, capture: Capture, *, only: tuple[str, ...] = ()) -> list[Variant]:
+def variants(chosen: Components, capture: CaptureTraits, *, only: tuple[str, ...] = ()) -> list[Variant]:
     """Models with one component removed from the chosen one, or added to it, in the order of `CHOICES`.
 
     Args:
@@ -66,7 +66,7 @@ def _off(name: str, chosen: Components) -> Value:
     return CHOICES[name].off
 
 
-def _offers(name: str, capture: Capture) -> list[Value]:
+def _offers(name: str, capture: CaptureTraits) -> list[Value]:
     """Values with which the component may be added."""
     if (name == "background" and capture.has_alpha) or (name == "points" and not capture.has_points):
         return []

@@ -6,7 +6,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from nerfcli.bench.heldout import FINER
+from nerfcli.bench.convergence import FINER
 from nerfcli.bench.summary import SAME_QUADRATURE
 from nerfcli.bench.tables import (
     RENDERING_COLUMNS,

@@ -13,7 +13,7 @@ NEAR_BEST_DB = 0.1
 
 
 @dataclass(frozen=True)
-class Spread:
+class TimeSpread:
     """Times of repeats, in seconds: their median and the quartiles around it."""
 
     low: float
@@ -22,26 +22,26 @@ class Spread:
     repeats: int
 
     @staticmethod
-    def of(values: Sequence[float]) -> "Spread":
+    def of(values: Sequence[float]) -> "TimeSpread":
         """Of at least one value."""
         low, median, high = np.percentile(values, (25, 50, 75))
-        return Spread(float(low), float(median), float(high), len(values))
+        return TimeSpread(float(low), float(median), float(high), len(values))
 
-    def clearly_below(self, other: "Spread") -> bool:
+    def clearly_below(self, other: "TimeSpread") -> bool:
         """Whether even the slower repeats were faster than the other's faster ones."""
         return self.high * SAME_TIME < other.low
 
 
 @dataclass(frozen=True)
-class Measured:
+class SettingResult:
     """What a setting costs and what it gives; the smaller the error, the better, in any unit."""
 
     name: str
-    seconds: Spread
+    seconds: TimeSpread
     error: float
 
 
-def dominators(points: Sequence[Measured], *, noise: float) -> dict[str, str | None]:
+def dominators(points: Sequence[SettingResult], *, noise: float) -> dict[str, str | None]:
     """For each point the name of one that makes it pointless, or None for those worth their time: the Pareto set.
 
     B is dominated by A if A's median time is no longer, and either A is clearly faster and B's error is not smaller by
@@ -52,7 +52,7 @@ def dominators(points: Sequence[Measured], *, noise: float) -> dict[str, str | N
         points: with different names.
         noise: differences of errors up to this mean nothing, >= 0.
     """
-    worth: list[Measured] = []
+    worth: list[SettingResult] = []
     found: dict[str, str | None] = {}
     for point in sorted(points, key=lambda point: (point.seconds.median, point.error)):
         above = [
@@ -84,14 +84,14 @@ def least_difference(values: Sequence[float]) -> float | None:
     return float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) * math.sqrt(2.0))
 
 
-def near_best(points: Sequence[Measured]) -> Measured:
+def near_best(points: Sequence[SettingResult]) -> SettingResult:
     """The fastest of those whose error, in dB, is within `NEAR_BEST_DB` of the smallest; at least one point."""
     smallest = min(point.error for point in points)
     near = [point for point in points if point.error <= smallest + NEAR_BEST_DB]
     return min(near, key=lambda point: (point.seconds.median, point.error))
 
 
-def at_most(points: Sequence[Measured], seconds: float) -> Measured | None:
+def at_most(points: Sequence[SettingResult], seconds: float) -> SettingResult | None:
     """The one with the smallest error among those whose median takes at most some time; None where none does."""
     fast = [point for point in points if point.seconds.median <= seconds * SAME_TIME]
     return min(fast, key=lambda point: (point.error, point.seconds.median), default=None)

@@ -17,18 +17,18 @@ import numpy as np
 import torch
 
 from nerfcli.atomic import atomic_path
-from nerfcli.bench.heldout import FINER, distance_to_float64, smaller
+from nerfcli.bench.convergence import FINER, distance_to_float64, smaller
 from nerfcli.bench.machine import PeakMemory
-from nerfcli.bench.pictures import FOLDER, MOST_ERROR, MOST_QUADRATURE, slug, write_difference, write_picture
+from nerfcli.bench.sample_pictures import FOLDER, MOST_ERROR, MOST_QUADRATURE, slug, write_difference, write_picture
 from nerfcli.bench.session import Session
 from nerfcli.bench.sweep import STORED_IN, RenderSetting
 from nerfcli.evaluate.metrics import psnr, to_8_bit
-from nerfcli.evaluate.protocol import HeldOut, as_exposed, over_white
+from nerfcli.evaluate.protocol import HeldOutPhoto, as_exposed, over_white
 from nerfcli.evaluate.sampled import background_of
 from nerfcli.field.cost import field_bytes
 from nerfcli.render.accuracy import TIGHT
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import Picture, Quality, render_picture
+from nerfcli.render.pictures import Quality, RenderedPicture, render_picture
 
 MOST_PHOTOS = 3
 LEAST_ROUNDS, MOST_ROUNDS = 3, 9
@@ -46,12 +46,12 @@ class _Subject:
     """The field in every precision it is stored in, and the photos with their converged renderings."""
 
     models: dict[str, Model]
-    photos: tuple[HeldOut, ...]
+    photos: tuple[HeldOutPhoto, ...]
     converged: tuple[np.ndarray, ...]
 
 
 def measure_rendering(
-    model: Model, photos: Sequence[HeldOut], settings: Sequence[RenderSetting], *, session: Session, seconds: float
+    model: Model, photos: Sequence[HeldOutPhoto], settings: Sequence[RenderSetting], *, session: Session, seconds: float
 ) -> None:
     """Measure as many of the settings as there is time for, and go on with what an earlier call left.
 
@@ -91,7 +91,7 @@ def measure_rendering(
 
 
 def _planned(
-    model: Model, photos: Sequence[HeldOut], settings: Sequence[RenderSetting], *, session: Session, seconds: float
+    model: Model, photos: Sequence[HeldOutPhoto], settings: Sequence[RenderSetting], *, session: Session, seconds: float
 ) -> dict[str, Any]:
     """How many photos, settings and rounds fit, and in which size: by the time of one default picture."""
     session.say("rendering a first picture")
@@ -130,7 +130,7 @@ def _cost(setting: RenderSetting) -> float:
     return steps * (1.8 if setting.name.endswith(("thread", "threads")) else 1.0)
 
 
-def _converged(model: Model, photos: Sequence[HeldOut], *, session: Session) -> tuple[np.ndarray, ...]:
+def _converged(model: Model, photos: Sequence[HeldOutPhoto], *, session: Session) -> tuple[np.ndarray, ...]:
     """The photos' views as the field says them: steps `FINER` times as fine, next to nothing left out."""
     pictures, told = [], {entry["photo"] for entry in session.records.of_kind("converged")}
     for photo in photos:
@@ -197,7 +197,7 @@ def _measure_times(
             session.record("time", point=setting.name, round=number, seconds=seconds, peak_memory_bytes=memory.read())
 
 
-def _render(model: Model, photo: HeldOut, setting: RenderSetting) -> Picture:
+def _render(model: Model, photo: HeldOutPhoto, setting: RenderSetting) -> RenderedPicture:
     torch.set_num_threads(setting.threads)
     return render_picture(
         model.stretched(setting.step),
@@ -208,7 +208,7 @@ def _render(model: Model, photo: HeldOut, setting: RenderSetting) -> Picture:
     )
 
 
-def _used(picture: Picture, photo: HeldOut) -> np.ndarray:
+def _used(picture: RenderedPicture, photo: HeldOutPhoto) -> np.ndarray:
     return picture.valid if photo.used is None else picture.valid & photo.used
 
 

@@ -7,14 +7,14 @@ from typing import Any
 
 from nerfcli.atomic import write_json
 from nerfcli.bench.page import bench_page
-from nerfcli.bench.pictures import FOLDER
 from nerfcli.bench.records import PLAN, Records, emptied
 from nerfcli.bench.rendering import WORK
+from nerfcli.bench.sample_pictures import FOLDER
 from nerfcli.bench.summary import summarised
 from nerfcli.bench.tables import write_csv
 from nerfcli.bench.training import KEPT_FIELD
+from nerfcli.pages.embedded_pictures import data_uri
 from nerfcli.pages.page import write_page
-from nerfcli.pages.pictures import data_uri
 
 JSON, CSV, PAGE = "bench.json", "bench.csv", "bench.html"
 

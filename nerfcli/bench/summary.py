@@ -7,10 +7,10 @@ from dataclasses import asdict
 from typing import Any
 
 from nerfcli import __version__
-from nerfcli.bench.measure import COMPLETE
-from nerfcli.bench.pareto import Measured, Spread, at_most, dominators, least_difference, near_best
-from nerfcli.bench.pictures import slug
+from nerfcli.bench.measurement import COMPLETE
+from nerfcli.bench.pareto import SettingResult, TimeSpread, at_most, dominators, least_difference, near_best
 from nerfcli.bench.records import Records
+from nerfcli.bench.sample_pictures import slug
 
 LEVELS = 255.0
 # Renderings whose distance to the converged one differs by less than this share are as good as each other.
@@ -42,13 +42,13 @@ def summarised(records: Records, plan: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _by_psnr(point: dict[str, Any]) -> Measured:
-    return Measured(point["name"], Spread(**point["seconds"]), -point["psnr"])
+def _by_psnr(point: dict[str, Any]) -> SettingResult:
+    return SettingResult(point["name"], TimeSpread(**point["seconds"]), -point["psnr"])
 
 
-def _by_quadrature(point: dict[str, Any]) -> Measured:
+def _by_quadrature(point: dict[str, Any]) -> SettingResult:
     """Its logarithm, so that differences are shares."""
-    return Measured(point["name"], Spread(**point["seconds"]), math.log(max(point["quadrature_levels"], 1e-6)))
+    return SettingResult(point["name"], TimeSpread(**point["seconds"]), math.log(max(point["quadrature_levels"], 1e-6)))
 
 
 def _rendering(records: Records) -> dict[str, Any] | None:
@@ -81,7 +81,7 @@ def _rendering_point(entry: dict[str, Any], times: Sequence[dict[str, Any]]) -> 
         "name": entry["point"],
         "options": entry["options"],
         "settings": entry["settings"],
-        "seconds": asdict(Spread.of([time["seconds"] for time in times])),
+        "seconds": asdict(TimeSpread.of([time["seconds"] for time in times])),
         "peak_memory_bytes": max(memory, default=None),
         "field_bytes": entry["field_bytes"],
         "psnr": entry["psnr"],
@@ -135,14 +135,14 @@ def _training_point(entry: dict[str, Any]) -> dict[str, Any]:
         "group": entry["group"],
         "options": entry["options"],
         "settings": entry["settings"],
-        "seconds": asdict(Spread.of([entry["seconds"]])),
+        "seconds": asdict(TimeSpread.of([entry["seconds"]])),
         "steps": entry["steps"],
         "samples_per_second": entry["samples_per_second"],
         "peak_memory_bytes": entry["peak_memory_bytes"],
         "field_bytes": entry["field_bytes"],
         "psnr": entry["psnr"],
         "quadrature_levels": LEVELS * entry["quadrature"],
-        "render_seconds": asdict(Spread.of(entry["render_seconds"])),
+        "render_seconds": asdict(TimeSpread.of(entry["render_seconds"])),
         "render_size": entry["render_size"],
         "compiled": entry.get("compiled"),
         "shown_psnr": entry["shown_psnr"],
@@ -182,14 +182,14 @@ def _training_advice(training: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-def _default_unless_better(chosen: Measured, default: Measured, noise: float) -> Measured:
+def _default_unless_better(chosen: SettingResult, default: SettingResult, noise: float) -> SettingResult:
     """The default where the chosen one takes as long and is not better by more than chance."""
     same_time = not chosen.seconds.clearly_below(default.seconds) and not default.seconds.clearly_below(chosen.seconds)
     return default if same_time and default.error - chosen.error <= noise else chosen
 
 
 def _advice(
-    part: str, question: str, chosen: Measured | None, by_name: dict[str, dict[str, Any]], against: Measured
+    part: str, question: str, chosen: SettingResult | None, by_name: dict[str, dict[str, Any]], against: SettingResult
 ) -> dict[str, Any]:
     """One recommendation; its "point" is None where no setting is fast enough."""
     if chosen is None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import nerfcli
-from nerfcli.bench.pictures import FOLDER, slug
+from nerfcli.bench.sample_pictures import FOLDER, slug
 from nerfcli.bench.session import Session
 from nerfcli.bench.sweep import TrainSetting, affordable
 from nerfcli.runs.files import FIELD

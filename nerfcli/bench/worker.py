@@ -16,11 +16,11 @@ from typing import Any, TextIO
 
 from nerfcli import kernels
 from nerfcli import scene as scenes
-from nerfcli.bench.heldout import quadrature, smaller
-from nerfcli.bench.pictures import MOST_ERROR, write_difference, write_picture
+from nerfcli.bench.convergence import quadrature, smaller
+from nerfcli.bench.sample_pictures import MOST_ERROR, write_difference, write_picture
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, to_8_bit
-from nerfcli.evaluate.protocol import HeldOut, as_exposed, over_white
+from nerfcli.evaluate.protocol import HeldOutPhoto, as_exposed, over_white
 from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels, background_of
 from nerfcli.field.cost import field_bytes
@@ -50,7 +50,7 @@ def main(job_path: str) -> None:
 
 
 def measure_model(
-    model: Model, held_out: list[HeldOut], *, seed: int, folder: Path, prefix: str, shown: str
+    model: Model, held_out: list[HeldOutPhoto], *, seed: int, folder: Path, prefix: str, shown: str
 ) -> dict[str, Any]:
     """What a field gives and costs to look at.
 

@@ -88,7 +88,7 @@ def ablate(
       nerfcli ablate photos-scene --only view --only exposure --budget 30s
       nerfcli ablate photos-scene --model default --seeds 5 --whole -o paper/ablation
     """
-    from nerfcli.ablate.results import COLUMNS, Row, table_of
+    from nerfcli.ablate.results import COLUMNS, ResultRow, table_of
     from nerfcli.runs.components import CHOICES, Components, choose
     from nerfcli.runs.settings import TrainSettings
     from nerfcli.workflows.ablate import ablate_scene
@@ -128,7 +128,7 @@ def ablate(
                 warn=console.warn,
                 progress=update,
             )
-        rows = [Row(**row) for row in content["rows"]]
+        rows = [ResultRow(**row) for row in content["rows"]]
         console.table(COLUMNS, table_of(rows), styles=_STYLES)
         console.note(f"protocol: {rows[-1].protocol}; 95 % intervals from Student's t over the seeds")
         console.result(folder / "ablation.csv", content)

@@ -23,7 +23,7 @@ from nerfcli.cli.options import (
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
-    from nerfcli.bench.measure import Wanted
+    from nerfcli.bench.measurement import BenchOptions
 
 _SWEEPS = ("both", "render", "train")
 _SHORTEST_SECONDS = 20.0
@@ -73,9 +73,9 @@ def bench(
             f"{budget!r} is too short; give at least {_SHORTEST_SECONDS:g}s", param_hint="--budget"
         )
     console = Console(quiet=quiet, json_lines=json)
-    from nerfcli.bench.measure import Wanted
+    from nerfcli.bench.measurement import BenchOptions
 
-    wanted = Wanted(seconds, sweep, seed)
+    wanted = BenchOptions(seconds, sweep, seed)
 
     def work(path: Path, one_of_many: bool) -> None:
         folder = result_path(path, suffix="-bench", output=output, one_of_many=one_of_many)
@@ -94,7 +94,7 @@ def bench(
 
 
 def bench_one(
-    path: Path, folder: Path, wanted: "Wanted", *, device: str, threads: int, overwrite: bool, console: Console
+    path: Path, folder: Path, wanted: "BenchOptions", *, device: str, threads: int, overwrite: bool, console: Console
 ) -> tuple[Path, dict[str, Any]]:
     """Measure one run or scene, or what is left of it, and write the report, of a part too when interrupted.
 
@@ -102,10 +102,10 @@ def bench_one(
         UserError: it cannot be measured, or something else stands at `folder`.
         KeyboardInterrupt: passed on after the report of what was measured.
     """
-    from nerfcli.bench.measure import COMPLETE, measure, open_bench
+    from nerfcli.bench.measurement import COMPLETE, measure, open_bench
     from nerfcli.bench.records import MEASURED
     from nerfcli.bench.report import discard, write_report
-    from nerfcli.bench.subject import find_subject
+    from nerfcli.bench.trained_run import find_subject
 
     subject = find_subject(path, device=device, threads=threads, seed=wanted.seed)
     if overwrite:

@@ -152,9 +152,9 @@ def convert(
       nerfcli convert strange/ repaired.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
-    from nerfcli.convert.conversion import Doubt, Wanted
+    from nerfcli.convert.camera_files import read_intrinsics
+    from nerfcli.convert.conversion import Doubt, TargetOptions
     from nerfcli.convert.formats import Given, format_named
-    from nerfcli.convert.intrinsics import read_intrinsics
     from nerfcli.convert.world_frame import WorldFrame
     from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record
 
@@ -184,7 +184,7 @@ def convert(
             raise typer.BadParameter("missing; give the file or folder to write", param_hint="OUT")
         one_of(pixels, ("stored", "upright"), "--pixels")
         world = WorldFrame(world_up, origin, scale, markers, tuple(distance or ()))
-        wanted = Wanted(
+        wanted = TargetOptions(
             format_named(to),
             axes=axes,
             pixel_centre=_pixel_centre(pixel_center, "--pixel-center"),

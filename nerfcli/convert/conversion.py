@@ -12,10 +12,10 @@ import numpy as np
 from nerfcli.cameras.frame import Capture
 from nerfcli.convert.axes import NAMED_AXES, Convention, expressed, opencv_from_axes, reinterpreted
 from nerfcli.convert.formats import Format, Given, recognise, with_photos
-from nerfcli.convert.pixels import STORED, Turned, in_pixels
 from nerfcli.convert.probes import probes_of, projected
 from nerfcli.convert.readback import READERS, Meant, read_ply
 from nerfcli.convert.reduction import reduced
+from nerfcli.convert.stored_pixels import STORED, Turned, in_pixels
 from nerfcli.convert.verify import TOLERANCE_PX, Verification, listed_order, unreadable, verify, verify_points
 from nerfcli.errors import GATE_NOT_MET, UserError
 
@@ -34,7 +34,7 @@ class Doubt:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class TargetOptions:
     """What the written file shall be.
 
     Args:
@@ -105,7 +105,7 @@ def load(source: Path, given: Given, doubt: Doubt) -> tuple[Format, Path, Captur
     return form, found, capture
 
 
-def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wanted) -> Conversion:
+def convert(capture: Capture, target: Path, *, source_format: str, wanted: TargetOptions) -> Conversion:
     """Write a capture in another format, and prove that nothing but the accepted losses was lost.
 
     The file is kept only if what was read back from it agrees; else what stood there before stands there again.
@@ -157,7 +157,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Wante
     return Conversion(path, source_format, capture, losses, _loss_px(capture, left), verification, notes)
 
 
-def _pixels(form: Format, wanted: Wanted, capture: Capture) -> str:
+def _pixels(form: Format, wanted: TargetOptions, capture: Capture) -> str:
     """The pixels that the cameras of the written file shall refer to."""
     if form.name == "nerfcli" and wanted.pixels == STORED:
         raise UserError("the nerfcli format always uses upright photos", "remove --pixels", exit_code=2)
@@ -176,7 +176,7 @@ def _orientation_notes(turned: Turned) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _convention(form: Format, wanted: Wanted) -> Convention:
+def _convention(form: Format, wanted: TargetOptions) -> Convention:
     """The convention of the file to be written.
 
     Raises:

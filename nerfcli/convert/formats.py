@@ -49,8 +49,8 @@ from nerfcli.convert.finding import (
     find_model,
     find_scene,
 )
-from nerfcli.convert.pixels import STORED, UPRIGHT, measure
 from nerfcli.convert.scene_folder import SCENE_FILES, losses_scene, write_scene
+from nerfcli.convert.stored_pixels import STORED, UPRIGHT, measure
 from nerfcli.errors import UserError
 from nerfcli.media.images import list_images
 from nerfcli.media.masks import find_mask

@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from nerfcli.convert.lenses import Lens
+from nerfcli.convert.opencv_lenses import FileLens
 
 
 class UnreadableError(Exception):
@@ -61,7 +61,7 @@ class ReadBack:
     labels: tuple[str, ...] | None
     cam_from_world: np.ndarray
     centres: np.ndarray
-    lenses: tuple[Lens, ...] | None
+    lenses: tuple[FileLens, ...] | None
     points: np.ndarray | None
     colours: np.ndarray | None = None
     features: Callable[[int], tuple[np.ndarray, np.ndarray]] | None = None
@@ -82,7 +82,7 @@ def read_colmap(path: Path, meant: Meant) -> ReadBack:
     """A COLMAP model, by pycolmap."""
     model = pycolmap.Reconstruction(str(path))
     lenses = {
-        camera_id: Lens(camera.model.name, camera.width, camera.height, tuple(camera.params))
+        camera_id: FileLens(camera.model.name, camera.width, camera.height, tuple(camera.params))
         for camera_id, camera in model.cameras.items()
     }
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
@@ -161,7 +161,7 @@ def read_llff(path: Path, meant: Meant) -> ReadBack:
     rotations, centres = _views_from_world_from_cam(matrices[:, :, :4], meant.axes)
     lenses = []
     for height, width, focal in matrices[:, :, 4]:
-        lenses.append(Lens("SIMPLE_PINHOLE", int(width), int(height), (focal, width / 2, height / 2)))
+        lenses.append(FileLens("SIMPLE_PINHOLE", int(width), int(height), (focal, width / 2, height / 2)))
     return ReadBack(None, rotations, centres, tuple(lenses), None, beside=Beside(depth_bounds=rows[:, 15:]))
 
 
@@ -207,7 +207,7 @@ def read_npz(path: Path, meant: Meant) -> ReadBack:
             camera = pycolmap.Camera(model=model, width=width, height=height, params=params[~np.isnan(params)])
             shifted = np.array(camera.params)
             shifted[list(camera.principal_point_idxs())] += 0.5 - meant.pixel_centre
-            lenses.append(Lens(model, width, height, tuple(shifted.tolist())))
+            lenses.append(FileLens(model, width, height, tuple(shifted.tolist())))
         return ReadBack(
             labels=tuple(arrays["names"].tolist()),
             cam_from_world=rotations,
@@ -250,11 +250,11 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return points, rows[:, 24:27] if stride == 27 else None
 
 
-def _opensfm_lens(record: dict[str, Any]) -> Lens:
+def _opensfm_lens(record: dict[str, Any]) -> FileLens:
     """A lens from numbers in units of the picture's longer side, measured from its middle."""
     kind, width, height = record["projection_type"], record["width"], record["height"]
     if kind in ("spherical", "equirectangular"):
-        return Lens("EQUIRECTANGULAR", width, height, (width, height))
+        return FileLens("EQUIRECTANGULAR", width, height, (width, height))
     unit = max(width, height)
     fx, fy = record["focal_x"] * unit, record["focal_y"] * unit
     head = (fx, fy, record["c_x"] * unit + width / 2, record["c_y"] * unit + height / 2)
@@ -262,13 +262,13 @@ def _opensfm_lens(record: dict[str, Any]) -> Lens:
         record.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s2")
     )
     if kind == "fisheye_opencv":
-        return Lens("OPENCV_FISHEYE", width, height, (*head, k1, k2, k3, k4))
+        return FileLens("OPENCV_FISHEYE", width, height, (*head, k1, k2, k3, k4))
     if kind == "fisheye62":
         terms = (k1, k2, k3, k4, k5, k6, p1, p2, 0.0, 0.0, 0.0, 0.0)
-        return Lens("RAD_TAN_THIN_PRISM_FISHEYE", width, height, (*head, *terms))
+        return FileLens("RAD_TAN_THIN_PRISM_FISHEYE", width, height, (*head, *terms))
     if kind == "fisheye624":
-        return Lens("THIN_PRISM_FISHEYE", width, height, (*head, k1, k2, p1, p2, k3, k4, sx, sy))
-    return Lens("FULL_OPENCV", width, height, (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+        return FileLens("THIN_PRISM_FISHEYE", width, height, (*head, k1, k2, p1, p2, k3, k4, sx, sy))
+    return FileLens("FULL_OPENCV", width, height, (*head, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
 
 
 def _from_transforms(contents: list[dict[str, Any]], meant: Meant) -> ReadBack:
@@ -286,19 +286,21 @@ def _from_transforms(contents: list[dict[str, Any]], meant: Meant) -> ReadBack:
     )
 
 
-def _transforms_lens(record: dict[str, Any], shift: float, size: tuple[int, int]) -> Lens:
+def _transforms_lens(record: dict[str, Any], shift: float, size: tuple[int, int]) -> FileLens:
     if "angle" in record:
         width, height = size
-        return Lens("SIMPLE_PINHOLE", width, height, (width / 2 / math.tan(record["angle"] / 2), width / 2, height / 2))
+        return FileLens(
+            "SIMPLE_PINHOLE", width, height, (width / 2 / math.tan(record["angle"] / 2), width / 2, height / 2)
+        )
     width, height = record["w"], record["h"]
     if record["camera_model"] == "EQUIRECTANGULAR":
-        return Lens("EQUIRECTANGULAR", width, height, (width, height))
+        return FileLens("EQUIRECTANGULAR", width, height, (width, height))
     head = (record["fl_x"], record["fl_y"], record["cx"] + shift, record["cy"] + shift)
     if "FISHEYE" in record["camera_model"]:
         terms = (record.get(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
-        return Lens("OPENCV_FISHEYE", width, height, (*head, *terms))
+        return FileLens("OPENCV_FISHEYE", width, height, (*head, *terms))
     terms = (record.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))
-    return Lens("FULL_OPENCV", width, height, (*head, *terms))
+    return FileLens("FULL_OPENCV", width, height, (*head, *terms))
 
 
 def _views_from_world_from_cam(matrices: Any, axes: str) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ from html import escape
 
 import numpy as np
 
-from nerfcli.pages.pictures import data_uri, png_bytes
+from nerfcli.pages.embedded_pictures import data_uri, png_bytes
 
 _WIDTH, _HEIGHT, _LEFT = 1040, 150, 44
 # The scale of a chart is at least this wide, so that noise does not look like a finding.

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
-from nerfcli.doctor import coverage, geometry, graph, inventory, quality, turntable
+from nerfcli.doctor import connectivity, coverage, geometry, inventory, quality, turntable
+from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
 from nerfcli.doctor.findings import Finding, as_json, worst
-from nerfcli.doctor.matching import Pair, compare, focal_px
-from nerfcli.doctor.photos import MOST_FEATURES, PhotoFacts, read_all
-from nerfcli.doctor.subject import Subject
+from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, read_all
+from nerfcli.doctor.photo_list import ExaminedCapture
 from nerfcli.poses.judge.checks import Checks
 
 # Measured on one core of a 2-core server; within a factor of two on other CPUs.
@@ -35,7 +35,7 @@ class Diagnosis:
         pairs: the pairs that were compared.
     """
 
-    subject: Subject
+    subject: ExaminedCapture
     findings: tuple[Finding, ...]
     not_checked: tuple[tuple[str, str], ...]
     photos: tuple[PhotoFacts, ...]
@@ -51,11 +51,11 @@ class Diagnosis:
 
 def estimated_seconds(count: int, threads: int) -> float:
     """About how long the examination of so many photos takes."""
-    return (count * _SECONDS_PER_PHOTO + graph.pair_count(count) * _SECONDS_PER_PAIR) / threads
+    return (count * _SECONDS_PER_PHOTO + connectivity.pair_count(count) * _SECONDS_PER_PAIR) / threads
 
 
 def examine(
-    subject: Subject,
+    subject: ExaminedCapture,
     *,
     threads: int,
     progress: Callable[[float, str], None],
@@ -70,7 +70,7 @@ def examine(
     """
     count = len(subject.sources)
     reading = count * _SECONDS_PER_PHOTO
-    share = reading / (reading + graph.pair_count(count) * _SECONDS_PER_PAIR)
+    share = reading / (reading + connectivity.pair_count(count) * _SECONDS_PER_PAIR)
 
     def on_photo(done: int) -> None:
         progress(share * done / count, f"photo {done} of {count}")
@@ -80,7 +80,7 @@ def examine(
         findings = [inventory.readable(unreadable, 0), inventory.enough(0)]
         nothing = np.zeros(0)
         return Diagnosis(subject, tuple(findings), (("all else", "no readable photo"),), (), nothing, nothing, ())
-    places = graph.choose_pairs(facts)
+    places = connectivity.choose_pairs(facts)
 
     def on_pair(done: int) -> None:
         progress(share + (1 - share) * done / max(len(places), 1), f"pair {done} of {len(places)}")
@@ -115,7 +115,7 @@ def compare_all(
 
 def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Sequence[float]) -> list[Pair]:
     """The pairs with those of a few photos that hang on nothing compared once more, by all of their features."""
-    apart = graph.apart(len(photos), pairs)
+    apart = connectivity.apart(len(photos), pairs)
     if not 0 < len(apart) <= max(_FEW_APART, len(photos) // 10):
         return pairs
     again = []
@@ -128,7 +128,9 @@ def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Seq
     return again
 
 
-def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unreadable: dict[str, str]) -> Diagnosis:
+def judged(
+    subject: ExaminedCapture, photos: list[PhotoFacts], pairs: list[Pair], *, unreadable: dict[str, str]
+) -> Diagnosis:
     """All findings on photos that were read and compared; unreadable tells by name why others could not be read.
 
     A check that raises is listed among those that were not made, and the others go on.
@@ -155,7 +157,7 @@ def judged(subject: Subject, photos: list[PhotoFacts], pairs: list[Pair], *, unr
     few = "too few pairs have enough matches"
     if len(photos) > 1:
         turning = checks.run("turning object", lambda: turntable.turning_object(pairs), otherwise=None)
-        planned.append(("connectivity", lambda: graph.connectivity(photos, pairs)))
+        planned.append(("connectivity", lambda: connectivity.connectivity(photos, pairs)))
         if turning is None:
             planned += [
                 ("moving content", lambda: geometry.moving_content(photos, pairs)),
@@ -194,7 +196,7 @@ def _or_not_checked(
     return finding
 
 
-def _focals(subject: Subject, photos: Sequence[PhotoFacts]) -> list[float]:
+def _focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts]) -> list[float]:
     """Focal lengths at the features' size: of the scene's cameras, of EXIF, or a usual one."""
     cameras = {} if subject.scene is None else {frame.name: frame.camera for frame in subject.scene.frames}
     focals = []
@@ -207,7 +209,7 @@ def _focals(subject: Subject, photos: Sequence[PhotoFacts]) -> list[float]:
     return focals
 
 
-def _known_focals(subject: Subject, photos: Sequence[PhotoFacts], calibration: Calibration) -> list[float]:
+def _known_focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibration: Calibration) -> list[float]:
     """Focal lengths at the features' size, by the intrinsics of a file."""
     paths = {source.name: source.path for source in subject.sources}
     pictures = [

@@ -11,10 +11,10 @@ import numpy as np
 from nerfcli.doctor.charts import bars, match_matrix
 from nerfcli.doctor.examination import Diagnosis
 from nerfcli.doctor.findings import BAD, GOOD, LOOK, VERDICTS, Finding, several, worst
-from nerfcli.doctor.photos import PhotoFacts
+from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.doctor.quality import BLURRED, STOPS_LOOK
 from nerfcli.pages import page
-from nerfcli.pages.pictures import data_uri, jpeg_bytes, picture_rule
+from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes, picture_rule
 
 # Thumbnails of large captures are smaller, so that a page of a thousand photos has about 5 MB.
 _SMALL_THUMBNAILS_FROM, _SMALL_THUMBNAIL_PX = 200, 120

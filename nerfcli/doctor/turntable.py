@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.findings import LOOK, Finding
-from nerfcli.doctor.matching import Pair
 from nerfcli.multiview.stationary import LEAST_SHARE, together
 
 

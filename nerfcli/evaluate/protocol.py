@@ -12,17 +12,17 @@ import torch
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.evaluate.alignment import align_pose, halves
 from nerfcli.evaluate.billboards import Billboards, Shape, ShapeEvidence
 from nerfcli.evaluate.colour import colour_aligned
 from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.perceptual import NAME as LPIPS_NAME
 from nerfcli.evaluate.perceptual import SMALLEST, Perceptual
+from nerfcli.evaluate.pose_refinement import align_pose, halves
 from nerfcli.field.background import Background
 from nerfcli.field.exposure import exposed
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import Picture, render_picture
+from nerfcli.render.pictures import RenderedPicture, render_picture
 
 PROTOCOL = "nerfcli-2"
 NO_GAINS = (0.0, 0.0, 0.0)
@@ -30,7 +30,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutPhoto:
     """A held-out photo at the resolution of the training.
 
     Args:
@@ -83,7 +83,7 @@ class Extras:
 
 def evaluate_model(
     model: Model,
-    held_out: Sequence[HeldOut],
+    held_out: Sequence[HeldOutPhoto],
     *,
     on_image: Callable[[int, int], None],
     extras: Extras = Extras(),
@@ -181,7 +181,7 @@ def over_white(pixels: np.ndarray) -> np.ndarray:
     return to_8_bit(pixels[..., :3] / 255.0 * alpha + 1.0 - alpha)
 
 
-def compare(photo: HeldOut, picture: Picture) -> Compared:
+def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> Compared:
     used = picture.valid if photo.used is None else picture.valid & photo.used
     if not used.any():
         raise UserError(
@@ -236,7 +236,7 @@ def _lpips(picture: np.ndarray, truth: np.ndarray, *, used: np.ndarray, perceptu
     return perceptual(as_float(np.where(used[..., None], picture, truth)), as_float(truth))
 
 
-def _counted(photo: HeldOut, picture: Picture, compared: Compared) -> dict[str, int]:
+def _counted(photo: HeldOutPhoto, picture: RenderedPicture, compared: Compared) -> dict[str, int]:
     return {
         "pixels": int(compared.used.sum()),
         "masked_pixels": 0 if photo.used is None else int((~photo.used).sum()),
@@ -276,7 +276,7 @@ def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     return {kind: {"images": len(group), **mean_of(group)} for kind, group in sorted(groups.items())}
 
 
-def _protocol_name(held_out: Sequence[HeldOut], extras: Extras) -> str:
+def _protocol_name(held_out: Sequence[HeldOutPhoto], extras: Extras) -> str:
     sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in held_out})
     names = hashlib.sha256("\n".join(photo.frame.name for photo in held_out).encode()).hexdigest()[:12]
     told = any(any(photo.log_gains) for photo in held_out)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.billboards import Billboards, reduction
-from nerfcli.evaluate.protocol import HeldOut, over_white
+from nerfcli.evaluate.protocol import HeldOutPhoto, over_white
 from nerfcli.photos.held_out_exposure import log_gains_of
 from nerfcli.photos.loading import downscaled_camera, load_photos
 from nerfcli.render.model import Model
@@ -16,7 +16,7 @@ from nerfcli.runs.run import Run
 
 def held_out_photos(
     frames: Sequence[Frame], model: Model, *, downscale: int, masks: str, threads: int
-) -> list[HeldOut]:
+) -> list[HeldOutPhoto]:
     """Load photos as a run was trained on, each as bright as EXIF or its neighbours say beside those of the model.
 
     Args:
@@ -31,12 +31,12 @@ def held_out_photos(
     """
     photos = load_photos(frames, factor=downscale, threads=threads, masks=masks)
     return [
-        HeldOut(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains))
+        HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains))
         for photo, gains in zip(photos, log_gains_of(frames, model).tolist(), strict=True)
     ]
 
 
-def held_out_photos_of(config: RunConfig, frames: Sequence[Frame], model: Model, *, threads: int) -> list[HeldOut]:
+def held_out_photos_of(config: RunConfig, frames: Sequence[Frame], model: Model, *, threads: int) -> list[HeldOutPhoto]:
     """Load held-out photos of a run; see `held_out_photos`."""
     masks = config.components.masks
     return held_out_photos(frames, model, downscale=config.downscale, masks=masks, threads=threads)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.evaluate.metrics import psnr, to_8_bit
-from nerfcli.evaluate.protocol import PROTOCOL, WHITE, HeldOut, as_exposed, over_white
+from nerfcli.evaluate.protocol import PROTOCOL, WHITE, HeldOutPhoto, as_exposed, over_white
 from nerfcli.field.background import Background, colours_behind
 from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
@@ -27,11 +27,11 @@ class SampledPixels:
         pixels: for each, which of its pixels, counted row by row.
     """
 
-    photos: tuple[HeldOut, ...]
+    photos: tuple[HeldOutPhoto, ...]
     pixels: tuple[np.ndarray, ...]
 
     @staticmethod
-    def drawn(photos: Sequence[HeldOut], *, seed: int) -> "SampledPixels":
+    def drawn(photos: Sequence[HeldOutPhoto], *, seed: int) -> "SampledPixels":
         """`SAMPLED_PIXELS` in all, or every pixel that counts where there are fewer."""
         generator = np.random.default_rng(seed)
         wanted = -(-SAMPLED_PIXELS // len(photos))
@@ -63,14 +63,14 @@ class SampledPixels:
         return float(np.mean(values))
 
 
-def background_of(model: Model, photo: HeldOut) -> Background:
+def background_of(model: Model, photo: HeldOutPhoto) -> Background:
     """What is behind the field where a photo is compared with it."""
     return WHITE if photo.pixels.shape[-1] == 4 else model.background
 
 
 def render_sampled(
     model: Model,
-    photo: HeldOut,
+    photo: HeldOutPhoto,
     pixels: np.ndarray,
     *,
     cuts: Tensor,

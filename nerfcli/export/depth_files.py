@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.export.names import with_suffix
+from nerfcli.export.file_names import with_suffix
 from nerfcli.export.settings import FLOAT_FORMATS, LEVELS_FOLDER, TOGETHER, ExportSettings, floor_of
 from nerfcli.media.arrays import read_arrays, write_npy, write_npz
-from nerfcli.media.depth import DepthMeta, difference_of, mixed
+from nerfcli.media.depth_pictures import DepthMeta, difference_of, mixed
 from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import CHANNELS, read_exr, write_exr
 from nerfcli.media.float_tiff import read_tiff, write_tiff
 from nerfcli.media.levels import LARGEST_LEVEL, chosen_scale, write_png16
 from nerfcli.media.quantiles import quantiles
-from nerfcli.render.pictures import Picture
+from nerfcli.render.pictures import RenderedPicture
 
 # Of the depths of a clip, the share by which levels are chosen, and how much farther than these they reach.
 _TYPICAL, _HEADROOM = 0.999, 2.0
@@ -52,7 +52,9 @@ def frame_meta(
     return replace(meta, view=view, provenance=dict(provenance), error_bounds=dict(error_bounds))
 
 
-def write_maps(picture: Picture, folder: Path, name: str, *, settings: ExportSettings, meta: DepthMeta) -> list[Path]:
+def write_maps(
+    picture: RenderedPicture, folder: Path, name: str, *, settings: ExportSettings, meta: DepthMeta
+) -> list[Path]:
     """Write what is measured of a picture in the float formats that `settings` asks for; each file atomically.
 
     Args:
@@ -172,7 +174,7 @@ def _floats_of(folder: Path, name: str, output: str) -> Path:
     return next((path for path in paths if path.exists()), paths[0])
 
 
-def _map_of(picture: Picture, output: str) -> np.ndarray:
+def _map_of(picture: RenderedPicture, output: str) -> np.ndarray:
     values: np.ndarray | None = getattr(picture, output)
     if values is None:
         raise ValueError(f"the picture was rendered without {output}")

@@ -11,7 +11,7 @@ from nerfcli import __version__
 from nerfcli.atomic import read_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.export.names import describe_frames, file_names
+from nerfcli.export.file_names import describe_frames, file_names
 from nerfcli.export.settings import ExportSettings
 from nerfcli.media.video import FORMATS, check_encoders
 

@@ -8,16 +8,16 @@ import numpy as np
 
 from nerfcli import __version__
 from nerfcli.export.depth_files import write_maps
-from nerfcli.export.names import with_suffix
+from nerfcli.export.file_names import with_suffix
 from nerfcli.export.settings import ExportSettings
 from nerfcli.field.background import Background, SphereBackground
-from nerfcli.media.depth import DepthMeta
+from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.images import write_png
-from nerfcli.render.pictures import Picture
+from nerfcli.render.pictures import RenderedPicture
 
 
 def write_picture(
-    picture: Picture,
+    picture: RenderedPicture,
     folder: Path,
     name: str,
     *,

@@ -12,7 +12,7 @@ from nerfcli import __version__
 from nerfcli.export.depth_files import read_map
 from nerfcli.export.order import Order
 from nerfcli.export.settings import MEASURED, floor_of
-from nerfcli.media.depth import KEY, DepthMeta
+from nerfcli.media.depth_pictures import KEY, DepthMeta
 from nerfcli.media.images import read_image, write_png
 from nerfcli.media.preview import beside, preview
 from nerfcli.media.quantiles import quantiles

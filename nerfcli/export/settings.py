@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from nerfcli.media.depth import DepthMeta
+from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Quality

@@ -11,10 +11,10 @@ from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.field.sizes import chosen_size
+from nerfcli.fit.appearance import Appearance
 from nerfcli.fit.error_map import BEGINS, ErrorMap
 from nerfcli.fit.losses import colour_losses, opacity_entropy
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
-from nerfcli.fit.parts import Parts
 from nerfcli.fit.point_depth import PointRays, fading, point_depth_loss
 from nerfcli.fit.watch import UNWATCHED, NonFiniteError, Watch
 from nerfcli.kernels import March, Rays, Targets
@@ -108,7 +108,7 @@ class Fitting:
         self.field = fresh_field(size).to(device)
         gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
         self.points, self.error_map = points, error_map
-        self.parts = Parts(self.components, pool, log_gains=gains, log_focal=log_focal)
+        self.parts = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
         self._cameras_from = cameras_from
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.occupied = self._open_cells()

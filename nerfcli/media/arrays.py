@@ -14,7 +14,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path, write_json
 from nerfcli.errors import UserError
-from nerfcli.media.depth import DepthMeta, check_map
+from nerfcli.media.depth_pictures import DepthMeta, check_map
 
 META = "meta"
 

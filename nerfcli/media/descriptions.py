@@ -16,7 +16,7 @@ import tifffile
 from PIL import Image
 
 from nerfcli.errors import UserError
-from nerfcli.media.depth import KEY, DepthMeta, entries_of_text
+from nerfcli.media.depth_pictures import KEY, DepthMeta, entries_of_text
 
 VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")
 

@@ -26,7 +26,7 @@ import OpenEXR
 from nerfcli import __version__
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
-from nerfcli.media.depth import KEY, DepthMeta, check_map
+from nerfcli.media.depth_pictures import KEY, DepthMeta, check_map
 
 CHANNELS = {"depth": "Z", "opacity": "opacity.V", "spread": "spread.V", "disagreement": "disagreement.V"}
 

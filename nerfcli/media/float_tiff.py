@@ -8,7 +8,7 @@ import tifffile
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
-from nerfcli.media.depth import DepthMeta, check_map
+from nerfcli.media.depth_pictures import DepthMeta, check_map
 
 
 def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:

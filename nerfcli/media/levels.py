@@ -14,7 +14,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
-from nerfcli.media.depth import KEY, DepthMeta, check_map
+from nerfcli.media.depth_pictures import KEY, DepthMeta, check_map
 
 LARGEST_LEVEL = 65535
 MILLIMETRE = 1e-3

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from nerfcli.media.colour_maps import levels_of
-from nerfcli.media.depth import AXES, DepthMeta
+from nerfcli.media.depth_pictures import AXES, DepthMeta
 
 _HATCH = np.array([[112, 112, 112], [160, 160, 160]], dtype=np.uint8)
 _INK, _PAPER = (20, 20, 20), (255, 255, 255)

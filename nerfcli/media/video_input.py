@@ -54,7 +54,7 @@ class Video:
 
 
 @dataclass(frozen=True)
-class Measured(Generic[T]):
+class MeasuredFrames(Generic[T]):
     """What was measured of each frame, its time (frames,) from the first one on, and how many errors decoding gave."""
 
     seconds: np.ndarray
@@ -95,7 +95,7 @@ def open_video(path: Path) -> Video:
 
 def measure_frames(
     video: Video, measure: Callable[[np.ndarray], T], *, longer_side: int, progress: Callable[[float], None]
-) -> Measured[T]:
+) -> MeasuredFrames[T]:
     """What `measure` says of every frame, in order.
 
     Args:
@@ -120,7 +120,7 @@ def measure_frames(
         raise _cut_short(video, decoder)
     if not values or decoder.returncode != 0:
         raise _unreadable(video.path, decoder)
-    return Measured(_times(decoder.times, len(values), video.fps), values, decoder.errors)
+    return MeasuredFrames(_times(decoder.times, len(values), video.fps), values, decoder.errors)
 
 
 def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:

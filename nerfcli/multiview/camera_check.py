@@ -13,8 +13,8 @@ import numpy as np
 
 from nerfcli.cameras.lens_change import FOCAL, changeable, changed
 from nerfcli.multiview.features import Matches
-from nerfcli.multiview.matching import radians_per_pixel
-from nerfcli.photos.loading import Photo
+from nerfcli.multiview.training_matches import radians_per_pixel
+from nerfcli.photos.loading import LoadedPhoto
 
 # Logarithms of factors of the focal length that are looked at: a wrong unit or crop is off by more, and every photo
 # shows it.
@@ -47,7 +47,7 @@ class CameraCheck:
     matches: int
 
 
-def check_cameras(photos: Sequence[Photo], matched: Sequence[Matches]) -> CameraCheck | None:
+def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> CameraCheck | None:
     """What matches say of the cameras; None where there are too few.
 
     The factor has the least sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
@@ -89,7 +89,7 @@ def check_cameras(photos: Sequence[Photo], matched: Sequence[Matches]) -> Camera
 class _Pair:
     """Every n-th match of two photos; its rays for any focal length."""
 
-    def __init__(self, photos: Sequence[Photo], matches: Matches, every: int):
+    def __init__(self, photos: Sequence[LoadedPhoto], matches: Matches, every: int):
         one, other = (photos[index].frame for index in matches.photos)
         self._baseline = other.centre - one.centre
         self._unit = MISS_PX * max(radians_per_pixel(frame.camera) for frame in (one, other))

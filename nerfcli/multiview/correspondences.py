@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from functools import cached_property
 
 from nerfcli.multiview.features import Matches
-from nerfcli.multiview.matching import LONGER_SIDE_PX, chosen_pairs, match
 from nerfcli.multiview.tracks import Tracks, tracks_of_matches, tracks_of_model
-from nerfcli.photos.loading import Photo
+from nerfcli.multiview.training_matches import LONGER_SIDE_PX, chosen_pairs, match
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.scene import Scene
 
 # What features of a photo take on one thread, and comparing them, for each of the pixels in which they are sought:
@@ -23,7 +23,7 @@ class Shared:
         threads: that look for features.
     """
 
-    def __init__(self, scene: Scene, photos: Sequence[Photo], *, threads: int):
+    def __init__(self, scene: Scene, photos: Sequence[LoadedPhoto], *, threads: int):
         self._scene, self._photos, self._threads = scene, photos, threads
 
     @property

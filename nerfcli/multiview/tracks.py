@@ -11,7 +11,7 @@ import numpy as np
 
 from nerfcli.cameras.formats.colmap import parse_colmap
 from nerfcli.multiview.features import Matches
-from nerfcli.photos.loading import Photo
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.scene import Scene, model_folder
 
 
@@ -35,7 +35,7 @@ class Tracks:
         return int(self.points.max(initial=-1)) + 1
 
 
-def tracks_of_model(scene: Scene, photos: Sequence[Photo]) -> Tracks:
+def tracks_of_model(scene: Scene, photos: Sequence[LoadedPhoto]) -> Tracks:
     """What the scene's COLMAP model says that these photos saw; nothing where there is no such model."""
     folder = model_folder(scene.root)
     capture = parse_colmap(folder) if folder is not None else None
@@ -55,7 +55,7 @@ def tracks_of_model(scene: Scene, photos: Sequence[Photo]) -> Tracks:
     return Tracks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def tracks_of_matches(photos: Sequence[Photo], matched: Sequence[Matches]) -> Tracks:
+def tracks_of_matches(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> Tracks:
     """Matches of two photos each, as points that both saw; some are wrong."""
     parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]
     first = 0

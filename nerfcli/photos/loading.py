@@ -14,7 +14,7 @@ from nerfcli.media.masks import read_mask
 
 
 @dataclass(frozen=True)
-class Photo:
+class LoadedPhoto:
     """One photo as it is trained on.
 
     Args:
@@ -28,7 +28,7 @@ class Photo:
     used: np.ndarray | None
 
 
-def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: str = "ignore") -> list[Photo]:
+def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: str = "ignore") -> list[LoadedPhoto]:
     """Read, orient and downscale the photos of `frames`, in parallel, in order.
 
     Args:
@@ -44,7 +44,7 @@ def load_photos(frames: Sequence[Frame], *, factor: float, threads: int, masks: 
         return list(pool.map(lambda frame: load_photo(frame, factor, masks), frames))
 
 
-def load_photo(frame: Frame, factor: float, masks: str) -> Photo:
+def load_photo(frame: Frame, factor: float, masks: str) -> LoadedPhoto:
     """Read one photo; arguments as of `load_photos`."""
     if frame.image is None:
         raise UserError(
@@ -70,7 +70,7 @@ def load_photo(frame: Frame, factor: float, masks: str) -> Photo:
     elif frame.mask is not None:
         # A pixel of the small picture counts only where all that it averages counts.
         used = downscale(read_mask(frame.mask, frame.image), factor) == 255
-    return Photo(replace(frame, camera=downscaled_camera(frame.camera, factor)), downscale(pixels, factor), used)
+    return LoadedPhoto(replace(frame, camera=downscaled_camera(frame.camera, factor)), downscale(pixels, factor), used)
 
 
 def downscaled_camera(camera: Camera, factor: float) -> Camera:

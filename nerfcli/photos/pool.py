@@ -15,7 +15,7 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.kernels import PixelTable, backend_for
 from nerfcli.photos.footprint import pixel_footprint
-from nerfcli.photos.loading import Photo, downscaled_camera, load_photo
+from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo
 from nerfcli.photos.storage import IN_MEMORY, Room
 
 # In float64, the bearings of a large photo would take more than the photo.
@@ -32,7 +32,7 @@ class Album:
         fills_frame: whether a photo has no alpha of its own.
     """
 
-    photos: tuple[Photo, ...]
+    photos: tuple[LoadedPhoto, ...]
     colours: np.ndarray
     fills_frame: bool
 
@@ -50,7 +50,7 @@ def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room
         colours = room.array((int(begins[-1]), channels), np.uint8)
         fills: list[bool] = []
 
-        def place(index: int, colours: np.ndarray = colours) -> tuple[Photo, bool] | None:
+        def place(index: int, colours: np.ndarray = colours) -> tuple[LoadedPhoto, bool] | None:
             photo = load_photo(frames[index], factor, masks)
             has_alpha = photo.pixels.shape[-1] == 4
             if has_alpha and colours.shape[-1] == 3:
@@ -60,7 +60,7 @@ def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room
             room.relieve()
             return replace(photo, pixels=part), not has_alpha
 
-        photos: list[Photo] = []
+        photos: list[LoadedPhoto] = []
         with ThreadPoolExecutor(max(1, threads)) as pool:
             for placed in pool.map(place, range(len(frames))):
                 if placed is None:
@@ -134,7 +134,7 @@ class PixelPool:
 
     def __init__(
         self,
-        photos: Sequence[Photo],
+        photos: Sequence[LoadedPhoto],
         training_from_scene: Similarity,
         device: torch.device,
         *,
@@ -167,7 +167,7 @@ class PixelPool:
         self.first_bearing = torch.tensor([first_bearing[photo.frame.camera] for photo in photos], device=device)
         self.without_ray = sum(int((~good_rays[photo.frame.camera]).sum()) for photo in photos)
 
-        def usable(photo: Photo) -> np.ndarray:
+        def usable(photo: LoadedPhoto) -> np.ndarray:
             good = good_rays[photo.frame.camera]
             return good if photo.used is None else good & photo.used.ravel()
 
@@ -237,7 +237,7 @@ def _fill_bearings(camera: Camera, bearings: np.ndarray, room: Room) -> np.ndarr
     return valid
 
 
-def _one_after_another(photos: Sequence[Photo]) -> np.ndarray:
+def _one_after_another(photos: Sequence[LoadedPhoto]) -> np.ndarray:
     any_alpha = any(photo.pixels.shape[-1] == 4 for photo in photos)
     pixels = [_with_alpha(photo.pixels) if any_alpha else photo.pixels for photo in photos]
     return np.concatenate([part.reshape(-1, part.shape[-1]) for part in pixels])

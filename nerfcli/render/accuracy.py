@@ -17,7 +17,7 @@ from nerfcli.field.background import colours_behind
 from nerfcli.kernels import RaysSeen
 from nerfcli.render.depth import DepthRequest, requested, shares
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import Picture
+from nerfcli.render.pictures import RenderedPicture
 from nerfcli.render.rays import CENTRES, pixel_rays
 from nerfcli.render.tracing import render_cut_rays, uniform_cuts
 
@@ -75,7 +75,7 @@ class MeasuredError:
         return numbers
 
 
-def truncation_bounds(picture: Picture, tolerance: float) -> dict[str, float]:
+def truncation_bounds(picture: RenderedPicture, tolerance: float) -> dict[str, float]:
     """What a picture states about itself: the tolerance asked for, the largest and the mean bound of its pixels."""
     error = picture.truncation_error
     return {

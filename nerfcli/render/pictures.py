@@ -42,7 +42,7 @@ class Quality:
 
 
 @dataclass(frozen=True)
-class Picture:
+class RenderedPicture:
     """What was seen from one frame: NumPy float32, lengths in the scene's unit, NaN where undefined.
 
     Args:
@@ -74,7 +74,7 @@ def render_picture(
     quality: Quality = Quality(),
     on_tile: Callable[[int], None] | None = None,
     rays_per_tile: int = RAYS_PER_TILE,
-) -> Picture:
+) -> RenderedPicture:
     """Render one frame; every bit of it is the same for any size of tiles and any number of threads.
 
     A pixel of several samples is the mean of its rays in colour and opacity; its depth, spread and disagreement are
@@ -113,7 +113,7 @@ def render_picture(
     )
     _refuse_non_finite(frame, {"rgb": rgb, "opacity": opacity, "truncation error": error})
     depth_map, spread_map, disagreement_map = distances if depth is not None else (None, None, None)
-    return Picture(
+    return RenderedPicture(
         rgb=rgb,
         opacity=opacity,
         depth=depth_map,
@@ -136,7 +136,7 @@ def _refuse_non_finite(frame: Frame, maps: dict[str, np.ndarray]) -> None:
             )
 
 
-def straight_rgba(picture: Picture) -> np.ndarray:
+def straight_rgba(picture: RenderedPicture) -> np.ndarray:
     """(H, W, 4) float32 sRGB with straight alpha of a picture that was rendered on black; 0 where nothing is."""
     alpha = picture.opacity[..., None]
     colour = np.divide(picture.rgb, alpha, out=np.zeros_like(picture.rgb), where=alpha > 0)

@@ -10,13 +10,13 @@ import numpy as np
 
 from nerfcli import __version__
 from nerfcli.media.colour_maps import levels_of
-from nerfcli.media.depth import DepthMeta
+from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.preview import coloured
 from nerfcli.pages import page
-from nerfcli.pages.pictures import data_uri, jpeg_bytes
+from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes
 from nerfcli.render.depth import DepthRequest
 from nerfcli.report.drawings import Curve, curves, from_above
-from nerfcli.report.facts import RunFacts, mismatches_of, warnings_of
+from nerfcli.report.run_facts import RunFacts, mismatches_of, warnings_of
 from nerfcli.report.tables import (
     capture_html,
     ledger_html,

@@ -5,7 +5,7 @@ from html import escape
 from typing import Any
 
 from nerfcli.pages.tables import table
-from nerfcli.report.facts import RunFacts
+from nerfcli.report.run_facts import RunFacts
 
 _MEGA = 1e6
 

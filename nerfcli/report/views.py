@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
-from nerfcli.evaluate.protocol import WHITE, HeldOut, compare
+from nerfcli.evaluate.protocol import WHITE, HeldOutPhoto, compare
 from nerfcli.media.colour_maps import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.report.facts import RunFacts
+from nerfcli.report.run_facts import RunFacts
 
 # Mean absolute difference of the channels that has the last colour of error maps, sRGB in [0, 1].
 ERROR_RANGE = 0.2
@@ -57,7 +57,7 @@ def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
 
 
 def look_at(
-    model: Model, held_out: Sequence[HeldOut], *, depth: DepthRequest, on_share: Callable[[float], None]
+    model: Model, held_out: Sequence[HeldOutPhoto], *, depth: DepthRequest, on_share: Callable[[float], None]
 ) -> list[Seen]:
     """Render held-out photos of a run.
 

@@ -18,7 +18,7 @@ from nerfcli.search.judgement import (
     judge_removal,
     judge_supported,
 )
-from nerfcli.search.trials import Start, Trial, Trials
+from nerfcli.search.trials import Trial, Trials, TrialStart
 
 # Steps of a trial against those of the training that it goes on from.
 STEPS_OF_START = 0.5
@@ -76,7 +76,7 @@ class Race:
         asked: the model that has to be bettered.
     """
 
-    def __init__(self, trials: Trials, start: Start, purse: Purse, asked: Components):
+    def __init__(self, trials: Trials, start: TrialStart, purse: Purse, asked: Components):
         self._trials, self._start, self._purse, self._asked = trials, start, purse, asked
         self._length = max(1, round(STEPS_OF_START * start.steps))
         self._seconds_each = start.seconds * self._length / start.steps

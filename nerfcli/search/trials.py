@@ -23,7 +23,7 @@ from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.point_depth import PointDepths, PointRays
-from nerfcli.photos.loading import Photo
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import PixelPool
 from nerfcli.photos.psnr import psnr_of
 from nerfcli.photos.storage import IN_MEMORY, Room
@@ -73,7 +73,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Start:
+class TrialStart:
     """Where the first training stood when it stopped.
 
     Args:
@@ -113,7 +113,7 @@ class Trials:
 
     def __init__(
         self,
-        photos: Sequence[Photo],
+        photos: Sequence[LoadedPhoto],
         extent: Extent,
         *,
         settings: TrainSettings,
@@ -142,7 +142,9 @@ class Trials:
         self._points = PointRays(usable, self._pool) if usable is not None and len(usable.numbers) else None
         self._room = room
 
-    def begin(self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0) -> Start | None:
+    def begin(
+        self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0
+    ) -> TrialStart | None:
         """Train from the beginning to `FORK_SHARE` of a schedule.
 
         Args:
@@ -184,9 +186,9 @@ class Trials:
         copies = {name: tensor.clone() for name, tensor in tensors.items()}
         errors = self._errors(fitting)
         trial = Trial(errors, errors, self._counts, statistics.median(took) * len(took), fitting.step)
-        return Start(copies, description, sum(took), trial, signs)
+        return TrialStart(copies, description, sum(took), trial, signs)
 
-    def go_on(self, start: Start, components: Components, *, seed: int, steps: int) -> Trial:
+    def go_on(self, start: TrialStart, components: Components, *, seed: int, steps: int) -> Trial:
         """Go on to the end of the schedule with these components, and judge.
 
         Args:
@@ -238,7 +240,7 @@ class Trials:
             error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
         )
 
-    def _take_up(self, fitting: Fitting, start: Start) -> None:
+    def _take_up(self, fitting: Fitting, start: TrialStart) -> None:
         """Bring a fresh training to `start`, but for its random numbers and for what only its own model has."""
         own, _ = fitting.state()
         kept = {name: tensor for name, tensor in own.items() if name == "generator" or name.startswith("parts")}
@@ -271,7 +273,7 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
     return np.kron(chosen, np.ones((block, block), bool))[: shape[0], : shape[1]]
 
 
-def _split(photos: Sequence[Photo], room: Room) -> tuple[list[Photo], np.ndarray]:
+def _split(photos: Sequence[LoadedPhoto], room: Room) -> tuple[list[LoadedPhoto], np.ndarray]:
     """The photos without the blocks that are judged, and numbers of pixels of those blocks, counted through all photos:
     as many of each photo, as far as it has them."""
     generator = np.random.default_rng(SEED)

@@ -30,7 +30,7 @@ class Ray:
 
 
 @dataclass(frozen=True)
-class Intervals:
+class Segments:
     """Densities and lengths of the intervals of one ray."""
 
     density: tuple[float, ...]
@@ -47,7 +47,7 @@ class Group:
     """
 
     name: str
-    rays: tuple[Intervals, ...]
+    rays: tuple[Segments, ...]
 
 
 def coarse(value: float) -> float:
@@ -55,10 +55,10 @@ def coarse(value: float) -> float:
     return torch.tensor(value, dtype=torch.float64).to(torch.bfloat16).item()
 
 
-def fog(optical_depth: float, samples: int) -> Intervals:
+def fog(optical_depth: float, samples: int) -> Segments:
     """Intervals of about one optical depth; neither densities nor lengths are all equal."""
     density = tuple(coarse(optical_depth * 64 * (3 + k % 5) / 4) for k in range(samples))
-    return Intervals(density, tuple(2.0 ** -(6 + k % 3) for k in range(samples)))
+    return Segments(density, tuple(2.0 ** -(6 + k % 3) for k in range(samples)))
 
 
 def groups() -> tuple[Group, ...]:
@@ -69,57 +69,57 @@ def groups() -> tuple[Group, ...]:
             Group(f"optical depth {x:g} per interval, 1 to 4096", tuple(fog(x, n) for n in counts))
             for x in (1e-12, 1e-9, 1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6)
         ),
-        Group("no intervals", (Intervals((), ()), Intervals((), ()))),
-        Group("zero weights: empty intervals", (Intervals((0.0,) * 5, (0.5,) * 5), Intervals((0.0,), (4.0,)))),
+        Group("no intervals", (Segments((), ()), Segments((), ()))),
+        Group("zero weights: empty intervals", (Segments((0.0,) * 5, (0.5,) * 5), Segments((0.0,), (4.0,)))),
         Group(
             "duplicate edges: intervals of length 0",
             (
-                Intervals((1.0, 2.0, 4.0), (0.0, 0.5, 0.0)),
-                Intervals((LARGEST, 1.0, 0.0), (0.0, 0.25, 0.0)),
-                Intervals((1.0, 1.0), (0.0, 0.0)),
+                Segments((1.0, 2.0, 4.0), (0.0, 0.5, 0.0)),
+                Segments((LARGEST, 1.0, 0.0), (0.0, 0.25, 0.0)),
+                Segments((1.0, 1.0), (0.0, 0.0)),
             ),
         ),
         Group(
             "first interval opaque",
-            (Intervals((2.0**20, 1.0, 2.0), (1.0, 0.5, 0.5)), Intervals((2.0**100, 0.0, 2.0**100), (1.0, 1.0, 1.0))),
+            (Segments((2.0**20, 1.0, 2.0), (1.0, 0.5, 0.5)), Segments((2.0**100, 0.0, 2.0**100), (1.0, 1.0, 1.0))),
         ),
         Group(
             "thin fog, then an opaque interval",
             (
-                Intervals((2.0**-30,) * 64 + (2.0**20,), (2.0**-6,) * 65),
-                Intervals((2.0**-20,) * 64 + (16.0, 2.0**20, 4.0), (2.0**-6,) * 64 + (1.0, 1.0, 1.0)),
+                Segments((2.0**-30,) * 64 + (2.0**20,), (2.0**-6,) * 65),
+                Segments((2.0**-20,) * 64 + (16.0, 2.0**20, 4.0), (2.0**-6,) * 64 + (1.0, 1.0, 1.0)),
             ),
         ),
         Group(
             "last interval very long, up to 1e38",
             (
-                Intervals((0.5, 2.0**-40), (1.0, 2.0**40)),
-                Intervals((0.5, 0.0), (1.0, 2.0**126)),
-                Intervals((0.5, 1.0), (1.0, 2.0**126)),
-                Intervals((0.5, 2.0**-126), (1.0, 2.0**126)),
+                Segments((0.5, 2.0**-40), (1.0, 2.0**40)),
+                Segments((0.5, 0.0), (1.0, 2.0**126)),
+                Segments((0.5, 1.0), (1.0, 2.0**126)),
+                Segments((0.5, 2.0**-126), (1.0, 2.0**126)),
             ),
         ),
         Group(
             "densities at overflow, product beyond float32",
             (
-                Intervals((LARGEST,), (2.0**-6,)),
-                Intervals((1.0, LARGEST, 1.0), (0.5, 4.0, 0.5)),
-                Intervals((LARGEST, LARGEST, LARGEST), (4.0, 4.0, 4.0)),
-                Intervals((LARGEST, LARGEST), (0.0, 0.0)),
+                Segments((LARGEST,), (2.0**-6,)),
+                Segments((1.0, LARGEST, 1.0), (0.5, 4.0, 0.5)),
+                Segments((LARGEST, LARGEST, LARGEST), (4.0, 4.0, 4.0)),
+                Segments((LARGEST, LARGEST), (0.0, 0.0)),
             ),
         ),
         Group(
             "two surfaces, shells and slabs",
             (
-                Intervals((44.5, 0.0, 2.0**14), (2.0**-6, 4.0, 2.0**-6)),
-                Intervals((0.0, 2.0**13, 0.0), (2.0, 2.0**-13, 4.0)),
-                Intervals((0.5, 1.0, 2.0), (1.0, 1.0, 1.0)),
+                Segments((44.5, 0.0, 2.0**14), (2.0**-6, 4.0, 2.0**-6)),
+                Segments((0.0, 2.0**13, 0.0), (2.0, 2.0**-13, 4.0)),
+                Segments((0.5, 1.0, 2.0), (1.0, 1.0, 1.0)),
             ),
         ),
     )
 
 
-def lit(rays: list[Intervals], precision: Precision) -> tuple[int, float]:
+def lit(rays: list[Segments], precision: Precision) -> tuple[int, float]:
     """The most intervals that light comes to, and the optical depth it comes through."""
     counts, depths = [0], [0.0]
     for ray in rays:
@@ -169,11 +169,11 @@ PIXELS: tuple[tuple[Ray, Ray], ...] = (
 PIXEL_SHARES = (0.04, 0.25, 0.75)
 
 
-def thick_and_thin(precision: Precision) -> list[Intervals]:
+def thick_and_thin(precision: Precision) -> list[Segments]:
     """Fog in as many intervals as the precision can add up, and a wall between thin fogs."""
     counts = (1, 16) if precision.dtype == torch.bfloat16 else (1, 16, 1024, 4096)
-    walls = [Intervals((2.0**-10, 2.0**27, 1.0), (1.0,) * 3), Intervals((2.0**-30, 2.0**-30, 2.0**40), (1.0, 0.0, 1.0))]
-    return [fog(x, n) for x in (1e-12, 1e-3, 1.0, 1e6) for n in counts] + [*walls, Intervals((), ())]
+    walls = [Segments((2.0**-10, 2.0**27, 1.0), (1.0,) * 3), Segments((2.0**-30, 2.0**-30, 2.0**40), (1.0, 0.0, 1.0))]
+    return [fog(x, n) for x in (1e-12, 1e-3, 1.0, 1e6) for n in counts] + [*walls, Segments((), ())]
 
 
 # Light of a surface far away: all of it within 1e-3 at 0.98 of the way to infinity.

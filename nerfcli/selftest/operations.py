@@ -16,7 +16,7 @@ from torch import Tensor
 from nerfcli.kernels import HashGrid, March, PixelTable, Rays, reference
 from nerfcli.kernels.activations import density_from_log
 from nerfcli.selftest import cases, textbook
-from nerfcli.selftest.cases import MEANINGLESS, Intervals, Ray, lit
+from nerfcli.selftest.cases import MEANINGLESS, Ray, Segments, lit
 from nerfcli.selftest.measure import Errors, Precision, largest_error
 
 BACKGROUND = COLOUR_GRADIENT = (1.0, 0.5, 0.25)
@@ -30,7 +30,7 @@ Inputs = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
-class Answer:
+class Outcome:
     """What an operation gives.
 
     Args:
@@ -49,7 +49,7 @@ def exact(given: Tensor) -> Tensor:
     return given.detach().cpu().double() if given.is_floating_point() else given.cpu()
 
 
-def errors(got: Answer, wanted: Answer, *, tiny: float) -> Errors:
+def errors(got: Outcome, wanted: Outcome, *, tiny: float) -> Errors:
     """Measure the largest errors of values and of gradients."""
     value = _largest(got.values, wanted.values, wanted.value_sizes, tiny=tiny)
     if not got.gradients:
@@ -67,21 +67,21 @@ def both(roundings: float, precision: Precision) -> Errors:
     return Errors(roundings * precision.unit, roundings * precision.unit)
 
 
-def gradients_of(function: Callable[[Tensor], Tensor], given: Tensor) -> Answer:
+def gradients_of(function: Callable[[Tensor], Tensor], given: Tensor) -> Outcome:
     """A function of numbers or points, and the gradient of a weighted sum, relative to the largest of its point."""
     given = given.detach().requires_grad_()
     values = function(given)
     weights = torch.tensor(COLOUR_GRADIENT if given.ndim == 2 else 1.0).to(values)
     (gradient,) = torch.autograd.grad((values * weights).sum(), given)
     size = gradient.abs().amax(-1, keepdim=True).expand_as(gradient) if given.ndim == 2 else gradient
-    return Answer((values.detach(),), (gradient,), (size,))
+    return Outcome((values.detach(),), (gradient,), (size,))
 
 
 def _offsets(counts: Sequence[int], precision: Precision) -> Tensor:
     return torch.tensor([0, *itertools.accumulate(counts)], device=precision.device)
 
 
-def intervals(rays: Sequence[Intervals], precision: Precision) -> Inputs:
+def intervals(rays: Sequence[Segments], precision: Precision) -> Inputs:
     """Pack densities and lengths of rays."""
     return {
         "density": precision.tensor([x for ray in rays for x in ray.density]),
@@ -90,7 +90,7 @@ def intervals(rays: Sequence[Intervals], precision: Precision) -> Inputs:
     }
 
 
-def light_inputs(rays: Sequence[Intervals], precision: Precision) -> Inputs:
+def light_inputs(rays: Sequence[Segments], precision: Precision) -> Inputs:
     """Pack rays with colours and what the loss gains by each output."""
     if precision.dtype == torch.bfloat16:  # a sum of more terms than 16 has no digits left
         rays = [ray for ray in rays if len(ray.density) <= 16]
@@ -104,7 +104,7 @@ def light_inputs(rays: Sequence[Intervals], precision: Precision) -> Inputs:
     }
 
 
-def light_bound(rays: Sequence[Intervals], precision: Precision) -> Errors:
+def light_bound(rays: Sequence[Segments], precision: Precision) -> Errors:
     """Bound colours and weights of rays."""
     if precision.compiled:
         return Errors(8 * precision.unit, 16 * precision.unit)
@@ -122,7 +122,7 @@ def surface_inputs(precision: Precision) -> Inputs:
     return {name: precision.tensor(values) for name, values in cases.FAR_SURFACE.items()}
 
 
-def composite(module: ModuleType, given: Inputs) -> Answer:
+def composite(module: ModuleType, given: Inputs) -> Outcome:
     """Colours, transmittances and weights; the sizes of the gradient by density are those of its terms."""
     density, rgb = given["density"].detach().requires_grad_(), given["rgb"].detach().requires_grad_()
     colour, transmittance, weights = module.composite(
@@ -141,22 +141,22 @@ def composite(module: ModuleType, given: Inputs) -> Answer:
         seen = (weight * value).abs()
         sizes.append(lengths * ((-own.cumsum(0)).exp() * value.abs() + seen.flip(0).cumsum(0).flip(0) - seen + last))
     answers = (colour.detach(), transmittance.detach(), weights.detach())
-    return Answer(answers, gradients, (torch.cat(sizes) if sizes else density, gradients[1]))
+    return Outcome(answers, gradients, (torch.cat(sizes) if sizes else density, gradients[1]))
 
 
-def before(module: ModuleType, given: Inputs) -> Answer:
+def before(module: ModuleType, given: Inputs) -> Outcome:
     """Optical depths in front of intervals."""
     density = _density_for(module, given)
     before = module.optical_depth_before(density, given["lengths"], offsets=given["offsets"])
-    return Answer((before.detach(),), _by(before, density))
+    return Outcome((before.detach(),), _by(before, density))
 
 
-def distortion(module: ModuleType, given: Inputs) -> Answer:
+def distortion(module: ModuleType, given: Inputs) -> Outcome:
     """Distortion of one ray."""
     weights = given["weights"].detach().requires_grad_()
     offsets = torch.tensor([0, len(weights)], device=weights.device)
     value = module.distortion(weights, given["starts"], given["ends"], offsets)
-    return Answer((value.detach().reshape(1),), torch.autograd.grad(value.sum(), weights))
+    return Outcome((value.detach().reshape(1),), torch.autograd.grad(value.sum(), weights))
 
 
 def _by(values: Tensor, density: Tensor) -> tuple[Tensor, ...]:
@@ -204,13 +204,13 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
     if precision.compiled:
         return Errors(16 * factor * precision.unit)
     lengths = (tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True)) for ray in rays)
-    intervals = [Intervals(tuple(ray.density), length) for ray, length in zip(rays, lengths, strict=True)]
+    intervals = [Segments(tuple(ray.density), length) for ray, length in zip(rays, lengths, strict=True)]
     samples, depth = lit(intervals, precision)
     bound = factor * precision.unit * (16 + (samples + 2) * (1 + depth))
     return Errors(bound, 16 * bound)
 
 
-def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Answer:
+def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
     """Some of the depths of rays."""
     density = _density_for(module, given)
     seen = module.light_ends(density, given["starts"], given["ends"], offsets=given["offsets"], shares=SHARES)
@@ -220,7 +220,7 @@ def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> A
     return _depths([named[column] for column in columns], columns, given, density)
 
 
-def depth_by_textbook(columns: tuple[str, ...], given: Inputs) -> Answer:
+def depth_by_textbook(columns: tuple[str, ...], given: Inputs) -> Outcome:
     """The same depths by the formulas of textbooks, which have the mean for that of the heaviest interval, too."""
     density = given["density"].detach().requires_grad_()
     named = textbook.depth(density, given["starts"], given["ends"], offsets=given["offsets"])
@@ -229,7 +229,7 @@ def depth_by_textbook(columns: tuple[str, ...], given: Inputs) -> Answer:
     )
 
 
-def _depths(values: list[Tensor], columns: tuple[str, ...], given: Inputs, density: Tensor) -> Answer:
+def _depths(values: list[Tensor], columns: tuple[str, ...], given: Inputs, density: Tensor) -> Outcome:
     if columns[0] == "median":
         settled = given["settled"].to(density.device)
         values = [torch.where(settled[:, i], value, 0.0) for i, value in enumerate(values)]
@@ -242,21 +242,21 @@ def _depths(values: list[Tensor], columns: tuple[str, ...], given: Inputs, densi
         torch.cat([part.abs().max().expand_as(part) for part in gradient.split(counts.tolist()) if len(part)])
         for gradient in gradients
     )
-    return Answer(tuple(value.detach() for value in values), gradients, sizes)
+    return Outcome(tuple(value.detach() for value in values), gradients, sizes)
 
 
-def mixture(module: ModuleType, given: Inputs) -> Answer:
+def mixture(module: ModuleType, given: Inputs) -> Outcome:
     """Quantiles of the light of two rays together."""
     spans = (given["density"], given["starts"], given["ends"])
     pixels = {"offsets": given["offsets"], "rays_per_pixel": 2}
-    return Answer(tuple(module.mixture_quantile(*spans, **pixels, share=share) for share in cases.PIXEL_SHARES))
+    return Outcome(tuple(module.mixture_quantile(*spans, **pixels, share=share) for share in cases.PIXEL_SHARES))
 
 
-def mixture_by_mean(given: Inputs) -> Answer:
+def mixture_by_mean(given: Inputs) -> Outcome:
     """The mean of the quantiles of two rays."""
     spans = (given["density"], given["starts"], given["ends"])
     seen = reference.light_ends(*spans, offsets=given["offsets"], shares=cases.PIXEL_SHARES)
-    return Answer(tuple(column.view(-1, 2).mean(1) for column in seen.quantiles.unbind(1)))
+    return Outcome(tuple(column.view(-1, 2).mean(1) for column in seen.quantiles.unbind(1)))
 
 
 def grid_inputs(points: Sequence[cases.Point], levels: int, precision: Precision) -> Inputs:
@@ -269,7 +269,7 @@ def grid_inputs(points: Sequence[cases.Point], levels: int, precision: Precision
     }
 
 
-def encode(grids: tuple[int, ...], rounded: int, module: ModuleType, given: Inputs) -> Answer:
+def encode(grids: tuple[int, ...], rounded: int, module: ModuleType, given: Inputs) -> Outcome:
     """Features between the vertices of hash grids."""
     points, table = given["points"], given["table"].detach().requires_grad_()
     encoded = module.hash_encode(points, table, grids).view(len(points), len(grids), -1)
@@ -277,10 +277,10 @@ def encode(grids: tuple[int, ...], rounded: int, module: ModuleType, given: Inpu
     blur = 1.0 + rounded * torch.tensor(grids, dtype=torch.float64)
     sizes = blur[:, None] * given["table"].abs().amax((1, 2)).cpu()[:, None].double()
     largest = (blur[:, None, None] * gradient.abs().amax(1, keepdim=True).cpu().double()).expand_as(gradient)
-    return Answer((encoded.detach(),), (gradient,), (largest,), (sizes.expand_as(encoded),))
+    return Outcome((encoded.detach(),), (gradient,), (largest,), (sizes.expand_as(encoded),))
 
 
-def encode_in_half(grids: tuple[int, ...], given: Inputs) -> Answer:
+def encode_in_half(grids: tuple[int, ...], given: Inputs) -> Outcome:
     """The same in half precision."""
     half = {name: values.half() for name, values in given.items()}
     return encode(grids, 0, reference, half)
@@ -302,14 +302,14 @@ def pixel_inputs(precision: Precision) -> Inputs:
     }
 
 
-def pixel_rays(module: ModuleType, given: Inputs) -> Answer:
+def pixel_rays(module: ModuleType, given: Inputs) -> Outcome:
     """Rays and colours of chosen pixels."""
     table = PixelTable(*(given[name] for name in ("first_pixel", "first_bearing", "bearings", "poses", "photos")))
     origins, directions, colours = module.pixel_rays(given["chosen"], table)
-    return Answer((origins, directions, colours), value_sizes=(origins, torch.ones_like(directions), colours))
+    return Outcome((origins, directions, colours), value_sizes=(origins, torch.ones_like(directions), colours))
 
 
-def density(module: ModuleType, given: Inputs) -> Answer:
+def density(module: ModuleType, given: Inputs) -> Outcome:
     """Densities of their logarithms; compiled, by networks of which one path for each sign carries the number."""
     logarithms = given["logarithms"]
     if module is reference:
@@ -328,18 +328,18 @@ def _layers(like: Tensor) -> tuple[Tensor, ...]:
     return tuple(like.new_zeros(shape) for shape in ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32)))
 
 
-def adam(module: ModuleType, given: Inputs) -> Answer:
+def adam(module: ModuleType, given: Inputs) -> Outcome:
     """Adam's first step."""
     table, first, second = (torch.zeros_like(given["gradients"]) for _ in range(3))
     module.adam_rows(table, given["gradients"].clone(), first, second, step=1, rate=RATE, betas=BETAS, eps=EPS)
-    return Answer((table,))
+    return Outcome((table,))
 
 
-def adam_in_half(given: Inputs) -> Answer:
+def adam_in_half(given: Inputs) -> Outcome:
     """Adam's first step with its state in half precision."""
     half = given["gradients"].half()
     moment, square = 0.1 * half, 0.01 * half * half
-    return Answer((-RATE * (moment / 0.1) / ((square / 0.01).sqrt() + EPS),))
+    return Outcome((-RATE * (moment / 0.1) / ((square / 0.01).sqrt() + EPS),))
 
 
 def contract_inputs(radii: Sequence[float], precision: Precision) -> Inputs:
@@ -363,10 +363,10 @@ def march_inputs(full: bool, precision: Precision) -> Inputs:
     }
 
 
-def chords(module: ModuleType, given: Inputs) -> Answer:
+def chords(module: ModuleType, given: Inputs) -> Outcome:
     """How much of each ray is kept, in a cube whose network gives no density."""
     origins = given["origins"]
     rays = Rays(origins, given["directions"], origins.new_zeros(len(origins)))
     march = March(given["edges"], given["occupied"], "none", 1e9)
     samples = module.visible_samples(rays, march, HashGrid(origins.new_zeros(8, 16, 4), (2,) * 8, _layers(origins)))
-    return Answer((reference.sum_along_rays(samples.ends - samples.starts, samples.offsets),))
+    return Outcome((reference.sum_along_rays(samples.ends - samples.starts, samples.offsets),))

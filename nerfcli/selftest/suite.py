@@ -6,8 +6,8 @@ import torch
 
 from nerfcli import kernels
 from nerfcli.selftest.cases import MEANINGLESS
-from nerfcli.selftest.checks import checks, row_of
 from nerfcli.selftest.measure import Precision, Row
+from nerfcli.selftest.table import checks, row_of
 
 
 def precisions(device: str) -> tuple[Precision, ...]:

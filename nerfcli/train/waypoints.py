@@ -16,7 +16,7 @@ from nerfcli.photos.held_out_exposure import log_gains_of
 from nerfcli.photos.pool import load_album
 from nerfcli.render.model import Model, load_model, save_model
 from nerfcli.runs.log import add_to_log
-from nerfcli.train.heldout import HeldoutPixels
+from nerfcli.train.held_out_pixels import HeldoutPixels
 from nerfcli.train.preparation import Prepared
 
 SHARES = (0.25, 0.5, 0.75, 1.0)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from nerfcli import scene as scenes
-from nerfcli.ablate.results import RUNS, Measured, refuse_foreign, rows_of, write_results
-from nerfcli.ablate.variants import AUTO, CHOSEN, Capture, Variant, variants
+from nerfcli.ablate.results import RUNS, MeasuredTraining, refuse_foreign, rows_of, write_results
+from nerfcli.ablate.variants import AUTO, CHOSEN, CaptureTraits, Variant, variants
 from nerfcli.cameras.formats.colmap import parse_colmap
 from nerfcli.errors import UserError
 from nerfcli.evaluate.run_photos import held_out_photos_of
@@ -27,7 +27,7 @@ from nerfcli.workflows.train import train_scene, was_interrupted
 _SAME = "; the same pixels for all variants of a seed, other pixels for each seed"
 
 # Takes a run, its variant's name and its settings, and whether to measure anew.
-Measure = Callable[[Run, str, TrainSettings, bool], Measured]
+Measure = Callable[[Run, str, TrainSettings, bool], MeasuredTraining]
 
 
 def ablate_scene(
@@ -91,7 +91,7 @@ def ablate_scene(
         return run
 
     about = {"scene": str(path), "settings": settings.to_json(), "complete": False}
-    measured: list[Measured] = []
+    measured: list[MeasuredTraining] = []
     compared: list[Variant] = []
     rows = rows_of(measured, compared)
     write_results(folder, rows, measured, about)
@@ -118,34 +118,36 @@ def ablate_scene(
     return {"rows": [vars(row) for row in rows], **about}
 
 
-def _capture(scene: Scene) -> Capture:
+def _capture(scene: Scene) -> CaptureTraits:
     """What the scene offers to components."""
     first, sparse = scene.train_frames[0].image, model_folder(scene.root)
     seen = parse_colmap(sparse).observations if sparse is not None else None
     exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))
-    return Capture(
+    return CaptureTraits(
         has_alpha=first is not None and read_image(first).shape[-1] == 4,
         has_points=seen is not None and len(seen.pixels) > 0,
         has_exif=bool(np.ptp(exif) > 0.0),
     )
 
 
-def _measured_whole(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> Measured:
+def _measured_whole(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> MeasuredTraining:
     """Whole photos, by the protocol of `evaluate_run`: now, or by an earlier call."""
     metrics = evaluate_run(run.path, device=settings.device, threads=settings.threads, overwrite=overwrite).metrics
     mean, training, protocol = metrics["mean"], metrics["training"], metrics["protocol"]
-    return Measured(name, settings.seed, mean["psnr"], mean["ssim"], training["seconds"], training["steps"], protocol)
+    return MeasuredTraining(
+        name, settings.seed, mean["psnr"], mean["ssim"], training["seconds"], training["steps"], protocol
+    )
 
 
-def _measured_pixels(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> Measured:
+def _measured_pixels(run: Run, name: str, settings: TrainSettings, overwrite: bool) -> MeasuredTraining:
     """Random pixels of the held-out photos: the same for all models of a seed."""
     model, last = run.model(settings.device), run.log[-1]
     photos = held_out_photos_of(run.config, run.cameras.test, model, threads=settings.threads)
     sample = SampledPixels.drawn(photos, seed=settings.seed)
-    return Measured(
+    return MeasuredTraining(
         name, settings.seed, sample.psnr(model), None, last["seconds"], last["step"], f"{sample.protocol()}{_SAME}"
     )
 
 
-def _line(entry: Measured) -> str:
+def _line(entry: MeasuredTraining) -> str:
     return f"{entry.variant}, seed {entry.seed}: {entry.psnr:.2f} dB after {entry.seconds:.0f} s, {entry.steps} steps"

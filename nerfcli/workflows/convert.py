@@ -7,9 +7,9 @@ from typing import Any
 from nerfcli.cameras.frame import Capture
 from nerfcli.cameras.orientation import rescaling_told
 from nerfcli.convert import detect
-from nerfcli.convert.conversion import Conversion, Doubt, Wanted, convert, load
+from nerfcli.convert.conversion import Conversion, Doubt, TargetOptions, convert, load
 from nerfcli.convert.formats import Format, Given, recording
-from nerfcli.convert.pixels import STORED, in_pixels, other_sizes
+from nerfcli.convert.stored_pixels import STORED, in_pixels, other_sizes
 from nerfcli.convert.world_frame import WorldFrame, in_world_frame
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
@@ -25,7 +25,7 @@ class Converted:
 def convert_capture(
     source: Path,
     target: Path,
-    wanted: Wanted,
+    wanted: TargetOptions,
     *,
     given: Given = Given(),
     doubt: Doubt = Doubt(),

@@ -6,7 +6,7 @@ Imports stand where they are needed: what a depth file holds is told without tor
 from pathlib import Path
 from typing import Any
 
-from nerfcli.media.facts import RENDERS, file_facts, renders_facts
+from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
 
 
 def describe(path: str | Path) -> dict[str, Any]:

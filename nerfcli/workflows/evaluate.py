@@ -24,7 +24,7 @@ from nerfcli.evaluate.predictions import (
 from nerfcli.evaluate.protocol import PROTOCOL, Compared, Extras, evaluate_model
 from nerfcli.evaluate.requirements import Requirement, known_numbers, unmet
 from nerfcli.evaluate.run_photos import held_out_photos_of, training_billboards
-from nerfcli.export.names import file_names
+from nerfcli.export.file_names import file_names
 from nerfcli.runs.files import LOG
 from nerfcli.runs.run import Run
 from nerfcli.workflows.machine import device_name, thread_count

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from nerfcli.convert.intrinsics import read_calibration
+from nerfcli.convert.camera_files import read_calibration
 from nerfcli.errors import UserError
 from nerfcli.poses import structure_from_motion
 from nerfcli.poses.input.plan import Outlook, Plan, duration

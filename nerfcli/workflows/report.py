@@ -10,8 +10,8 @@ from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.export.settings import depth_meta
 from nerfcli.pages.page import is_made_from, refuse_foreign, write_page
 from nerfcli.render.depth import DepthRequest
-from nerfcli.report.facts import labels_of, read_facts
 from nerfcli.report.page import mark_of, origin_of, page_html
+from nerfcli.report.run_facts import labels_of, read_facts
 from nerfcli.report.views import common_names, look_at
 from nerfcli.runs.files import REPORT
 from nerfcli.runs.run import load_run

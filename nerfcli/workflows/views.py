@@ -14,8 +14,8 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.camera_path import losses_camera_path, read_normalisation, read_path, write_camera_path
 from nerfcli.cameras.formats.transforms import write_transforms
 from nerfcli.cameras.frame import Capture, Frame
+from nerfcli.cameras.frame_names import frames_named
 from nerfcli.cameras.framing import Window, cropped, equirectangular, sized, with_lens
-from nerfcli.cameras.names import frames_named
 from nerfcli.convert.finding import find_camera_path
 from nerfcli.convert.formats import Given, recognise
 from nerfcli.errors import UserError

@@ -14,7 +14,7 @@ from hard_cases.exact_depths import SHARES, quantile_name
 from nerfcli.kernels import LightEnds
 from nerfcli.kernels.reference.depth import BISECTIONS
 from nerfcli.selftest import textbook
-from nerfcli.selftest.cases import MEANINGLESS, PIXEL_SHARES, PIXELS, Intervals, Ray, depth_rays, lit, thick_and_thin
+from nerfcli.selftest.cases import MEANINGLESS, PIXEL_SHARES, PIXELS, Ray, Segments, depth_rays, lit, thick_and_thin
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
 # Rays of the depths are either cut a few times or finely.
@@ -159,7 +159,7 @@ def _bound(ray: Ray, precision: Precision) -> float:
     if precision.compiled:
         return 16 * precision.unit
     lengths = tuple(end - start for start, end in zip(ray.starts, ray.ends, strict=True))
-    samples, depth = lit([Intervals(tuple(ray.density), lengths)], precision)
+    samples, depth = lit([Segments(tuple(ray.density), lengths)], precision)
     return precision.unit * (16 + (samples + 2) * (1 + depth))
 
 
@@ -211,7 +211,7 @@ def _farthest(rays: list[Ray], wanted: list[float]) -> float:
     return max(ends[i % len(ends)] / place for i, place in enumerate(wanted) if not math.isnan(place))
 
 
-def _flat(rays: list[Intervals], precision: Precision) -> tuple[Tensor, Tensor, Tensor]:
+def _flat(rays: list[Segments], precision: Precision) -> tuple[Tensor, Tensor, Tensor]:
     """Density, lengths and offsets."""
     density = precision.tensor([x for ray in rays for x in ray.density])
     lengths = precision.tensor([x for ray in rays for x in ray.lengths])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from itertools import accumulate
 
-from nerfcli.selftest.cases import Intervals, Ray
+from nerfcli.selftest.cases import Ray, Segments
 
 DIGITS = 60
 
@@ -23,7 +23,7 @@ class Composited:
 
 
 def composited(
-    ray: Intervals,
+    ray: Segments,
     rgb: list[list[float]],
     background: list[float],
     *,
@@ -80,7 +80,7 @@ def composited(
         )
 
 
-def optical_depths(ray: Intervals) -> list[float]:
+def optical_depths(ray: Segments) -> list[float]:
     """The optical depth in front of each interval of a ray, and that of the whole ray."""
     with localcontext() as context:
         context.prec = DIGITS

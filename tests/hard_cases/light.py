@@ -12,7 +12,7 @@ from torch import Tensor
 from hard_cases import exact
 from hard_cases.exact import Composited
 from nerfcli.selftest import textbook
-from nerfcli.selftest.cases import FAR_SURFACE, MEANINGLESS, Group, Intervals, groups, lit
+from nerfcli.selftest.cases import FAR_SURFACE, MEANINGLESS, Group, Segments, groups, lit
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
 
 # In bfloat16 a sum of more terms than this has no digits left.
@@ -62,7 +62,7 @@ def _weights_gradient(samples: int) -> list[float]:
 
 
 @functools.cache
-def _exact(ray: Intervals) -> Composited:
+def _exact(ray: Segments) -> Composited:
     samples = len(ray.density)
     return exact.composited(
         ray,
@@ -74,7 +74,7 @@ def _exact(ray: Intervals) -> Composited:
     )
 
 
-def _packed(rays: list[Intervals], precision: Precision) -> _Packed:
+def _packed(rays: list[Segments], precision: Precision) -> _Packed:
     density, lengths, rgb, gradient, offsets = [], [], [], [], [0]
     for ray in rays:
         density += ray.density
@@ -92,7 +92,7 @@ def _packed(rays: list[Intervals], precision: Precision) -> _Packed:
     )
 
 
-def _bounds(rays: list[Intervals], precision: Precision) -> tuple[Errors, str]:
+def _bounds(rays: list[Segments], precision: Precision) -> tuple[Errors, str]:
     if precision.compiled:
         return Errors(8 * precision.unit, 16 * precision.unit), COMPILED_BOUND
     samples, depth = lit(rays, precision)
@@ -159,7 +159,7 @@ def _composite_errors(operation, rays, wanted, *, precision):  # type: ignore[no
 
 def _subtraction_rows(precisions: tuple[Precision, ...]) -> Iterator[Row]:
     """The gradient behind an opaque interval, which a running sum from the front cannot give."""
-    ray = Intervals((2.0**-4,) * 64 + (32.0, 16.0, 8.0, 4.0), (2.0**-6,) * 64 + (1.0,) * 4)
+    ray = Segments((2.0**-4,) * 64 + (32.0, 16.0, 8.0, 4.0), (2.0**-6,) * 64 + (1.0,) * 4)
     values = [(k % 5 + 1) / 8 for k in range(len(ray.density))]
     wanted = exact.composited(
         ray,

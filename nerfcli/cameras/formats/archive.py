@@ -35,7 +35,7 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.limits import plausible, stated_camera
 from nerfcli.cameras.formats.npy import array_from_npy
-from nerfcli.cameras.formats.poses import rigid_poses
+from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.errors import UserError
 

@@ -17,7 +17,6 @@ from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import parameter_names
 from nerfcli.cameras.conventions import opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import read_json_object
-from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts, lost_to_pinhole
 from nerfcli.cameras.formats.transforms import (
     SPLITS,
     Found,
@@ -27,6 +26,7 @@ from nerfcli.cameras.formats.transforms import (
     refuse_twins,
     relative_path,
 )
+from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole
 from nerfcli.cameras.frame import Capture, Frame, Size
 from nerfcli.cameras.orientation import Measure
 from nerfcli.errors import UserError

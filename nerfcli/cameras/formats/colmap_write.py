@@ -9,7 +9,7 @@ from pathlib import Path
 from nerfcli.atomic import atomic_folder
 from nerfcli.cameras.formats import colmap_binary, colmap_text
 from nerfcli.cameras.formats.colmap_model import ColmapModel, model_of
-from nerfcli.cameras.formats.losses import lost_parts
+from nerfcli.cameras.formats.unsupported import lost_parts
 from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError
 

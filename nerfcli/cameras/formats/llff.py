@@ -16,9 +16,9 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.conventions import llff_from_opencv_pose, opencv_from_llff_pose
 from nerfcli.cameras.formats.limits import plausible, stated_camera
-from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts, lost_to_pinhole
 from nerfcli.cameras.formats.npy import array_from_npy
-from nerfcli.cameras.formats.poses import rigid_poses
+from nerfcli.cameras.formats.rigid_poses import rigid_poses
+from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts, lost_to_pinhole
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling
 from nerfcli.errors import UserError

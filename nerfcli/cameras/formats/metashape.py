@@ -23,7 +23,7 @@ from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats import lenses
 from nerfcli.cameras.formats.fields import malformed, name_of, numbers, refuse_twins, shown, size_of
-from nerfcli.cameras.formats.poses import rigid_pose
+from nerfcli.cameras.formats.rigid_poses import rigid_pose
 from nerfcli.cameras.frame import Capture, Frame
 
 Element = ElementTree.Element

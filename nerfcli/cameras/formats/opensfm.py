@@ -32,7 +32,7 @@ from nerfcli.cameras.formats.fields import (
     vector,
 )
 from nerfcli.cameras.formats.limits import plausible
-from nerfcli.cameras.formats.losses import distortion, lost_of_cameras, lost_parts
+from nerfcli.cameras.formats.unsupported import distortion, lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
 

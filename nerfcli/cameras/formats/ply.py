@@ -11,7 +11,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.cameras.formats.limits import plausible
-from nerfcli.cameras.formats.losses import lost_parts
+from nerfcli.cameras.formats.unsupported import lost_parts
 from nerfcli.cameras.frame import Capture
 from nerfcli.errors import UserError
 

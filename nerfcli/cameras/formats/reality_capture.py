@@ -23,7 +23,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose
 from nerfcli.cameras.formats import lenses
 from nerfcli.cameras.formats.fields import malformed, name_of, numbers, read_text, refuse_twins, shown
-from nerfcli.cameras.formats.photos import measured_sizes
+from nerfcli.cameras.formats.photo_names import measured_sizes
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.cameras.orientation import Measure
 

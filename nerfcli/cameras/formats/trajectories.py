@@ -15,8 +15,8 @@ from nerfcli.atomic import atomic_path
 from nerfcli.cameras import rigid
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.fields import filled_lines, malformed, numbers, read_text, refuse_twins, shown
-from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts
-from nerfcli.cameras.formats.poses import rigid_pose
+from nerfcli.cameras.formats.rigid_poses import rigid_pose
+from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame
 from nerfcli.errors import UserError
 

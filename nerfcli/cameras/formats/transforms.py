@@ -17,15 +17,15 @@ from nerfcli.atomic import write_json
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.conventions import opencv_from_opengl_pose, opengl_from_opencv_pose
 from nerfcli.cameras.formats.fields import malformed, read_json_object
-from nerfcli.cameras.formats.losses import lost_of_cameras, lost_parts
 from nerfcli.cameras.formats.ply import read_ply_points, write_ply
-from nerfcli.cameras.formats.poses import rigid_poses
+from nerfcli.cameras.formats.rigid_poses import rigid_poses
 from nerfcli.cameras.formats.transforms_cameras import (
     camera_of_record,
     given_size,
     lost_to_transforms,
     record_of_camera,
 )
+from nerfcli.cameras.formats.unsupported import lost_of_cameras, lost_parts
 from nerfcli.cameras.frame import Capture, Frame, Size
 from nerfcli.cameras.orientation import Measure, counted, fit_to_picture, rescaling, stored_size
 from nerfcli.errors import UserError

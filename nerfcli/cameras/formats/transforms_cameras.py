@@ -9,7 +9,7 @@ from typing import Any
 from nerfcli.cameras.camera import Camera, parameter_names
 from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.limits import stated_camera
-from nerfcli.cameras.formats.losses import distortion, projection
+from nerfcli.cameras.formats.unsupported import distortion, projection
 
 # All the keys that are read here, of a frame or of the whole file.
 CAMERA_KEYS = frozenset(

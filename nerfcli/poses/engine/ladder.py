@@ -16,7 +16,7 @@ from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.mapped import Mapped
-from nerfcli.poses.engine.mapping import Start, map_photos
+from nerfcli.poses.engine.mapping import MapperOptions, map_photos
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, matching_seconds
@@ -44,8 +44,8 @@ _WIDE_DEG = 100.0
 # Each takes some seconds; where more are missing, it is not single photos that are.
 _MOST_SINGLE_PHOTOS = 60
 
-SMALLER_BASELINE = Start(init_min_tri_angle=8.0, init_min_num_inliers=50)
-LOW_ANGLES = Start(
+SMALLER_BASELINE = MapperOptions(init_min_tri_angle=8.0, init_min_num_inliers=50)
+LOW_ANGLES = MapperOptions(
     init_min_tri_angle=3.0, init_min_num_inliers=30, filter_min_tri_angle=0.5, init_max_forward_motion=1.0
 )
 
@@ -76,7 +76,7 @@ class _Ladder:
             self._tell(f"{rung['what']}: {largest}{also} of {self._photos} photos registered")
         self._told = len(self.rungs)
 
-    def attempt(self, what: str, job: Job, start: Start) -> None:
+    def attempt(self, what: str, job: Job, start: MapperOptions) -> None:
         """Map once; the result counts if it places more photos than the best so far."""
         if self.rungs:
             self.announce(what)
@@ -91,7 +91,7 @@ class _Ladder:
             if _placed(merged) > _placed(models):
                 self._take("sub-models merged", merged, job)
 
-    def attempt_instead(self, what: str, job: Job, start: Start) -> None:
+    def attempt_instead(self, what: str, job: Job, start: MapperOptions) -> None:
         """Map once; the result counts if it places as many photos as the best so far, which rests on something else."""
         best = self.best
         self.best = Mapped([], job, [])
@@ -107,7 +107,7 @@ class _Ladder:
         cameras = {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
         return any(field_of_view_deg(model.camera(camera_id)) > _WIDE_DEG for camera_id in cameras)
 
-    def go_on(self, what: str, start: Start) -> None:
+    def go_on(self, what: str, start: MapperOptions) -> None:
         """Try to place the rest from the best model as it is."""
         models, job = self.best.models, self.best.job
         if not models:
@@ -158,7 +158,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     last, `tell` is told each attempt and its result.
     """
     ladder = _Ladder(job, report, tell)
-    ladder.attempt("default thresholds", job, Start())
+    ladder.attempt("default thresholds", job, MapperOptions())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
     job = _without_exif(ladder, job, report, share=ladder.share(featured))
     job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
@@ -193,7 +193,7 @@ def _with_more_features(ladder: _Ladder, job: Job, report: Report, *, missing: f
     extract(more, report)
     start_matching(more, more.pairs)
     match(more, more.pairs, report)
-    ladder.attempt(what, more, Start())
+    ladder.attempt(what, more, MapperOptions())
     _other_starts(ladder, more)
 
 
@@ -228,7 +228,7 @@ def _without_exif(ladder: _Ladder, job: Job, report: Report, *, share: float) ->
     ladder.announce(what)
     register_photos(bare)  # which takes out what was verified with the other focal length
     match(bare, bare.pairs, report)
-    ladder.attempt(what, bare, Start())
+    ladder.attempt(what, bare, MapperOptions())
     if ladder.best.job is bare:
         return bare
     register_photos(job)
@@ -246,7 +246,7 @@ def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) ->
     ladder.announce("start from a fisheye lens")
     register_photos(fisheye)  # which takes out what was verified with another lens
     match(fisheye, fisheye.pairs, report)
-    ladder.attempt_instead("start from a fisheye lens", fisheye, Start())
+    ladder.attempt_instead("start from a fisheye lens", fisheye, MapperOptions())
     if ladder.best.job is fisheye:
         return fisheye
     register_photos(job)

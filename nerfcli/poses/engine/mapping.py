@@ -17,7 +17,7 @@ from nerfcli.poses.model.reasons import FEW_MATCHES
 
 
 @dataclass(frozen=True)
-class Start:
+class MapperOptions:
     """How the mapper begins and what it accepts: pycolmap's names and defaults; init_pair holds image ids."""
 
     init_min_tri_angle: float = 16.0
@@ -92,7 +92,7 @@ def _model_folder(job: Job) -> Path:
 
 
 def map_photos(
-    job: Job, report: Report, *, attempt: int, start: Start, base: pycolmap.Reconstruction | None = None
+    job: Job, report: Report, *, attempt: int, start: MapperOptions, base: pycolmap.Reconstruction | None = None
 ) -> list[pycolmap.Reconstruction]:
     """Run the incremental mapper once, from nothing or from a model, unless an earlier call has done so.
 
@@ -131,7 +131,7 @@ def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
-def _options(job: Job, *, attempt: int, start: Start) -> pycolmap.IncrementalPipelineOptions:
+def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = job.threads
     seed = job.seed + attempt

@@ -16,7 +16,7 @@ import pycolmap
 from nerfcli.poses.engine.database import keep_geometries
 from nerfcli.poses.engine.ladder import SMALLER_BASELINE
 from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.mapping import Start, map_globally, map_photos, photo_numbers
+from nerfcli.poses.engine.mapping import MapperOptions, map_globally, map_photos, photo_numbers
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import capture_order
 from nerfcli.poses.input.plan import duration
@@ -186,7 +186,7 @@ def _mapped_without(
     mapped: Mapped, core: _Core, report: Report, *, attempt: int, base: pycolmap.Reconstruction | None
 ) -> Mapped:
     job = _with_own_database(mapped.job, without=core.suspects)
-    start = Start() if base is not None else SMALLER_BASELINE
+    start = MapperOptions() if base is not None else SMALLER_BASELINE
     models = map_photos(job, report, attempt=attempt, start=start, base=base)
     job.database.unlink()
     return Mapped(models, mapped.job, mapped.attempts)

@@ -1,7 +1,8 @@
 """An object that turns before a still background: recognised in a job's features, and masks that leave the object.
 
 A few pairs of photos are compared before the long work (see `stationary`). If they show two motions, masks of the
-object are found (see `background`), so that what is solved is the object's motion, as if the camera went around it.
+object are found (see `still_background`), so that what is solved is the object's motion, as if the camera went around
+it.
 The masks stand in the scene's folder, named after the photos as those of `--masks` are, and training uses them too.
 Masks that are there from an earlier call are used as they are: they may have been edited by hand.
 """
@@ -24,7 +25,7 @@ from nerfcli.media.masks import read_mask
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.stationary import Motions, Stationary, motions, together
 from nerfcli.poses.engine.features import feature_keys
-from nerfcli.poses.input import background as still
+from nerfcli.poses.input import still_background as still
 from nerfcli.poses.input.job import Job, LaidOutMask, Tell
 from nerfcli.poses.input.masks import write_mask, write_no_mask
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
@@ -49,7 +50,7 @@ MASKS = "masks"
 
 
 @dataclass(frozen=True)
-class Compared:
+class ComparedPair:
     """Two photos by number, the places (N, 2) of their matches in the first one, as shares of its size, and what they
     say."""
 
@@ -174,16 +175,16 @@ class _Features:
             self._read[number] = pixels, descriptors[order], (camera.width, camera.height)
         return self._read[number]
 
-    def compare(self, first: int, second: int) -> Compared | None:
+    def compare(self, first: int, second: int) -> ComparedPair | None:
         """Two photos, None if they have not the same size."""
         (x, one, size), (y, other, other_size) = self.of(first), self.of(second)
         if size != other_size:
             return None
         a, b = mutual_matches(one, other, ratio=LOOSE_RATIO)
-        return Compared(first, second, x[a] / size, motions(x[a], y[b], size))
+        return ComparedPair(first, second, x[a] / size, motions(x[a], y[b], size))
 
 
-def _compared(features: _Features) -> list[Compared]:
+def _compared(features: _Features) -> list[ComparedPair]:
     """Photos that follow each other, and photos that do not; all of a choice if names follow no order."""
     count = len(features.job.files)
     first = _pairs(count, _FIRST_ANCHORS)
@@ -200,11 +201,11 @@ def _compared(features: _Features) -> list[Compared]:
     return pairs
 
 
-def _together(pairs: Sequence[Compared]) -> Stationary:
+def _together(pairs: Sequence[ComparedPair]) -> Stationary:
     return together([(pair.first, pair.second, pair.motions) for pair in pairs])
 
 
-def _all_compared(features: _Features, pairs: Sequence[tuple[int, int]]) -> list[Compared]:
+def _all_compared(features: _Features, pairs: Sequence[tuple[int, int]]) -> list[ComparedPair]:
     found = (features.compare(first, second) for first, second in pairs)
     return [pair for pair in found if pair is not None]
 
@@ -220,7 +221,7 @@ def _pairs(count: int, most: int) -> list[tuple[int, int]]:
     return sorted(pair for pair in near | far if pair[0] < pair[1])
 
 
-def _same_place(pairs: Sequence[Compared], places: dict[int, int]) -> list[list[int]]:
+def _same_place(pairs: Sequence[ComparedPair], places: dict[int, int]) -> list[list[int]]:
     """Photos (numbers in the whole job) that pairs with still matches join: each set is of one place of the camera."""
     groups: list[set[int]] = []
     for pair in pairs:
@@ -233,7 +234,7 @@ def _same_place(pairs: Sequence[Compared], places: dict[int, int]) -> list[list[
 
 
 def _masks(
-    job: Job, pairs: Sequence[Compared], *, groups: Sequence[Sequence[int]], places: dict[int, int]
+    job: Job, pairs: Sequence[ComparedPair], *, groups: Sequence[Sequence[int]], places: dict[int, int]
 ) -> list[np.ndarray | None]:
     """A small mask for each photo that a background is found for."""
     pictures = [still.small(read_image(job.photos / file)[..., :3]) for file in job.files]
@@ -255,7 +256,9 @@ def _masks(
     return masks
 
 
-def _judged(masks: Sequence[np.ndarray | None], pairs: Sequence[Compared], places: dict[int, int]) -> dict[str, Any]:
+def _judged(
+    masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair], places: dict[int, int]
+) -> dict[str, Any]:
     """How much of the photos the masks leave, and how many matches of the two motions are on the right side."""
     found = [mask for mask in masks if mask is not None]
     moving, staying = [], []

@@ -26,13 +26,13 @@ import pycolmap
 
 from nerfcli.finite import finite
 from nerfcli.poses.engine.chosen import choose_component
-from nerfcli.poses.engine.components import describe_components
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images
 from nerfcli.poses.engine.features import extract, match, start_matching
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
 from nerfcli.poses.engine.retrieval import with_neighbours
+from nerfcli.poses.engine.separate_models import describe_components
 from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import recalled, with_object_masks
 from nerfcli.poses.input.job import Job, Report, Tell, read_job

@@ -16,7 +16,7 @@ from PIL import Image
 import nerfcli
 from nerfcli.atomic import atomic_folder, write_json
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
-from nerfcli.media.video_input import Measured, Video, measure_frames, open_video, read_frames
+from nerfcli.media.video_input import MeasuredFrames, Video, measure_frames, open_video, read_frames
 from nerfcli.poses.input.frame_choice import (
     MOVED_SHARE,
     SHARPNESS_SIZE_PX,
@@ -124,7 +124,7 @@ def _write(
     folder: Path,
     video: Video,
     numbers: Sequence[int],
-    measured: Measured[FrameMeasure],
+    measured: MeasuredFrames[FrameMeasure],
     progress: Callable[[float], None],
 ) -> list[VideoFrame]:
     """Write the chosen frames that differ from the one written before; of two alike the sharper one."""

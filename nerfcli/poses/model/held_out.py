@@ -24,7 +24,7 @@ _MIN_TRACK = 3
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutObservations:
     """Observations that were taken out of a model: image ids (n,), point ids (n,), pixels (n, 2)."""
 
     images: NDArray[np.int64]
@@ -32,7 +32,7 @@ class HeldOut:
     pixels: Array
 
 
-def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Reconstruction, HeldOut]:
+def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Reconstruction, HeldOutObservations]:
     """A copy of a model without every tenth observation, and these; at most one of each point.
 
     Points seen fewer than three times give none away. Of a large model the copy holds a part of the points.
@@ -55,12 +55,12 @@ def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Recons
         points.append(int(point_id))
         pixels.append(np.asarray(image.points2D[element.point2D_idx].xy))
         copy.delete_observation(element.image_id, element.point2D_idx)
-    return copy, HeldOut(
+    return copy, HeldOutObservations(
         np.array(images, dtype=np.int64), np.array(points, dtype=np.int64), np.array(pixels, dtype=float).reshape(-1, 2)
     )
 
 
-def errors_px(model: pycolmap.Reconstruction, held: HeldOut) -> Array:
+def errors_px(model: pycolmap.Reconstruction, held: HeldOutObservations) -> Array:
     """(n,) distance of each held-out observation from where the model projects its point; inf if it does not."""
     errors = np.full(len(held.points), np.inf)
     for index, (image_id, point_id) in enumerate(zip(held.images, held.points, strict=True)):

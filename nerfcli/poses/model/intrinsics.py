@@ -295,7 +295,9 @@ def _field_by_exif_deg(camera: pycolmap.Camera, exif_focal_px: float | None) -> 
 class _Choice:
     """The trials of one camera, from the simplest on, each against the best before it."""
 
-    def __init__(self, held: held_out.HeldOut, camera_id: int, *, threads: int, fixed: Sequence[int]) -> None:
+    def __init__(
+        self, held: held_out.HeldOutObservations, camera_id: int, *, threads: int, fixed: Sequence[int]
+    ) -> None:
         self.held, self.camera_id, self.threads, self.fixed = held, camera_id, threads, fixed
         self.tried: list[Candidate] = []
 

@@ -21,7 +21,7 @@ _PALE = 0.3
 
 
 @dataclass(frozen=True)
-class Exposure:
+class Brightness:
     """How light a photo is by itself.
 
     Args:
@@ -34,13 +34,13 @@ class Exposure:
     black: float
 
 
-def measure(rgb: np.ndarray, used: np.ndarray) -> Exposure:
+def measure(rgb: np.ndarray, used: np.ndarray) -> Brightness:
     """The exposure of a photo (H, W, 3) uint8 where `used` (H, W) is True."""
     pixels = rgb[used]
     if not len(pixels):
-        return Exposure(float("nan"), 0.0, 0.0)
+        return Brightness(float("nan"), 0.0, 0.0)
     white, black = (pixels >= WHITE_LEVEL).all(axis=1).mean(), (pixels <= BLACK_LEVEL).all(axis=1).mean()
-    return Exposure(float(pixels.mean() / 255), float(white), float(black))
+    return Brightness(float(pixels.mean() / 255), float(white), float(black))
 
 
 def local_light(rgb: np.ndarray) -> np.ndarray:

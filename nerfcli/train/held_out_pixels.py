@@ -9,7 +9,7 @@ from nerfcli.cameras.rigid import Similarity
 from nerfcli.field.background import colours_behind
 from nerfcli.field.exposure import exposed
 from nerfcli.fit.losses import over_background
-from nerfcli.photos.loading import Photo
+from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import PixelPool
 from nerfcli.photos.psnr import psnr_of
 from nerfcli.photos.storage import IN_MEMORY, Room
@@ -34,7 +34,7 @@ class HeldoutPixels:
 
     def __init__(
         self,
-        photos: Sequence[Photo],
+        photos: Sequence[LoadedPhoto],
         training_from_scene: Similarity,
         device: torch.device,
         *,

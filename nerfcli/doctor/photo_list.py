@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerfcli import scene as scenes
-from nerfcli.doctor.photos import Source
+from nerfcli.doctor.photo_facts import Source
 from nerfcli.errors import UserError
 from nerfcli.media.images import IMAGE_SUFFIXES, list_images
 
 
 @dataclass(frozen=True)
-class Subject:
+class ExaminedCapture:
     """A capture to examine.
 
     Args:
@@ -29,7 +29,7 @@ class Subject:
         return "photos" if self.scene is None else "scene"
 
 
-def find_subject(path: Path) -> Subject:
+def find_subject(path: Path) -> ExaminedCapture:
     """The photos of a folder, or those of a scene.
 
     A folder that holds photos and the poses of a scene is a scene.
@@ -47,10 +47,10 @@ def find_subject(path: Path) -> Subject:
         where = f"there are photos in {below}; give that folder" if below else ""
         hint = where or f"expected a scene, or files ending in {', '.join(sorted(IMAGE_SUFFIXES))}"
         raise UserError(f"no photos and no scene in {path}", hint)
-    return Subject(path, tuple(Source(photo.name, photo) for photo in photos), None)
+    return ExaminedCapture(path, tuple(Source(photo.name, photo) for photo in photos), None)
 
 
-def _of_scene(path: Path) -> Subject:
+def _of_scene(path: Path) -> ExaminedCapture:
     scene = scenes.load(path)
     sources = tuple(Source(f.name, f.image, f.mask) for f in scene.frames if f.image is not None)
-    return Subject(path, sources, scene)
+    return ExaminedCapture(path, sources, scene)

@@ -14,7 +14,7 @@ from PIL import Image
 
 from nerfcli.errors import UserError
 from nerfcli.media.arrays import read_arrays
-from nerfcli.media.depth import FORMAT, DepthMeta, as_floats, refuse_mixing
+from nerfcli.media.depth_pictures import FORMAT, DepthMeta, as_floats, refuse_mixing
 from nerfcli.media.descriptions import VIDEO_SUFFIXES, damaged, depth_meta_of, description_of
 from nerfcli.media.exr import CHANNELS, read_exr
 from nerfcli.media.float_tiff import read_any_tiff

@@ -42,12 +42,12 @@ class Check:
     case: str
     operation: str
     inputs: Callable[[Precision], operations.Inputs]
-    run: Callable[[ModuleType, operations.Inputs], operations.Answer]
+    run: Callable[[ModuleType, operations.Inputs], operations.Outcome]
     bound: Callable[[Precision], Errors]
     reason: str
     precisions: tuple[str, ...] = (SINGLE, HALF, COMPILED)
     formula: str = ""
-    textbook: Callable[[operations.Inputs], operations.Answer] | None = None
+    textbook: Callable[[operations.Inputs], operations.Outcome] | None = None
     no_gradient: str = ""
 
 

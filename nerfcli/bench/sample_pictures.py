@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.media.colour_maps import levels_of
-from nerfcli.pages.pictures import fitted, jpeg_bytes
+from nerfcli.pages.embedded_pictures import fitted, jpeg_bytes
 
 FOLDER = "pictures"
 LONGEST_PX = 480

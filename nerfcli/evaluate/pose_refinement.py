@@ -31,7 +31,7 @@ _TRIES = 5
 
 
 @dataclass(frozen=True)
-class Alignment:
+class RefinedPose:
     """A refined frame, and how far it moved: rotation in degrees, translation of its centre in scene units, and the
     mean squared errors of the pixels that were looked at, before and after."""
 
@@ -66,7 +66,7 @@ def align_pose(
     used: np.ndarray,
     background: Background,
     log_gains: tuple[float, ...] = (0.0, 0.0, 0.0),
-) -> Alignment | None:
+) -> RefinedPose | None:
     """The pose at which the model comes closest to a photo, from the photo's own pose on; the model is not changed.
 
     Levenberg-Marquardt on the squared error of 2048 random pixels, with derivatives by differences of renders. The six
@@ -80,7 +80,7 @@ def align_pose(
         colours: (H, W, 3) the photo, float in [0, 1].
         used: (H, W) bool, the pixels to look at.
         background: behind everything.
-        log_gains: the photo's exposure, as of `protocol.HeldOut`.
+        log_gains: the photo's exposure, as of `protocol.HeldOutPhoto`.
 
     Returns:
         None where too few pixels count.
@@ -124,7 +124,7 @@ def align_pose(
                 break
             damping *= 10
     turn = frame.world_from_cam[:3, :3].T @ pose[:3, :3]
-    return Alignment(
+    return RefinedPose(
         frame=replace(frame, world_from_cam=pose),
         rotation_deg=float(np.degrees(np.linalg.norm(vector_from_rotation(turn)))),
         translation=float(np.linalg.norm(pose[:3, 3] - frame.world_from_cam[:3, 3])),

@@ -16,8 +16,8 @@ from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
 # Learning rates as multiples of the field's. After 300 steps at 0.3, gains of photos are a tenth of the way to the true
 # ones, at 2 half of it, at 5 no further.
 BACKGROUND_RATE, EXPOSURE_RATE = 5.0, 2.0
-# Detail comes later to a field whose cameras learn: see `Parts.share_of_detail`. Balls, photos turned by 0.5 degree,
-# 800 steps: 31.1 dB with the usual shares, 31.2 with 0.7 of them, 31.9 and 32.0 with these.
+# Detail comes later to a field whose cameras learn: see `Appearance.share_of_detail`. Balls, photos turned by 0.5
+# degree, 800 steps: 31.1 dB with the usual shares, 31.2 with 0.7 of them, 31.9 and 32.0 with these.
 DETAIL_DELAY, DETAIL_SLOPE = 0.125, 0.875
 # From here on a photo's level says only that the light was at least that bright.
 SATURATED = 254.5 / 255
@@ -25,7 +25,7 @@ SATURATED = 254.5 / 255
 LEAST_OPACITY = 1e-3
 
 
-class Parts(nn.Module):
+class Appearance(nn.Module):
     """The parts that the components ask for, and how they enter the colour of a ray.
 
     Args:

@@ -7,7 +7,7 @@ from typing import Any
 from nerfcli import scene as scenes
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
-from nerfcli.evaluate.protocol import HeldOut
+from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.render.model import Model
 from nerfcli.runs.files import CONFIG
@@ -17,7 +17,7 @@ from nerfcli.scene import Scene
 
 
 @dataclass(frozen=True)
-class Subject:
+class BenchedRun:
     """A run, a scene, or both.
 
     Args:
@@ -45,7 +45,7 @@ class Subject:
         """The name of the held-out photo whose renderings are kept."""
         return self.test_frames[len(self.test_frames) // 2].name
 
-    def held_out(self, model: Model) -> list[HeldOut]:
+    def held_out(self, model: Model) -> list[HeldOutPhoto]:
         """The held-out photos as `model` is compared with them.
 
         Raises:
@@ -56,7 +56,7 @@ class Subject:
         return held_out_photos(self.test_frames, model, downscale=self.base.downscale, masks=masks, threads=threads)
 
 
-def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Subject:
+def find_subject(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
     """The run or scene at a path.
 
     Raises:
@@ -73,7 +73,7 @@ def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Subject
     return subject
 
 
-def _run_at(path: Path, *, device: str, threads: int, seed: int) -> Subject:
+def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
     run = Run(path)
     trained, named = run.config.settings, run.config.scene
     if not run.is_trained:
@@ -87,7 +87,7 @@ def _run_at(path: Path, *, device: str, threads: int, seed: int) -> Subject:
     why = "" if scene is not None else f"its scene {named} is not there"
     if scene is not None and scenes.fingerprint(scenes.load(scene)) != run.config.scene_fingerprint:
         scene, why = None, f"{scene} has changed since"
-    return Subject(
+    return BenchedRun(
         path=path,
         run=path,
         scene=scene,
@@ -105,9 +105,9 @@ def _trained(run: Run) -> dict[str, Any]:
     return {name: value for name, value in summary.items() if name != "rays_per_second"}
 
 
-def _scene_at(path: Path, *, device: str, threads: int, seed: int) -> Subject:
+def _scene_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
     scene = scenes.load(path)
-    return Subject(
+    return BenchedRun(
         path=path,
         run=None,
         scene=path,

@@ -7,7 +7,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.colmap import read_cameras
 from nerfcli.cameras.formats.fields import read_json_object
 from nerfcli.convert.formats import Given, recognise
-from nerfcli.convert.pixels import UPRIGHT
+from nerfcli.convert.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError
 from nerfcli.scene import MODEL_FOLDER, SCENE_FILE
 

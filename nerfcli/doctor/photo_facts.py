@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from nerfcli.doctor import exposure, sharpness
+from nerfcli.doctor import brightness, sharpness
 from nerfcli.errors import UserError
 from nerfcli.media.images import Exif, downscale, read_exif, read_image
 from nerfcli.multiview.features import find_features
@@ -37,7 +37,7 @@ class PhotoFeatures:
         scales: (N,) float32, how large what was found is, in pixels.
         descriptors: (N, 128) uint8.
         detail: (N,) float32, see `sharpness.measure`; NaN without texture.
-        light: (N, 2) float32, see `exposure.local_light`; NaN where not known.
+        light: (N, 2) float32, see `brightness.local_light`; NaN where not known.
     """
 
     size: tuple[int, int]
@@ -68,7 +68,7 @@ class PhotoFacts:
     tiny: np.ndarray
     transparent: bool
     sharpness: sharpness.Sharpness
-    exposure: exposure.Exposure
+    exposure: brightness.Brightness
     features: PhotoFeatures
 
 
@@ -131,7 +131,7 @@ def read_photo(source: Source, most_features: int) -> PhotoFacts:
         tiny=_tiny(small_grey),
         transparent=large.shape[2] == 4 and bool((large[..., 3] < 255).any()),
         sharpness=sharp,
-        exposure=exposure.measure(rgb, used),
+        exposure=brightness.measure(rgb, used),
         features=_features(small, seen, local_detail=local_detail, most_features=most_features),
     )
 
@@ -171,7 +171,7 @@ def _features(rgb: np.ndarray, seen: np.ndarray, *, local_detail: np.ndarray, mo
         scales=found.sizes[clearest],
         descriptors=found.descriptors[clearest].astype(np.uint8),
         detail=local_detail[row * rows // height, column * columns // width],
-        light=exposure.local_light(rgb)[row, column],
+        light=brightness.local_light(rgb)[row, column],
     )
 
 

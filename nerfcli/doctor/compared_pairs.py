@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerfcli.doctor import two_views
+from nerfcli.doctor import camera_motion
 from nerfcli.doctor.moving import Patch, moving_patches
-from nerfcli.doctor.photos import PhotoFacts, PhotoFeatures
+from nerfcli.doctor.photo_facts import PhotoFacts, PhotoFeatures
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import Exif
 from nerfcli.multiview.epipolar import fundamental_matrix
@@ -57,7 +57,7 @@ class Pair:
     stops: float
     stops_spread: float
     redder: float
-    views: two_views.TwoViews | None
+    views: camera_motion.TwoViews | None
     patches: tuple[Patch, ...]
     motions: Motions | None = None
 
@@ -98,7 +98,7 @@ def compare(
         still = motions(x, y, one.size)
     if count >= _LEAST_FOR_GEOMETRY:
         centres = [np.array(features.size) / 2 for features in (one, other)]
-        views = two_views.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px)
+        views = camera_motion.estimate(x[agree] - centres[0], y[agree] - centres[1], focals_px)
         patches = moving_patches(x, y, agree, within_px=EPIPOLAR_PX)
     return Pair(
         *numbers,

@@ -18,7 +18,7 @@ _ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEY
 
 
 @dataclass(frozen=True)
-class Lens:
+class FileLens:
     """A lens as a file describes it.
 
     Args:
@@ -33,7 +33,7 @@ class Lens:
     params: tuple[float, ...]
 
 
-def project(lens: Lens, points_cam: np.ndarray) -> np.ndarray:
+def project(lens: FileLens, points_cam: np.ndarray) -> np.ndarray:
     """Pixels (N, 2) of points (N, 3) in OpenCV camera axes; meaningless for points that the lens does not see."""
     if not len(points_cam):
         return np.zeros((0, 2))
@@ -51,14 +51,14 @@ def project(lens: Lens, points_cam: np.ndarray) -> np.ndarray:
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
-def _matrix_and_terms(lens: Lens) -> tuple[np.ndarray, tuple[float, ...]]:
+def _matrix_and_terms(lens: FileLens) -> tuple[np.ndarray, tuple[float, ...]]:
     """OpenCV's camera matrix (3, 3) and distortion terms."""
     fx, fy, cx, cy = lens.params[:1] * 2 + lens.params[1:3] if lens.model in _ONE_FOCAL else lens.params[:4]
     terms = lens.params[3:] if lens.model in _ONE_FOCAL else lens.params[4:]
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), terms
 
 
-def _fisheye_pixels(lens: Lens, points: np.ndarray) -> np.ndarray:
+def _fisheye_pixels(lens: FileLens, points: np.ndarray) -> np.ndarray:
     """The equidistant fisheye, theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8), which may see behind itself.
 
     cv2.fisheye.projectPoints has the same formula, but divides by z and so ends at 90 degrees.

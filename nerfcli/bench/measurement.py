@@ -10,12 +10,12 @@ import torch
 
 from nerfcli import kernels
 from nerfcli.bench.machine import describe_machine, is_busy, load_average
-from nerfcli.bench.pictures import FOLDER, slug
 from nerfcli.bench.records import Records, opened
 from nerfcli.bench.rendering import WORK, measure_rendering
+from nerfcli.bench.sample_pictures import FOLDER, slug
 from nerfcli.bench.session import Session
-from nerfcli.bench.subject import Subject
 from nerfcli.bench.sweep import RenderSetting, render_settings, train_settings
+from nerfcli.bench.trained_run import BenchedRun
 from nerfcli.bench.training import KEPT_FIELD, Trainings, measure_trainings
 from nerfcli.bench.worker import measure_model
 from nerfcli.errors import UserError
@@ -34,7 +34,7 @@ THIS_RUN = "this run"
 
 
 @dataclass(frozen=True)
-class Wanted:
+class BenchOptions:
     """What to measure.
 
     Args:
@@ -48,7 +48,7 @@ class Wanted:
     seed: int
 
 
-def open_bench(subject: Subject, folder: Path, wanted: Wanted) -> Records:
+def open_bench(subject: BenchedRun, folder: Path, wanted: BenchOptions) -> Records:
     """The records of this bench in a folder, new or to go on with.
 
     Raises:
@@ -66,9 +66,9 @@ def open_bench(subject: Subject, folder: Path, wanted: Wanted) -> Records:
 
 
 def measure(
-    subject: Subject,
+    subject: BenchedRun,
     records: Records,
-    wanted: Wanted,
+    wanted: BenchOptions,
     *,
     tell: Callable[[float, str], None],
     notify: Callable[[str], None],
@@ -103,7 +103,7 @@ def measure(
     shutil.rmtree(records.folder / WORK, ignore_errors=True)
 
 
-def _measure_run(subject: Subject, run: Path, wanted: Wanted, session: Session) -> None:
+def _measure_run(subject: BenchedRun, run: Path, wanted: BenchOptions, session: Session) -> None:
     """Render the run's field, then train its scene again in other ways."""
     ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
     model = load_model(run / FIELD, subject.base.device)
@@ -130,7 +130,7 @@ def _measure_run(subject: Subject, run: Path, wanted: Wanted, session: Session) 
     measure_trainings(trainings, train_settings(), session=session, seconds=ends - session.spent)
 
 
-def _measure_scene(subject: Subject, wanted: Wanted, session: Session) -> None:
+def _measure_scene(subject: BenchedRun, wanted: BenchOptions, session: Session) -> None:
     """Train the scene, then render the field of the default training."""
     assert subject.scene is not None
     ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
@@ -145,7 +145,7 @@ def _measure_scene(subject: Subject, wanted: Wanted, session: Session) -> None:
         _render(subject, load_model(field, subject.base.device), session, ends=ends)
 
 
-def _render(subject: Subject, model: Model, session: Session, *, ends: float) -> None:
+def _render(subject: BenchedRun, model: Model, session: Session, *, ends: float) -> None:
     seconds = max(ends - session.spent, _LEAST_SHARE * session.budget_seconds)
     measure_rendering(model, subject.held_out(model), _ways_to_render(subject), session=session, seconds=seconds)
 
@@ -155,7 +155,7 @@ def _title(path: Path) -> str:
     return f"{path.parent.name}/{path.name}" if path.name in ("run", "scene") else path.name
 
 
-def _ways_to_render(subject: Subject) -> list[RenderSetting]:
+def _ways_to_render(subject: BenchedRun) -> list[RenderSetting]:
     """All that make a difference on this device: the number of CPU threads is none to a GPU."""
     base = subject.base
     return [way for way in render_settings(base.threads) if base.device == "cpu" or way.threads == base.threads]

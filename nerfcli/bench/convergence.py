@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from nerfcli.evaluate.protocol import HeldOut
+from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.sampled import SampledPixels, render_sampled
 from nerfcli.media.images import downscale
 from nerfcli.photos.loading import downscaled_camera
@@ -34,7 +34,7 @@ def quadrature(sample: SampledPixels, model: Model) -> float:
 
 
 @torch.no_grad()
-def distance_to_float64(model: Model, photo: HeldOut, *, seed: int, count: int) -> float:
+def distance_to_float64(model: Model, photo: HeldOutPhoto, *, seed: int, count: int) -> float:
     """Root mean square of what float64 and steps twice as fine again change of the converged colours of some pixels.
 
     Float64 goes through plain torch, which defines the operations: so much of the converged pictures is rounding,
@@ -50,13 +50,13 @@ def distance_to_float64(model: Model, photo: HeldOut, *, seed: int, count: int) 
     return float(np.sqrt(np.square(rgb - exact)[valid].mean()))
 
 
-def smaller(photo: HeldOut, factor: float) -> HeldOut:
+def smaller(photo: HeldOutPhoto, factor: float) -> HeldOutPhoto:
     """The photo with its sides divided by a factor; as it is where that is 1 or less."""
     if factor <= 1.0:
         return photo
     used = None if photo.used is None else downscale(photo.used.astype(np.uint8) * 255, factor) == 255
     frame = replace(photo.frame, camera=downscaled_camera(photo.frame.camera, factor))
-    return HeldOut(frame, downscale(photo.pixels, factor), used, photo.log_gains)
+    return HeldOutPhoto(frame, downscale(photo.pixels, factor), used, photo.log_gains)
 
 
 def _in_float64(model: Model) -> Model:

@@ -12,7 +12,7 @@ import numpy as np
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.layout import centres_of, views_of
 from nerfcli.multiview.features import Features, Matches, find_features, mutual_matches
-from nerfcli.photos.loading import Photo
+from nerfcli.photos.loading import LoadedPhoto
 
 # Features are sought in photos whose longer side is at most this, so that it takes seconds.
 LONGER_SIDE_PX = 600
@@ -24,7 +24,7 @@ PARTNERS = (1, 3, 9)
 SAME_WAY_COS = np.cos(np.radians(40.0))
 
 
-def match(photos: Sequence[Photo], *, threads: int) -> tuple[Matches, ...]:
+def match(photos: Sequence[LoadedPhoto], *, threads: int) -> tuple[Matches, ...]:
     """The matches of `chosen_pairs` that have any."""
     pairs = chosen_pairs(photos)
     wanted = sorted({index for pair in pairs for index in pair})
@@ -39,7 +39,7 @@ def match(photos: Sequence[Photo], *, threads: int) -> tuple[Matches, ...]:
         cv2.setNumThreads(own_threads)
 
 
-def chosen_pairs(photos: Sequence[Photo]) -> list[tuple[int, int]]:
+def chosen_pairs(photos: Sequence[LoadedPhoto]) -> list[tuple[int, int]]:
     """Pairs of photos that look about the same way from different places."""
     frames = [photo.frame for photo in photos]
     centres, views = centres_of(frames), views_of(frames)
@@ -55,7 +55,7 @@ def chosen_pairs(photos: Sequence[Photo]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _features(photo: Photo) -> Features:
+def _features(photo: LoadedPhoto) -> Features:
     grey = cv2.cvtColor(np.ascontiguousarray(photo.pixels[..., :3]), cv2.COLOR_RGB2GRAY)
     return find_features(grey, longer_side_px=LONGER_SIDE_PX, most=MOST_FEATURES, used=photo.used)
 
