@@ -17,7 +17,8 @@ from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.field.voxel_field import VoxelFieldSettings
-from nerfcli.kernels import Backend, March, Rays, RaysSeen, RaySums, Targets, numba_cpu, reference
+from nerfcli.kernels import Backend, HashGrid, March, Rays, RaysSeen, RaySums, Targets, numba_cpu, reference
+from nerfcli.kernels.contraction import cube_widths
 
 CPU = torch.device("cpu")
 COMPILED = HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=16)
@@ -186,6 +187,145 @@ def test_sums_along_rays_are_those_of_a_double_loop(dtype):
     for value, wanted in zip(seen[:4], expected, strict=True):
         exact = torch.tensor(wanted, dtype=torch.float64)
         torch.testing.assert_close(value.detach().double(), exact, rtol=1e-5, atol=1e-6)
+
+
+UNEVEN = torch.linspace(0.55, 2.0, 40, dtype=torch.float64).square()
+
+
+@torch.no_grad()
+def samples_by_hand(field: Field, rays: Rays, march: March) -> list[list[tuple[float, float]]]:
+    """Of each ray the intervals that light gets to, one after the other, in float64."""
+    plain = rays.detached()
+    starts, ends, places, offsets = reference.occupied_samples(plain, march)
+    medium = field.medium()
+    if isinstance(medium, HashGrid):
+        widths = widths_by_hand(plain, starts, ends, offsets) if medium.antialias else None
+        code = reference.hash_encode(places, medium.table, medium.resolutions, widths)
+        density = reference.density(code, medium.layers)
+    else:
+        density = medium.density(places)
+    kept: list[list[tuple[float, float]]] = []
+    for ray in range(len(plain.origins)):
+        kept.append([])
+        depth = 0.0
+        for k in range(int(offsets[ray]), int(offsets[ray + 1])):
+            if depth < march.max_optical_depth:
+                kept[-1].append((float(starts[k]), float(ends[k])))
+            depth += float(density[k] * (ends[k] - starts[k]))
+    return kept
+
+
+def widths_by_hand(rays: Rays, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+    assert rays.cones is not None
+    index, middles = kernels.ray_indices(offsets), (starts + ends) / 2
+    places = rays.origins[index] + rays.directions[index] * middles[:, None]
+    return cube_widths(places, rays.cones[index] * middles, "l2")
+
+
+def radiance_by_hand(field: Field, rays: Rays, kept: list[list[tuple[float, float]]]) -> tuple[Tensor, ...]:
+    """Densities, colours, lengths, middles and rays of all intervals, from single operations."""
+    flat = [span for spans in kept for span in spans]
+    starts, ends = torch.tensor(flat, dtype=torch.float64).reshape(-1, 2).unbind(1)
+    index = torch.tensor([ray for ray, spans in enumerate(kept) for _ in spans], dtype=torch.int64)
+    offsets = torch.tensor([0, *torch.tensor([len(spans) for spans in kept]).cumsum(0).tolist()])
+    places = rays.origins[index] + rays.directions[index] * ((starts + ends) / 2)[:, None]
+    coordinates = kernels.grid_coordinates(places, "l2")
+    medium = field.medium()
+    if isinstance(medium, HashGrid):
+        widths = widths_by_hand(rays.detached(), starts, ends, offsets) if medium.antialias else None
+        code = reference.hash_encode(coordinates, medium.table, medium.resolutions, widths)
+        harmonics = kernels.spherical_harmonics(rays.directions, medium.view_degree)
+        density, rgb = reference.radiance(code, harmonics, index, medium.layers)
+    else:
+        density, rgb = medium.radiance(coordinates, rays.directions, index)
+    return density, rgb, ends - starts, starts, index
+
+
+@pytest.mark.parametrize("near", [False, True])
+@pytest.mark.parametrize("name", MEDIA)
+def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near):
+    """Independent of the composition, which both backends have in common: values and gradients by a loop."""
+    field = field_of(name, torch.float64, "reference")
+    rays, march = rays_and_march(4, torch.float64)
+    rays, march = (
+        rays._replace(origins=rays.origins + 1.2 * rays.directions),
+        march._replace(edges=UNEVEN, max_optical_depth=0.4),
+    )
+    background = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+
+    def gradients(loss: Tensor, given: Rays) -> list[Tensor | None]:
+        wanted = (given.origins, given.directions, *field.parameters())
+        return list(torch.autograd.grad(loss, wanted, allow_unused=True))
+
+    def learnable() -> Rays:
+        origins, directions = (x.detach().clone().requires_grad_() for x in (rays.origins, rays.directions))
+        return rays._replace(origins=origins, directions=directions)
+
+    given = learnable()
+    sums = field.backend.render_rays(given, march, field.medium(), Targets(near_scaling=near), background=background)
+    found = gradients((sums.rgb * background.flip(0)).sum() + sums.transmittance.square().sum(), given)
+
+    given = learnable()
+    kept = samples_by_hand(field, given, march)
+    density, rgb, lengths, starts, index = radiance_by_hand(field, given, kept)
+    if near:
+        scale = starts.square().clamp_max(1.0)
+        assert (scale < 1).any()
+        density = scale * density + (1 - scale) * density.detach()
+        rgb = scale[:, None] * rgb + (1 - scale[:, None]) * rgb.detach()
+    colours, passing = [], []
+    for ray in range(4):
+        left, colour = torch.ones((), dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+        for k in (index == ray).nonzero()[:, 0]:
+            through = torch.exp(-density[k] * lengths[k])
+            colour = colour + left * (1 - through) * rgb[k]
+            left = left * through
+        colours.append(colour + left * background[ray])
+        passing.append(left)
+    expected = gradients((torch.stack(colours) * background.flip(0)).sum() + torch.stack(passing).square().sum(), given)
+    assert int(sums.samples) == sum(map(len, kept)) > 15
+    torch.testing.assert_close(sums.rgb, torch.stack(colours), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(sums.transmittance, torch.stack(passing), rtol=1e-9, atol=1e-12)
+    for value, wanted in zip(found, expected, strict=True):
+        assert (value is None) == (wanted is None)
+        if value is not None and wanted is not None:
+            torch.testing.assert_close(value, wanted, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", MEDIA)
+def test_rays_of_a_picture_are_single_operations_one_after_the_other(name):
+    """Colours that are not asked for are grey, and the bound says what that and the early stop may change."""
+    field = field_of(name, torch.float64, "reference")
+    rays, march = rays_and_march(6, torch.float64)
+    march, negligible = march._replace(edges=UNEVEN, max_optical_depth=0.4), 0.3
+    background = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    seen = field.backend.trace_rays(rays, march, field.medium(), background=background, negligible=negligible)
+    with torch.no_grad():
+        kept = samples_by_hand(field, rays, march)
+        density, rgb, lengths, _, index = radiance_by_hand(field, rays, kept)
+    greys = stops = 0
+    for ray in range(6):
+        left, colour, error = 1.0, torch.zeros(3, dtype=torch.float64), 0.0
+        for k in (index == ray).nonzero()[:, 0]:
+            weight = left * -math.expm1(-float(density[k] * lengths[k]))
+            grey = weight <= negligible / len(kept[ray])
+            greys += grey
+            colour += weight * (0.5 if grey else rgb[k])
+            error += 0.5 * weight * grey
+            left *= math.exp(-float(density[k] * lengths[k]))
+        behind = float(torch.maximum(background[ray], 1 - background[ray]).max())
+        if left <= math.exp(-march.max_optical_depth) * (1 + 1e-5):
+            stops += 1
+            error += left * behind
+        torch.testing.assert_close(seen.rgb[ray], colour + left * background[ray], rtol=1e-9, atol=1e-12)
+        assert float(seen.truncation_error[ray]) == pytest.approx(error, rel=1e-9)
+        # What the marching left out is within the bound.
+        whole = field.backend.trace_rays(
+            rays, march._replace(max_optical_depth=1e9), field.medium(), background=background
+        )
+        assert (whole.rgb[ray] - seen.rgb[ray]).abs().max() <= error * (1 + 1e-9) + 1e-12
+    assert greys > 2
+    assert stops > 0
 
 
 @pytest.mark.parametrize("wanted", ["numba_cpu", "reference"])

@@ -123,7 +123,7 @@ def test_a_wrong_result_with_low_residuals_is_refused(solved: Solved):
     assert left_out == {}
     verdict = judge(wrong, pairs, turn=None, names={"00005.jpg": "kitchen 5.jpg"}, seed=0, threads=1)
     assert verdict.failures[0].kind == "the poses contradict the strongest matches"
-    assert "verified matches of" in verdict.failures[0].evidence
+    assert "verified matches between" in verdict.failures[0].evidence
 
 
 def wrongly_mapped(solved: Solved, folder: Path) -> Mapped:
