@@ -21,6 +21,8 @@ _MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.3, 0.0025
 _CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.1
 # How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
 _GROWTH = {"map": 1.3}
+# Of a stage, the share after which its speed says something.
+_TELLING = 0.05
 
 
 @dataclass(frozen=True)
@@ -86,10 +88,11 @@ def matching_seconds(pairs: int, *, max_features: int) -> float:
 class Outlook:
     """How much is left, told as the work goes on: measured for the stage at hand, for later ones from the plan.
 
-    The plan's seconds are stretched by how much longer all work so far took, so that after a few photos it fits the
-    machine and what else it does. Work that an earlier call has done counts for nothing. Which photos are enlarged to
-    find more features in them is known only after the first search; where that adds work, the share that is done stands
-    still until it is true again.
+    The plan's seconds are stretched by how long the stage at hand has taken so far, after its first twentieth; those of
+    later stages by the least that any stage was. The machine slows all of them, whereas what makes one of them slow is
+    its own (matches of shiny things, poses of a dense walk). Work that an earlier call has done counts for nothing.
+    Which photos are enlarged to find more features in them is known only after the first search; where that adds work,
+    the share that is done stands still until it is true again.
 
     Args:
         plan: for the stages that have not begun.
@@ -102,8 +105,8 @@ class Outlook:
         self._start = clock()
         self._stage = ""
         self._began = (0.0, 0.0)
-        self._worked = (0.0, 0.0)  # seconds, and what the plan has for the same work, of the stages before
-        self._latest = (0.0, 0.0)  # the same of the stage at hand
+        self._stretches: list[float] = []  # of the stages before: their seconds, over what the plan has for that work
+        self._latest = (0.0, 0.0)  # of the stage at hand: its seconds, and what the plan has for that work
         self._seconds = dict(plan.seconds)
         self._share = 0.0
 
@@ -116,17 +119,23 @@ class Outlook:
         if self._begins_again(stage, ratio):
             self._share = 0.0
         if stage != self._stage or ratio < self._began[1]:
-            self._worked = (self._worked[0] + self._latest[0], self._worked[1] + self._latest[1])
-            self._stage, self._began = stage, (now, ratio)
+            took, of_plan = self._latest
+            if of_plan > _TELLING * self._seconds.get(self._stage, 0.0):
+                self._stretches.append(took / of_plan)
+            self._stage, self._began, self._latest = stage, (now, ratio), (0.0, 0.0)
         planned = self._seconds.get(stage, 0.0)
         began, ratio_before = self._began
-        self._latest = (now - began, planned * (ratio - ratio_before))
-        seconds, of_plan = self._worked[0] + self._latest[0], self._worked[1] + self._latest[1]
-        stretch = seconds / of_plan if of_plan > 0 else 1.0
-        if ratio > ratio_before:
-            left = (now - began) * (1 - ratio) / (ratio - ratio_before)
+        took, of_plan = now - began, planned * (ratio - ratio_before)
+        self._latest = (took, of_plan)
+        stretch = min(self._stretches, default=1.0)
+        if planned > 0:
+            # What a stage begins with says little of its rest: its first twentieth is as planned until it is done.
+            unseen = max(_TELLING * planned - of_plan, 0.0)
+            own = (took + unseen * stretch) / (of_plan + unseen)
+            left = own * planned * (1 - ratio)
+            stretch = min(own, *self._stretches) if self._stretches else own
         else:
-            left = stretch * planned * (1 - ratio)
+            left = took * (1 - ratio) / (ratio - ratio_before) if ratio > ratio_before else 0.0
         stages = list(self._seconds)
         later = stages[stages.index(stage) + 1 :] if stage in stages else []
         left += stretch * sum(self._seconds[name] for name in later)
