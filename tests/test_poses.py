@@ -219,7 +219,7 @@ def test_a_dying_worker_is_told_with_its_last_words(tmp_path: Path, monkeypatch:
     """Its own words: it takes no library from where the user happens to be."""
     (tmp_path / "pycolmap.py").write_text("raise RuntimeError('another library of this name')")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"died \(exit status 1\) while starting: .*FileNotFoundError.*job\.json"):
+    with pytest.raises(UserError, match=r"crashed \(exit status 1\) while starting: .*FileNotFoundError.*job\.json"):
         supervise.run_worker(tmp_path / "job.json", threads=1, progress=lambda *told: None)
 
 

@@ -2,15 +2,13 @@
 
 import json
 import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import nerfcli
+from nerfcli import child
 from nerfcli.bench.sample_pictures import FOLDER, slug
 from nerfcli.bench.session import Session
 from nerfcli.bench.sweep import TrainSetting, affordable
@@ -109,31 +107,16 @@ def _train(
 def _run_worker(job: Path, say: Callable[[str], None]) -> dict[str, Any]:
     """Run `nerfcli.bench.worker`; it is dead when this returns or raises."""
     log = job.with_name("worker.log")
-    package_root = str(Path(nerfcli.__file__).parent.parent)
-    places = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
     last: dict[str, Any] = {}
     with log.open("wb") as stderr:
-        worker = subprocess.Popen(
-            # -P: what lies in the folder that the user is in must not pass for our libraries.
-            [sys.executable, "-P", "-m", "nerfcli.bench.worker", str(job)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            env=environment,
-            # Ctrl-C on a terminal goes to its whole process group; only we answer it, by ending the worker.
-            start_new_session=True,
-        )
+        worker = child.spawn("nerfcli.bench.worker", job, log=stderr)
+        messages = child.messages(worker)
         try:
-            assert worker.stdout is not None
-            for line in worker.stdout:
-                last = json.loads(line)
+            for last in messages:
                 if "share" in last:
                     say(last["detail"])
-            worker.wait()
         finally:
-            worker.kill()
-            worker.communicate()
+            messages.close()
     if "result" in last or "error" in last:
         return last
     words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()

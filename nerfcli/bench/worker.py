@@ -2,22 +2,21 @@
 
 A process of its own, so that its peak memory is that of this training alone. It leaves pictures where the job says, and
 tells lines of JSON on stdout: {"share", "detail"} while it works, {"result"} at the end, {"error"} where the user can
-mend something. It ends by itself when its stdin closes, which is what happens when the parent dies, however it dies.
+mend something.
 """
 
 import json
-import os
-import signal
 import sys
-import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from nerfcli import kernels
 from nerfcli import scene as scenes
 from nerfcli.bench.convergence import quadrature, smaller
 from nerfcli.bench.sample_pictures import MOST_ERROR, write_difference, write_picture
+from nerfcli.child import take_stdout
 from nerfcli.errors import UserError
 from nerfcli.evaluate.metrics import psnr, to_8_bit
 from nerfcli.evaluate.protocol import HeldOutPhoto, as_exposed, over_white
@@ -38,15 +37,12 @@ _LONGEST_PX = 360
 
 def main(job_path: str) -> None:
     """Do one job and tell its result."""
-    channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all processes of a command: the parent answers it
+    send = take_stdout()
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
     try:
-        _tell(channel, result=_train_and_measure(job, channel))
+        send({"result": _train_and_measure(job, send)})
     except UserError as error:
-        _tell(channel, error=f"{error.message}; {error.hint}")
+        send({"error": f"{error.message}; {error.hint}"})
 
 
 def measure_model(
@@ -87,7 +83,7 @@ def measure_model(
     }
 
 
-def _train_and_measure(job: dict[str, Any], channel: TextIO) -> dict[str, Any]:
+def _train_and_measure(job: dict[str, Any], send: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     began = time.perf_counter()
     scene, run = scenes.load(Path(job["scene"])), Path(job["run"])
     settings = TrainSettings.from_json(job["settings"])
@@ -97,13 +93,13 @@ def _train_and_measure(job: dict[str, Any], channel: TextIO) -> dict[str, Any]:
         nonlocal told
         if time.monotonic() - told > 1.0:
             told = time.monotonic()
-            _tell(channel, share=progress.share, detail=f"step {progress.step}")
+            send({"share": progress.share, "detail": f"step {progress.step}"})
 
     train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=on_progress)
     trained = Run(run)
     summary, model = trained.summary, trained.model(settings.device)
     assert summary is not None
-    _tell(channel, share=1.0, detail="comparing with held-out photos")
+    send({"share": 1.0, "detail": "comparing with held-out photos"})
     held_out = held_out_photos(
         scene.test_frames,
         model,
@@ -132,17 +128,6 @@ def _train_and_measure(job: dict[str, Any], channel: TextIO) -> dict[str, Any]:
 def _has_compiled(settings: TrainSettings) -> bool:
     """Whether the CPU kernels have code for a field of this size."""
     return kernels.has_compiled() and (settings.levels, settings.width) == (TrainSettings.levels, TrainSettings.width)
-
-
-def _tell(channel: TextIO, **message: Any) -> None:
-    channel.write(json.dumps(message) + "\n")
-    channel.flush()
-
-
-def _end_with_parent() -> None:
-    """End this process at once when stdin closes."""
-    os.read(0, 1)
-    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,16 @@
 """Run the worker: hear its progress, keep it within limits, end it when we end, and tell in words how it died."""
 
-import json
 import os
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
 from errno import ENOSPC
 from pathlib import Path
 
-import nerfcli
+from nerfcli import child
 from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
 from nerfcli.memory import resident_bytes
 from nerfcli.poses.input.settings import Limits
@@ -63,39 +61,26 @@ def run_worker(
         UserError: it was ended at a limit, or the disk is full.
     """
     log = job_path.with_name("worker.log")
-    package_root = str(Path(nerfcli.__file__).parent.parent)
-    # An empty entry would mean the current folder, whose files must not pass for libraries.
-    places = [package_root, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
-    if threads > 0:
-        environment["OMP_NUM_THREADS"] = str(threads)
     stage = "starting"
     with log.open("wb") as stderr:
-        worker = subprocess.Popen(
-            # -P: else a file numpy.py or a folder nerfcli where the user happens to be would be taken for ours.
-            [sys.executable, "-P", "-m", "nerfcli.poses.engine.worker", str(job_path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=stderr,
-            env=environment,
-            pass_fds=() if lock is None or sys.platform == "win32" else (lock,),
-            # Ctrl-C on a terminal goes to its whole process group; only we answer it, by ending the worker.
-            start_new_session=True,
+        worker = child.spawn(
+            "nerfcli.poses.engine.worker",
+            job_path,
+            log=stderr,
+            threads=threads,
+            descriptors=() if lock is None else (lock,),
         )
         guard = _Guard(worker, limits, time.monotonic() if since is None else since)
+        messages = child.messages(worker)
         try:
-            assert worker.stdout is not None
-            for line in worker.stdout:
-                message = json.loads(line)
+            for message in messages:
                 if "note" in message:
                     notify(message["note"])
                     continue
                 stage = f"{_STAGES[message['stage']]} ({message['done']} of {message['total']} done)"
                 progress(message["stage"], message["done"], message["total"])
-            worker.wait()
         finally:
-            worker.kill()
-            worker.communicate()
+            messages.close()
             guard.stop()
     if worker.returncode == 0:
         return

@@ -10,11 +10,7 @@ Photos go by number here: pycolmap sees `00000.jpg`, `00001.png`..., so that a s
 cannot break the list of pairs.
 """
 
-import json
-import os
-import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,6 +20,7 @@ from typing import Any
 
 import pycolmap
 
+from nerfcli.child import take_stdout
 from nerfcli.finite import finite
 from nerfcli.poses.engine.chosen import choose_component
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images
@@ -45,13 +42,15 @@ RESULT = "result.json"
 
 def main(job_path: str) -> None:
     """Do one job and write its result."""
-    report, tell = _take_stdout()
-    _end_with_parent()
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # sent to all processes of a command: the parent answers it
+    send = take_stdout()
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
     job = read_job(Path(job_path))
     pycolmap.set_random_seed(job.seed)
-    solve(job, report, tell)
+    solve(
+        job,
+        lambda stage, done, total: send({"stage": stage, "done": done, "total": total}),
+        lambda text: send({"note": text}),
+    )
 
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
@@ -191,31 +190,6 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     seconds[stage] = round(time.perf_counter() - start, 3)
-
-
-def _take_stdout() -> tuple[Report, Tell]:
-    """Functions that report on stdout, which from here on is closed to every other writer in the process."""
-    channel = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-
-    def send(message: dict[str, Any]) -> None:
-        channel.write(json.dumps(message) + "\n")
-        channel.flush()
-
-    return (
-        lambda stage, done, total: send({"stage": stage, "done": done, "total": total}),
-        lambda text: send({"note": text}),
-    )
-
-
-def _end_with_parent() -> None:
-    """End this process at once when stdin closes."""
-
-    def wait() -> None:
-        os.read(0, 1)
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
 
 
 if __name__ == "__main__":
