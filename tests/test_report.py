@@ -223,7 +223,7 @@ def test_numbers_that_must_not_be_compared_are_named():
     )
     told = list(mismatches_of([one, foreign]))
     assert len(told) == 3
-    assert "hold out different photos" in told[0]
+    assert "have different held-out photos" in told[0]
 
 
 def test_everything_that_was_warned_about_is_listed():

@@ -92,7 +92,7 @@ def measure(
     session = Session(records, wanted.budget_seconds, tell, notify)
     session.record("begun", load_average=load, busy=is_busy(load))
     if is_busy(load):
-        notify(f"other programs use the processors (load average {load:.1f}): times will be too long, and uneven")
+        notify(f"other programs are using the processors (load average {load:.1f}): times will be too long and vary")
     torch.set_num_threads(subject.base.threads)
     (records.folder / FOLDER).mkdir(exist_ok=True)
     if subject.run is not None:
@@ -108,14 +108,14 @@ def _measure_run(subject: BenchedRun, run: Path, wanted: BenchOptions, session: 
     ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
     model = load_model(run / FIELD, subject.base.device)
     if model.sha256 != subject.identity:
-        raise UserError(f"{run / FIELD} was replaced while bench began", "let the training end first")
+        raise UserError(f"{run / FIELD} was replaced while bench started", "wait until the training has finished")
     if wanted.sweep != "train":
         share = _RENDERING_SHARE if wanted.sweep == "both" and subject.scene is not None else 1.0
         _render(subject, model, session, ends=share * ends)
     if wanted.sweep == "render":
         return
     if subject.scene is None:
-        session.notify(f"training settings are left out: {subject.why_no_scene}")
+        session.notify(f"training settings are skipped: {subject.why_no_scene}")
         return
     if subject.trained and not any(entry["point"] == THIS_RUN for entry in session.records.of_kind("training")):
         session.say("comparing this run with held-out photos")

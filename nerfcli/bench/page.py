@@ -36,7 +36,7 @@ def bench_page(content: Mapping[str, Any], pictures: Mapping[str, str], folder: 
         device=escape(machine["processor"] if machine["device"] == "cpu" else machine["device"]),
         threads=f"{machine['threads']} {'thread' if machine['threads'] == 1 else 'threads'}",
         minutes=f"{content['spent_seconds'] / 60:.1f}",
-        state="complete" if content["complete"] else "interrupted: what was measured so far",
+        state="complete" if content["complete"] else "interrupted: results so far",
         verdict="good" if content["complete"] else "look",
         warning=_warning(content),
         advice="".join(map(_advice, content["recommendations"])),
@@ -58,16 +58,16 @@ def _warning(content: Mapping[str, Any]) -> str:
         return ""
     loads = ", ".join(f"{load:.1f}" for load in content["load_average"] if load is not None)
     return (
-        f'<p class="warning">Other programs used the processors when this began (load average {loads}): times are too '
-        "long and uneven. Measure again on a quiet machine before you rely on them.</p>"
+        f'<p class="warning">Other programs used the processors at the start (load average {loads}): times are too '
+        "long and vary. Measure again on an idle machine before relying on them.</p>"
     )
 
 
 def _advice(advice: Mapping[str, Any]) -> str:
     head = f"<p>{escape(advice['part'].capitalize())}, {escape(advice['question'])}</p>"
     if advice["point"] is None:
-        return f"<div>{head}<b>nothing that was tried</b></div>"
-    unit = "s a picture" if advice["part"] == "rendering" else "s of training"
+        return f"<div>{head}<b>none of the measured settings</b></div>"
+    unit = "s per picture" if advice["part"] == "rendering" else "s of training"
     told = f"{advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
     if advice["against"] != advice["point"]:
         told += f" ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"
@@ -77,9 +77,9 @@ def _advice(advice: Mapping[str, Any]) -> str:
 
 def _rendering(part: Mapping[str, Any]) -> str:
     text = (
-        "One trained field, rendered in many ways. Filled points are in the Pareto set: nothing is faster and nearer "
-        f"to the converged rendering by {SAME_QUADRATURE:.0%} or more. Bars are quartiles of the times. Choose a point "
-        "to see its pictures."
+        "One trained field, rendered with many settings. Filled points are in the Pareto set: nothing is faster and "
+        f"closer to the converged rendering by {SAME_QUADRATURE:.0%} or more. Bars are quartiles of the times. Click "
+        "a point to see its pictures."
     )
     rows = table(RENDERING_COLUMNS, rendering_rows(part), numbers=range(1, 7))
     return _part("rendering", "Rendering this field", text, rows)
@@ -87,9 +87,9 @@ def _rendering(part: Mapping[str, Any]) -> str:
 
 def _training(part: Mapping[str, Any]) -> str:
     text = (
-        f"Trainings of {part['unit_seconds']:.0f} s with one thing changed, and of other lengths. Filled points are in "
-        "the Pareto set of time and PSNR; differences that seeds alone make are not counted. Choose a point to see its "
-        "picture."
+        f"Trainings of {part['unit_seconds']:.0f} s with one setting changed, and trainings of other lengths. Filled "
+        "points are in the Pareto set of time and PSNR; differences within the spread of seeds are not counted. "
+        "Click a point to see its picture."
     )
     rows = table(TRAINING_COLUMNS, training_rows(part), numbers=range(1, 8))
     failed = "".join(f"<li>{escape(entry['name'])}: {escape(entry['reason'])}</li>" for entry in part["failed"])
@@ -115,25 +115,25 @@ def _notes(content: Mapping[str, Any]) -> list[str]:
         *sentences(content),
     ]
     if rendering := content["rendering"]:
-        size = f" at 1/{rendering['factor']:.2g} of their size, for want of time" if rendering["factor"] > 1.0 else ""
+        size = f" at 1/{rendering['factor']:.2g} of their size, to save time" if rendering["factor"] > 1.0 else ""
         told += [
             f"Rendering: whole held-out photos ({', '.join(rendering['photos'])}){size}, a first round for pictures "
             f"and warm-up, then {rendering['rounds']} rounds through all settings in changing order, all in one "
-            "process; the time of a picture is the median of the rounds.",
-            f"Quadrature error is the root mean square distance, in levels of 255, to the same field rendered with "
-            f"steps {FINER} times as fine and next to nothing left out. PSNR against photos holds the error of the "
-            f"field too: the converged rendering has {rendering['converged_psnr']:.2f} dB.",
+            "process; the time per picture is the median of the rounds.",
+            "Quadrature error is the root mean square difference, in levels of 255, from the same field rendered "
+            f"with {FINER} times finer steps and hardly any early stopping. PSNR on photos includes the error of the "
+            f"field: the converged rendering reaches {rendering['converged_psnr']:.2f} dB.",
         ]
         if rendering["float64_levels"] is not None:
             told.append(
-                f"The converged rendering is itself {rendering['float64_levels']:.2g} levels from one in float64 with "
-                "steps twice as fine again, on a sample of pixels."
+                f"The converged rendering differs by {rendering['float64_levels']:.2g} levels from one in float64 "
+                "with half the step, on a sample of pixels."
             )
     if content["training"]:
         told.append(
-            f"Training: a process for each point, so that peak memory is its own; PSNR on the same {SAMPLED_PIXELS} "
-            "random pixels of all held-out photos (the mean over photos, 8 bit). All settings train for the same time, "
-            "not for the same number of steps; longer trainings may favour larger fields."
+            f"Training: one process per point, to measure its peak memory; PSNR on the same {SAMPLED_PIXELS} random "
+            "pixels of all held-out photos (mean over photos, 8 bit). All settings train for the same time, not the "
+            "same number of steps; longer trainings may favour larger fields."
         )
     return told
 

@@ -73,7 +73,7 @@ def opened(folder: Path, plan: dict[str, Any]) -> Records:
         if different:
             name = different[0]
             raise UserError(
-                f"{folder} holds a bench with another {name} ({found[name]}, now {wanted.get(name)})",
+                f"{folder} contains a bench with a different {name} ({found[name]}, now {wanted.get(name)})",
                 "add --overwrite to measure again, or choose another folder with -o",
             )
         if found != wanted:  # it was `emptied`
@@ -81,7 +81,7 @@ def opened(folder: Path, plan: dict[str, Any]) -> Records:
         _end_with_whole_line(folder / MEASURED)
         return Records(folder)
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
-        raise UserError(f"{folder} is not a bench, but something else", "choose another place with -o")
+        raise UserError(f"{folder} exists and is not a bench folder", "choose another folder with -o")
     write_json(path, wanted)
     return Records(folder)
 

@@ -79,7 +79,7 @@ def measure_rendering(
     for number, setting in enumerate(chosen):
         if number >= _LEAST_SETTINGS and session.spent > ends - 0.3 * seconds:
             chosen = [setting for setting in chosen if setting.name in done]
-            session.notify(f"no time for {len(plan['settings']) - len(chosen)} of the rendering settings")
+            session.notify(f"skipping {len(plan['settings']) - len(chosen)} rendering settings for lack of time")
             break
         if setting.name not in done:
             session.say(f"rendering: {setting.name}")

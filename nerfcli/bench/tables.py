@@ -9,7 +9,7 @@ from nerfcli.atomic import atomic_path
 
 RENDERING_COLUMNS = (
     "rendering",
-    "s a picture",
+    "s per picture",
     "quartiles",
     "peak MB",
     "field MB",
@@ -73,11 +73,11 @@ def sentences(content: Mapping[str, Any]) -> list[str]:
     training = content["training"]
     if training and training["noise_db"] is not None:
         told.append(
-            f"Trainings that differ in their seed alone: {', '.join(f'{psnr:.2f}' for psnr in training['seed_psnr'])} "
-            f"dB; two trainings must differ by {training['noise_db']:.2f} dB not to be chance (95 %)."
+            f"Trainings that differ only in their seed: {', '.join(f'{psnr:.2f}' for psnr in training['seed_psnr'])}"
+            f" dB; two trainings must differ by {training['noise_db']:.2f} dB to be significant (95 %)."
         )
     elif training:
-        told.append("There was time for one seed only: nothing tells which differences between trainings are chance.")
+        told.append("There was time for only one seed, so the spread between seeds is unknown.")
     return told
 
 
@@ -127,8 +127,8 @@ def _advice_in_words(advice: Mapping[str, Any]) -> str:
     """One sentence, with what to type."""
     head = f"{advice['part'].capitalize()}, {advice['question']}: "
     if advice["point"] is None:
-        return f"{head}no setting that was tried is fast enough."
-    unit = "s a picture" if advice["part"] == "rendering" else "s of training"
+        return f"{head}none of the measured settings is fast enough."
+    unit = "s per picture" if advice["part"] == "rendering" else "s of training"
     told = f"{head}{advice['point']}, {advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
     if advice["against"] != advice["point"]:
         told += f" ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"

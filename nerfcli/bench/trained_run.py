@@ -67,9 +67,7 @@ def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Benched
     else:
         subject = _scene_at(path, device=device, threads=threads, seed=seed)
     if not subject.test_frames:
-        raise UserError(
-            f"{path} has no held-out photo to compare with", "the default split holds out every 8th; check the split"
-        )
+        raise UserError(f"{path} has no held-out photos", "by default every 8th photo is held out; check the split")
     return subject
 
 
@@ -84,7 +82,7 @@ def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
     # As the training named it, which is relative to where the user then was; or beside the run, where both moved.
     places = (named, path.resolve().parent / named.name)
     scene = next((place for place in places if named.name and scenes.is_scene(place)), None)
-    why = "" if scene is not None else f"its scene {named} is not there"
+    why = "" if scene is not None else f"its scene {named} is missing"
     if scene is not None and scenes.fingerprint(scenes.load(scene)) != run.config.scene_fingerprint:
         scene, why = None, f"{scene} has changed since"
     return BenchedRun(

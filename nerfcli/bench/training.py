@@ -61,7 +61,7 @@ def measure_trainings(
             continue
         needs = setting.share * plan["unit_seconds"] + _overhead(session)
         if done and session.spent + needs > ends:
-            session.notify(f"no time for the training {setting.name}, about {needs:.0f} s")
+            session.notify(f"skipping the training {setting.name} for lack of time (about {needs:.0f} s)")
             continue
         outcome = _train(trainings, setting, plan["unit_seconds"], f"training {number} of {len(planned)}", session)
         if "error" in outcome:
@@ -120,4 +120,4 @@ def _run_worker(job: Path, say: Callable[[str], None]) -> dict[str, Any]:
     if "result" in last or "error" in last:
         return last
     words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return {"error": f"the training died (exit status {worker.returncode}): {words[-1] if words else 'no message'}"}
+    return {"error": f"the training crashed (exit status {worker.returncode}): {words[-1] if words else 'no message'}"}

@@ -92,7 +92,7 @@ def _warnings_html(runs: Sequence[RunFacts]) -> str:
         of = f"{run.label}: " if len(runs) > 1 else ""
         rows += [(stage, of + text) for stage, text in warnings_of(run)]
     items = "".join(f"<li><b>{escape(stage)}</b> {escape(text)}</li>" for stage, text in rows)
-    return f'<ul class="warned">{items}</ul>' if rows else "<p>Nothing was warned about.</p>"
+    return f'<ul class="warned">{items}</ul>' if rows else "<p>No warnings.</p>"
 
 
 def _structure(view: Seen) -> str:
@@ -135,8 +135,8 @@ def _views_html(
         )
         layers.append(_layers(first, seen, alone=len(runs) == 1))
     if not figures:
-        return "<p>No photo was held out.</p>"
-    noscript = "<noscript><p>The pictures need JavaScript; nothing is loaded from elsewhere.</p></noscript>"
+        return "<p>No held-out photos.</p>"
+    noscript = "<noscript><p>The pictures need JavaScript; nothing is loaded from the network.</p></noscript>"
     return f'{noscript}<div class="views">{"".join(figures)}</div>{page.data_element("views", layers)}'
 
 
@@ -190,7 +190,7 @@ def _curves_html(runs: Sequence[RunFacts]) -> str:
     charts = (
         ("PSNR of held-out pixels, dB", curves(drawn("heldout_psnr", dots=True), x_title="s", y_title="dB")),
         ("Loss", curves(drawn("loss"), x_title="s", y_title="loss", logarithmic=True)),
-        ("Samples a second, M", curves(drawn("samples_per_second", scale=_MEGA), x_title="s", y_title="M/s")),
+        ("Samples per second, M", curves(drawn("samples_per_second", scale=_MEGA), x_title="s", y_title="M/s")),
         ("Peak memory, MB", curves(drawn("peak_memory_bytes", scale=_MEGA), x_title="s", y_title="MB")),
     )
     key = "".join(
@@ -198,7 +198,7 @@ def _curves_html(runs: Sequence[RunFacts]) -> str:
     )
     sections = "".join(f'<section class="chart"><h3>{title}</h3>{chart}</section>' for title, chart in charts if chart)
     if not sections:
-        return "<p>The log of the training is empty.</p>"
+        return "<p>The training log is empty.</p>"
     return (f'<p class="key">{key}</p>' if len(runs) > 1 else "") + f'<div class="charts pairs">{sections}</div>'
 
 
@@ -228,25 +228,25 @@ _BODY = Template("""\
 <div class="top"><div><h1>$title</h1><p>nerfcli report on $count</p></div></div>
 <h2>Numbers</h2>
 $numbers
-<h2>What was warned about</h2>
+<h2>Warnings</h2>
 $warnings
-<h2>Photos that training did not see</h2>
-<p>Drag the border; the lists below each picture choose what stands on its left and on its right.</p>
+<h2>Held-out photos</h2>
+<p>Drag the slider; the lists below each picture choose what is shown on its left and right.</p>
 $views
 $legends
 <h2>Training</h2>
 $curves
-<h2>Every held-out photo</h2>
+<h2>Metrics per held-out photo</h2>
 $photos
-<h2>What has seen the held-out photos</h2>
+<h2>Use of held-out photos by stage</h2>
 $ledger
 $selection
 <h2>Capture and poses</h2>
 $capture
 <h2>Cameras</h2>
-<p>In the plane in which they lie best; lines point where they look. Marked: held-out photos.</p>
+<p>Projected onto their best-fitting plane; lines show viewing directions. Held-out photos are marked.</p>
 <div class="charts pairs">$cameras</div>
 <h2>Settings and versions</h2>
 $settings
-<footer>Pictures are compared as sRGB in 8 bit. Depth and errors shown here are of the field, rendered anew for
+<footer>Pictures are compared as sRGB in 8 bit. Depth and error maps were rendered for
 this page.</footer>""")

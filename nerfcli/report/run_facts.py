@@ -85,14 +85,17 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
     yield from _of_poses(facts.poses or {})
     missing = facts.config.missing_photos
     if missing:
-        yield "scene", f"{len(missing)} photos are not there: {_listed(missing)}"
+        yield "scene", f"{len(missing)} photos are missing: {_listed(missing)}"
     for note in facts.config.warnings:
         yield "training", note
     rollbacks = max((entry.get("rollbacks", 0) for entry in facts.log), default=0)
     if rollbacks:
-        yield "training", f"numbers became non-finite {rollbacks} times; training went back and on with smaller steps"
+        yield (
+            "training",
+            f"numbers became non-finite {rollbacks} times; training continued from an earlier state with smaller steps",
+        )
     if facts.metrics is None:
-        yield "evaluation", "no numbers of this checkpoint: nerfcli evaluate measures them"
+        yield "evaluation", "this checkpoint was not evaluated: run nerfcli evaluate"
     else:
         yield from (("evaluation", text) for text in facts.metrics.get("warnings", []))
 
@@ -101,7 +104,7 @@ def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
     """Why numbers of these runs must not be compared with each other."""
     measured = [run for run in runs if run.metrics is not None]
     if len({run.config.split_sha256 for run in runs}) > 1:
-        yield "the runs hold out different photos"
+        yield "the runs have different held-out photos"
     if len({(run.metrics or {}).get("protocol") for run in measured}) > 1:
         yield "the runs were evaluated by different protocols"
     if len({(run.metrics or {}).get("device") for run in measured}) > 1:
@@ -111,13 +114,13 @@ def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
 def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
     left_out = [image for image in poses.get("images", []) if not image.get("registered")]
     if left_out:
-        told = _listed([f"{image['name']} ({image.get('reason') or 'no reason known'})" for image in left_out])
+        told = _listed([f"{image['name']} ({image.get('reason') or 'unknown reason'})" for image in left_out])
         yield "poses", f"{len(left_out)} photos have no pose: {told}"
     for failure in poses.get("verdict", {}).get("failures", []):
         yield "poses", str(failure)
     attempts = poses.get("attempts", [])
     if len(attempts) > 1:
-        yield "poses", f"it took {len(attempts)} attempts: {', '.join(str(one.get('what')) for one in attempts)}"
+        yield "poses", f"mapping took {len(attempts)} attempts: {', '.join(str(one.get('what')) for one in attempts)}"
     blur = poses.get("pose_blur_px") or {}
     if (blur.get("largest") or 0.0) > _VISIBLE_BLUR_PX:
         yield "poses", f"the pose of {blur.get('photo')} is uncertain by {blur['largest']:.1f} px"
@@ -139,7 +142,7 @@ def _json(path: Path) -> dict[str, Any] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read: {error}", "write it again with the command that made it") from error
+        raise UserError(f"cannot read {path}: {error}", "write it again with the command that created it") from error
     if not isinstance(content, dict):
-        raise UserError(f"{path} is no JSON object", "write it again with the command that made it")
+        raise UserError(f"{path} is not a JSON object", "write it again with the command that created it")
     return content

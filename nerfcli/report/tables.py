@@ -92,7 +92,7 @@ def _lenses(run: RunFacts) -> str:
 
 def _verdict(run: RunFacts) -> str:
     verdict = (run.poses or {}).get("verdict")
-    return ("accepted on evidence" if verdict.get("accepted") else "not accepted") if verdict else ""
+    return ("passed all checks" if verdict.get("accepted") else "not accepted") if verdict else ""
 
 
 def photos_html(runs: Sequence[RunFacts]) -> str:
@@ -113,7 +113,7 @@ def photos_html(runs: Sequence[RunFacts]) -> str:
             row += [number(image.get("psnr"), 2), number(image.get("ssim"), 4)]
         view = next((images[name]["view"] for images in by_run if "view" in images.get(name, {})), None)
         rows.append([*row, *_novelty(view)])
-    columns += ["nearest training view", "distance / radius", "degrees between", "kind of view"]
+    columns += ["nearest training view", "distance / scene radius", "degrees between", "type of view"]
     return table(columns, rows, numbers=range(1, len(columns)))
 
 
@@ -134,8 +134,8 @@ def ledger_html(runs: Sequence[RunFacts]) -> str:
         for entry in (run.metrics or {}).get("ledger", [])
     ]
     if not rows:
-        return "<p>Not known: the run was not evaluated.</p>"
-    return table(("run", "stage", "saw held-out photos", "how"), rows)
+        return "<p>Unknown: the run was not evaluated.</p>"
+    return table(("run", "stage", "used held-out photos", "how"), rows)
 
 
 def selection_html(runs: Sequence[RunFacts]) -> str:
@@ -144,7 +144,7 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
         (
             run.label,
             f"{decision.component}={str(decision.value).lower()}",
-            "" if decision.gain_db is None else f"{decision.gain_db:+.2f} +- {decision.error_db:.2f}",
+            "" if decision.gain_db is None else f"{decision.gain_db:+.2f} ± {decision.error_db:.2f}",
             "" if decision.cost is None else f"{decision.cost:+.0%}",
             "yes" if decision.kept else "no",
             decision.why,
@@ -156,7 +156,7 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
     if not rows:
         return ""
     columns = ("run", "component", "gain, dB", "time", "kept", "why")
-    return f"<h2>What the scene needs</h2>{table(columns, rows, numbers=(2, 3))}"
+    return f"<h2>Selected components</h2>{table(columns, rows, numbers=(2, 3))}"
 
 
 def settings_html(runs: Sequence[RunFacts]) -> str:
@@ -184,21 +184,21 @@ def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
 
 
 _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
-    ("PSNR of held-out photos", _metric("psnr", "{:.2f} dB")),
+    ("PSNR on held-out photos", _metric("psnr", "{:.2f} dB")),
     ("SSIM", _metric("ssim", "{:.4f}")),
     ("LPIPS", _metric("lpips", "{:.4f}")),
-    ("PSNR, colours aligned", _metric("psnr_colour_aligned", "{:.2f} dB")),
-    ("PSNR of the right halves", _metric("psnr_right_half", "{:.2f} dB")),
-    ("the same, poses aligned on the left halves", _metric("psnr_pose_aligned", "{:.2f} dB")),
-    ("PSNR of views between training views", _of_kind("interpolation")),
-    ("PSNR of views beyond them", _of_kind("extrapolation")),
-    ("PSNR against photos on billboards, without shape", _shape),
+    ("PSNR after colour alignment", _metric("psnr_colour_aligned", "{:.2f} dB")),
+    ("PSNR on the right halves", _metric("psnr_right_half", "{:.2f} dB")),
+    ("PSNR on the right halves, poses aligned on the left halves", _metric("psnr_pose_aligned", "{:.2f} dB")),
+    ("PSNR on views between training views (interpolation)", _of_kind("interpolation")),
+    ("PSNR on views beyond training views (extrapolation)", _of_kind("extrapolation")),
+    ("PSNR of billboards (a model without geometry)", _shape),
     ("training", _last("seconds", "{:.1f} s")),
     ("steps", _last("step", "{:,.0f}")),
-    ("samples a second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),
+    ("samples per second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),
     ("peak memory", _last("peak_memory_bytes", "{:.0f} MB", _MEGA)),
     ("checkpoint", lambda run: f"{run.field_bytes / _MEGA:.1f} MB"),
-    ("a picture takes", _of("render", "seconds_per_image", "{:.2f} s")),
+    ("time per picture", _of("render", "seconds_per_image", "{:.2f} s")),
     ("measured on", lambda run: str((run.metrics or {}).get("device", ""))),
 )
 
@@ -206,16 +206,16 @@ _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
 _CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("scene", lambda run: run.config.scene.name),
     ("format", lambda run: run.config.scene_kind or ""),
-    ("photos to train on", lambda run: str(len(run.frames.train))),
-    ("photos held out", lambda run: str(len(run.frames.test))),
+    ("training photos", lambda run: str(len(run.frames.train))),
+    ("held-out photos", lambda run: str(len(run.frames.test))),
     ("size", _size),
     ("unit of length", _unit),
     ("poses found", _registered),
-    ("the result was", _verdict),
+    ("result", _verdict),
     ("lenses", _lenses),
     ("points", _of("", "points", "{:,.0f}")),
     ("mean reprojection error", _of("", "mean_reprojection_error_px", "{:.2f} px")),
-    ("blur by uncertain poses, median", _of("pose_blur_px", "median", "{:.2f} px")),
-    ("blur by uncertain poses, largest", _of("pose_blur_px", "largest", "{:.2f} px")),
-    ("structure from motion took", _of("seconds", "total", "{:.0f} s")),
+    ("blur due to pose uncertainty, median", _of("pose_blur_px", "median", "{:.2f} px")),
+    ("blur due to pose uncertainty, maximum", _of("pose_blur_px", "largest", "{:.2f} px")),
+    ("time of structure from motion", _of("seconds", "total", "{:.0f} s")),
 )
