@@ -1,4 +1,4 @@
-"""Where the program starts: the command `nerfcli`, and `python -m nerfcli` where that is not on the path.
+"""Entry point of the command `nerfcli`, and of `python -m nerfcli` where that is not on the path.
 
 Importing what a command needs takes longer than many commands: Ctrl-C meanwhile ends as it does later, in one line.
 """

@@ -60,7 +60,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def replace_folder(complete: Path, path: Path) -> None:
-    """Put a folder in the place of another that may stand there, which is kept until this has worked.
+    """Replace a folder by another; the old one is kept until the new one is in place.
 
     Raises:
         UserError: it cannot be moved.
@@ -124,7 +124,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, Any]:
-    """What `write_json` wrote, where that was an object.
+    """Read an object that `write_json` wrote.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""What the user can mend: one exception, and the exit codes that scripts rely on."""
+"""Errors that a user can fix: one exception, and the exit codes that scripts rely on."""
 
 BAD_INPUT = 3
 TOO_FEW_PHOTOS = 4
@@ -10,7 +10,7 @@ TERMINATED = 143
 
 
 class UserError(Exception):
-    """A problem that the user can mend, told in two lines.
+    """A problem that the user can fix, reported in two lines.
 
     Args:
         message: what is wrong, with the value and the file; no trailing full stop needed.

@@ -1,4 +1,4 @@
-"""Which photos are held out: every n-th by name, a block of neighbours, or those that a file lists.
+"""Held-out split: every n-th photo by name, a block of neighbours, or a list in a file.
 
 every:8       index 0, 8, 16, ... of the names in order: each has trained neighbours on both sides
 block:0.15    the middle 15 % of the names in order: a gap in the capture, whose inside has no neighbour

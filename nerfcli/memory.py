@@ -1,4 +1,4 @@
-"""How much memory there is, and how much a process has in use.
+"""Memory of the machine and of processes.
 
 What counts is what is resident. A limit on the address space (RLIMIT_AS) would be simpler, but it counts what is merely
 reserved: the libraries, the stacks and heaps of threads, gigabytes that never become memory.
@@ -14,7 +14,7 @@ _CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.lim
 
 
 def default_memory_limit() -> int | None:
-    """Four fifths of the memory of the machine or container, in bytes; None where it is not known."""
+    """Return four fifths of the memory of the machine or container, in bytes; None if unknown."""
     try:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):  # not a POSIX system

@@ -81,7 +81,7 @@ class Scene:
 
 
 def is_scene(path: Path) -> bool:
-    """Whether a folder holds the files of a scene, well-formed or not."""
+    """Return whether a folder contains the files of a scene, well-formed or not."""
     files = (SCENE_FILE, *_FOREIGN_FILES)
     return any((path / name).is_file() for name in files) or model_folder(path) is not None
 

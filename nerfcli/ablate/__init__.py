@@ -1,1 +1,1 @@
-"""What each component of a model is worth on a scene: trainings with and without it, measured on held-out photos."""
+"""Ablation: train a model with and without each component and compare on held-out photos."""

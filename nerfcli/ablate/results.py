@@ -1,4 +1,4 @@
-"""What an ablation found: differences to the chosen model with their intervals, and the files that tell them."""
+"""Results of an ablation: differences from the reference model with their intervals, and the files with them."""
 
 import csv
 import math
@@ -142,7 +142,7 @@ def write_results(
 
 
 def refuse_foreign(folder: Path) -> None:
-    """Raise if something else than an ablation stands at a place."""
+    """Raise if the folder contains something other than an ablation."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / RESULT).exists()):
         raise UserError(f"{folder} exists and is not an ablation folder", "choose another folder with -o")
 

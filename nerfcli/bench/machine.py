@@ -15,7 +15,7 @@ BUSY_SHARE = 0.25
 
 
 def describe_machine(device: str, threads: int) -> dict[str, Any]:
-    """What a time depends on besides the settings."""
+    """Describe the machine: everything that a time depends on besides the settings."""
     return {
         "processor": processor_name(),
         "processors": os.cpu_count(),
@@ -42,7 +42,7 @@ def load_average() -> float | None:
 
 
 def is_busy(load: float | None) -> bool:
-    """Whether a load average from before the work began means that others use the processors."""
+    """Return whether a load average from before the start means that other programs use the processors."""
     return load is not None and load > BUSY_SHARE * (os.cpu_count() or 1)
 
 

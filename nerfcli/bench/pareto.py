@@ -1,4 +1,4 @@
-"""Which settings are worth their time: dominance that minds noise, and the settings to recommend."""
+"""Pareto sets under measurement noise, and the recommended settings."""
 
 import math
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ def dominators(points: Sequence[SettingResult], *, noise: float) -> dict[str, st
 
 
 def least_difference(values: Sequence[float]) -> float | None:
-    """How far two single trainings must be apart for 95 % confidence that it is not chance.
+    """Return the difference between two single trainings that is significant at 95 %.
 
     t * s * sqrt(2), with the standard deviation s of repeats that differ in their seed alone, and Student's t for as
     many degrees of freedom.

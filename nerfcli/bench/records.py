@@ -1,4 +1,4 @@
-"""What was measured so far: a file of JSON lines that only grows, so that an interruption costs one measurement."""
+"""Records of measurements: a file of JSON lines that only grows, so that an interruption costs one measurement."""
 
 import json
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ FORMAT = "nerfcli bench 1"
 
 @dataclass(frozen=True)
 class Records:
-    """The measurements in a folder. Each is a flat dict whose "kind" says what it is."""
+    """Measurements in a folder, each a flat dict whose "kind" names its type."""
 
     folder: Path
 
@@ -53,7 +53,7 @@ class Records:
 
 
 def opened(folder: Path, plan: dict[str, Any]) -> Records:
-    """The records of a bench in a folder, new or to go on with.
+    """Open the records of a bench in a folder, new or existing.
 
     Args:
         folder: made if it is not there.

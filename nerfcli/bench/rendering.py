@@ -53,7 +53,7 @@ class _Subject:
 def measure_rendering(
     model: Model, photos: Sequence[HeldOutPhoto], settings: Sequence[RenderSetting], *, session: Session, seconds: float
 ) -> None:
-    """Measure as many of the settings as there is time for, and go on with what an earlier call left.
+    """Measure as many rendering settings as time allows, continuing an earlier call.
 
     Args:
         model: the trained field.

@@ -1,4 +1,4 @@
-"""One bench: its time, its records, and whom it tells how far it is."""
+"""State of one bench: its time, its records, its progress messages."""
 
 import time
 from collections.abc import Callable
@@ -52,7 +52,7 @@ class Session:
         self._lap = now
 
     def say(self, doing: str) -> None:
-        """Tell what is done now and for how long all of it will go on."""
+        """Report the current work and the remaining time."""
         left = max(0.0, self.left)
         told = f"{left / 60:.0f} min" if left >= 90 else f"{left:.0f} s"
         self.tell(min(1.0, self.spent / self.budget_seconds), f"{doing}, about {told} left")

@@ -1,4 +1,4 @@
-"""From measurements to what they say: points with their spread, the Pareto sets, what to recommend."""
+"""Summarize measurements: points with their spread, Pareto sets, recommendations."""
 
 import math
 import statistics

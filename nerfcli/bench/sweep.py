@@ -40,7 +40,7 @@ class RenderSetting:
 
     @property
     def name(self) -> str:
-        """What differs from the defaults, threads apart where they are all of them."""
+        """Name of the setting: its differences from the defaults, except threads if all are used."""
         return ", ".join(self._parts()) or "default"
 
     def _parts(self) -> list[str]:
@@ -98,7 +98,7 @@ class TrainSetting:
 
     @property
     def name(self) -> str:
-        """What is varied."""
+        """Name of the setting: the parameter that is varied."""
         values = dict(self.changed)
         match self.group:
             case "seed":
@@ -114,7 +114,7 @@ class TrainSetting:
         return "default"
 
     def settings(self, base: TrainSettings, unit_seconds: float) -> TrainSettings:
-        """What to train with."""
+        """Return the settings of the training."""
         values = dict(self.changed)
         if "samples_per_step" in values:
             values["first_samples_per_step"] = min(base.first_samples_per_step, values["samples_per_step"])
@@ -122,7 +122,7 @@ class TrainSetting:
         return replace(base, budget_seconds=seconds, steps=None, seed=base.seed + self.seed, **values)  # type: ignore[arg-type]
 
     def to_json(self) -> dict[str, Any]:
-        """What is not as in the defaults of `TrainSettings`."""
+        """Return the differences from the defaults of `TrainSettings`."""
         return {**dict(self.changed), "seed": self.seed}
 
     @property
@@ -153,7 +153,7 @@ def render_settings(threads: int) -> list[RenderSetting]:
 
 
 def train_settings() -> list[TrainSetting]:
-    """Trainings, the most telling first. Two more seeds of the default tell what of all differences is chance."""
+    """List trainings, the most informative first. Two more seeds of the default give the noise of all differences."""
     return [
         TrainSetting("default"),
         TrainSetting("seed", seed=1),
@@ -178,7 +178,7 @@ def train_settings() -> list[TrainSetting]:
 def affordable(
     settings: Sequence[TrainSetting], seconds: float, *, overhead: float
 ) -> tuple[list[TrainSetting], float]:
-    """As many of the first settings as there is time for, and the time that one share of training gets.
+    """Return as many of the first settings as time allows, and the time for one unit of training.
 
     Args:
         settings: the most telling first; at least one.

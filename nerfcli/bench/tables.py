@@ -68,7 +68,7 @@ def training_rows(training: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def sentences(content: Mapping[str, Any]) -> list[str]:
-    """What is recommended, and what the differences have to be held against."""
+    """Return the recommendations, and the noise level of differences."""
     told = [_advice_in_words(advice) for advice in content["recommendations"]]
     training = content["training"]
     if training and training["noise_db"] is not None:
@@ -117,7 +117,7 @@ def _verdict(point: Mapping[str, Any]) -> str:
 
 
 def command_of(advice: Mapping[str, Any]) -> str:
-    """What to type for a recommendation."""
+    """Return the command line for a recommendation."""
     if advice["part"] == "rendering":
         return f"nerfcli render RUN {advice['options']}".strip()
     return f"nerfcli train SCENE --budget {advice['seconds']:.0f}s {advice['options']}".strip()

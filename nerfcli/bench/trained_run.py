@@ -1,4 +1,4 @@
-"""What is measured: a trained run, or a scene that is trained first."""
+"""The subject of a bench: a trained run, or a scene that is trained first."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -22,7 +22,7 @@ KEPT_FIELD = FIELD
 
 @dataclass(frozen=True)
 class Trainings:
-    """What all trainings of a bench have in common.
+    """Common data of all trainings of a bench.
 
     Args:
         scene: the folder of the scene.
@@ -40,7 +40,7 @@ class Trainings:
 def measure_trainings(
     trainings: Trainings, settings: Sequence[TrainSetting], *, session: Session, seconds: float
 ) -> None:
-    """Train as many of the settings as there is time for, and go on with what an earlier call left.
+    """Train as many settings as time allows, continuing an earlier call.
 
     Args:
         trainings: what they have in common.

@@ -36,7 +36,7 @@ _LONGEST_PX = 360
 
 
 def main(job_path: str) -> None:
-    """Do one job and tell its result."""
+    """Run one job and report its result."""
     send = take_stdout()
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
     try:
@@ -48,7 +48,7 @@ def main(job_path: str) -> None:
 def measure_model(
     model: Model, held_out: list[HeldOutPhoto], *, seed: int, folder: Path, prefix: str, shown: str
 ) -> dict[str, Any]:
-    """What a field gives and costs to look at.
+    """Measure the rendering time and the error of a field.
 
     Args:
         model: the trained field.

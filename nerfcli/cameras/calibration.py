@@ -1,4 +1,4 @@
-"""Intrinsics that are known beforehand, and which of them belong to a photo: by its name, else by its size."""
+"""Known intrinsics, assigned to photos by name, else by size."""
 
 import hashlib
 import json
@@ -34,7 +34,7 @@ class Calibration:
 
     @property
     def key(self) -> str:
-        """A hash of what it says, wherever the file is."""
+        """Hash of the content, independent of the file's location."""
         content = [[camera.to_json() for camera in self.cameras], sorted(self.of_image.items()), self.upright]
         return hashlib.blake2b(json.dumps(content).encode(), digest_size=16).hexdigest()
 
@@ -51,7 +51,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """The camera of an upright photo, the number of the one in the file, and whether the photo was found by name."""
+    """Camera of an upright photo, the index of the camera in the file, and whether the photo was found by name."""
 
     camera: Camera
     number: int

@@ -75,7 +75,7 @@ class Camera:
 
     @property
     def is_spherical(self) -> bool:
-        """Whether the picture covers the whole sphere (EQUIRECTANGULAR), where there is no focal length."""
+        """Whether the picture covers the whole sphere (EQUIRECTANGULAR), in which case there is no focal length."""
         return _colmap_camera(self).is_spherical()
 
     @property
@@ -85,7 +85,7 @@ class Camera:
 
     @property
     def principal_point(self) -> tuple[float, float]:
-        """Where the optical axis meets the picture, in pixels (x, y)."""
+        """Principal point in pixels (x, y)."""
         index = _colmap_camera(self).principal_point_idxs()
         return (self.params[index[0]], self.params[index[1]]) if index else (self.width / 2, self.height / 2)
 
@@ -127,7 +127,7 @@ class Camera:
         return directions, valid
 
     def project(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points appear in the picture.
+        """Project points to pixels.
 
         Args:
             points_cam: (N, 3) in camera axes.
@@ -147,7 +147,7 @@ class Camera:
         return pixels, valid
 
     def project_jacobian(self, points_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How the pixels of points move with the points and with the camera's parameters.
+        """Compute the Jacobian of pixels with respect to points and camera parameters.
 
         Args:
             points_cam: (N, 3) in camera axes.
@@ -167,7 +167,7 @@ class Camera:
         return np.moveaxis(by_point, -1, 0), np.moveaxis(by_parameters * valid, -1, 0), valid
 
     def bearing_jacobian(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How the directions of pixels turn as the pixels move.
+        """Compute the Jacobian of bearings with respect to pixels.
 
         Args:
             pixels: (N, 2).
@@ -233,7 +233,7 @@ class Camera:
         return Camera(self.model, width, height, tuple(colmap.params))
 
     def undistorted(self) -> "Camera":
-        """A PINHOLE camera of the same size and focal length, for views that nobody photographed."""
+        """Return a PINHOLE camera of the same size and focal length, for rendered views."""
         return Camera.pinhole(self.width, self.height, self.focal_px)
 
     def to_json(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a capture consists of: frames (camera, pose, picture) and what the file that lists them knows besides."""
+"""Data of a capture: frames (camera, pose, picture), points and other content of the file that lists them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Observations:
-    """Where points were seen: one row per 2D feature of a frame.
+    """Observations of points: one row per 2D feature of a frame.
 
     Args:
         frame_index: (M,) int64, of the frame.

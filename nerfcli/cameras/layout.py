@@ -1,4 +1,4 @@
-"""How the cameras of a capture stand: where they look, which way is up, whether they surround something.
+"""Layout of the cameras of a capture: what they look at, which way is up, whether they surround something.
 
 Letters: a camera has centre c and unit viewing direction d.
 """
@@ -85,7 +85,7 @@ def nearest_to_rays(
 
 
 def up_direction(frames: Sequence[Frame]) -> np.ndarray:
-    """Which way is up in the world, (3,), unit.
+    """Estimate the up direction of the world, (3,), unit.
 
     People hold a camera level but tilt it: the horizontal axes of the pictures lie in the ground plane whatever the
     tilt, so where those span a plane clearly, up is its normal. Where they do not (all cameras look the same way),
@@ -100,7 +100,7 @@ def up_direction(frames: Sequence[Frame]) -> np.ndarray:
 
 
 def surrounds(frames: Sequence[Frame], up: np.ndarray) -> bool:
-    """Whether the cameras look at something from all sides: no gap of 150 degrees between their headings."""
+    """Return whether the cameras look at something from all sides: no gap of 150 degrees between their headings."""
     east, north = horizontal_axes(up)
     views = views_of(frames)
     heading = np.stack([views @ east, views @ north], axis=-1)

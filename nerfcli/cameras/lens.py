@@ -68,7 +68,9 @@ class Lens:
     spread: np.ndarray
 
     def project(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (2, N) of unit directions (3, N), and whether the lens sees them, (N,) bool; zeros where not."""
+        """Project unit directions (3, N) to pixels (2, N), and return whether the lens sees them, (N,) bool; zeros
+        where not.
+        """
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             valid = self.projection.sees(directions)
             plane = self.projection.plane(_where_seen(directions, valid))
@@ -81,7 +83,9 @@ class Lens:
         return pixels, valid
 
     def unproject(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Unit directions (3, N) of finite pixels (2, N), and whether the lens has one, (N,) bool; +z where not."""
+        """Unproject finite pixels (2, N) to unit directions (3, N), and return whether there is one, (N,) bool; +z
+        where not.
+        """
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             plane = (pixels - self.principal_point) / self.focal_px
             valid = np.ones(pixels.shape[1], dtype=bool)

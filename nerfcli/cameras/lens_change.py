@@ -1,4 +1,4 @@
-"""What refinement may change of a lens: its focal length by a factor, and the first two terms of its radial distortion.
+"""Lens parameters that refinement can change: a factor of the focal length and the first two radial terms.
 
 Resolution does not enter: the same change suits the photo and the smaller picture that is trained on.
 """
@@ -18,7 +18,7 @@ _RADIAL_TERMS = 2
 
 
 def changeable(camera: Camera) -> tuple[str, ...]:
-    """What there is to change: "focal", and the names of the radial terms; nothing of a spherical camera."""
+    """List the parameters that can change: "focal" and the radial terms; none for a spherical camera."""
     radial = [name for group in DISTORTIONS[camera.model] for name in group.get("radial", ())]
     has_focal = any(name in _FOCAL_NAMES for name in parameter_names(camera.model))
     return (*([FOCAL] if has_focal else []), *radial[:_RADIAL_TERMS])

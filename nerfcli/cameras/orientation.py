@@ -138,12 +138,12 @@ def rescaling(calibrated: Camera, fitted: Camera) -> tuple[Size, Size] | None:
 
 
 def counted(sizes: Iterable[tuple[Size, Size] | None]) -> dict[tuple[Size, Size], int]:
-    """How often each pair of sizes comes up that `rescaling` gave."""
+    """Count the pairs of sizes that `rescaling` returned."""
     return dict(Counter(pair for pair in sizes if pair is not None))
 
 
 def rescaling_told(rescaled: Mapping[tuple[Size, Size], int]) -> list[str]:
-    """What `Capture.rescaled` holds, a sentence for each pair of sizes."""
+    """Describe `Capture.rescaled`, one sentence per pair of sizes."""
     return [
         f"{count} photo{'s are' if count > 1 else ' is'} {width}x{height}, but the intrinsics are for {of_width}x"
         f"{of_height}: rescaled"

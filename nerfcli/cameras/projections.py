@@ -1,4 +1,4 @@
-"""How directions meet the plane, before any distortion: one class for each way that COLMAP's models know.
+"""Projections of directions onto the plane before distortion: one class per projection of COLMAP's models.
 
 A projection maps directions d = (x, y, z) in camera axes to a plane q with unit focal length; rho = |(x, y)| and theta
 is the angle between d and the optical axis. Coordinates come first: directions are (3, N), points of the plane (2, N).
@@ -19,15 +19,15 @@ class Projection(Protocol):
     """A map from directions to the plane, one to one where it sees."""
 
     def sees(self, directions: np.ndarray) -> np.ndarray:
-        """Whether directions (3, N) of any length lie in the domain; (N,) bool."""
+        """Return whether directions (3, N) of any length are in the domain; (N,) bool."""
         ...
 
     def plane(self, directions: np.ndarray) -> np.ndarray:
-        """Where unit directions (3, N) meet the plane, (2, N)."""
+        """Project unit directions (3, N) onto the plane, (2, N)."""
         ...
 
     def directions(self, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse of `plane`: unit directions (3, N), and whether there is one, (N,) bool."""
+        """Invert `plane`: unit directions (3, N), and whether there is one, (N,) bool."""
         ...
 
     def jacobian(self, directions: np.ndarray) -> np.ndarray:

@@ -53,7 +53,7 @@ def stdin_paths() -> Iterator[Path]:
 
 
 def result_path(source: Path, *, suffix: str, output: Path | None, one_of_many: bool) -> Path:
-    """Where the result of `source` goes.
+    """Return the output path for `source`.
 
     Beside the source with `suffix` added to its name; at `output` where that is given; inside `output` where there
     are many sources.

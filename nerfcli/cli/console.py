@@ -1,4 +1,4 @@
-"""What a command says: results on stdout, everything else on stderr, errors in two lines with their exit code."""
+"""Output of commands: results on stdout, everything else on stderr, errors in two lines with their exit code."""
 
 import functools
 import json

@@ -13,7 +13,7 @@ WIDTH = 110
 
 
 def lines_of(facts: dict[str, Any]) -> list[str]:
-    """Facts by their names, a line each or folded ones, lists below their name; what is not known is not said."""
+    """Format facts by name, one line each or folded, lists below their name; unknown values are omitted."""
     lines = []
     for name, value in facts.items():
         if value is None or value in ([], {}):
@@ -29,7 +29,9 @@ def lines_of(facts: dict[str, Any]) -> list[str]:
 
 
 def words_of(facts: dict[str, Any]) -> list[str]:
-    """The facts of `media.facts.file_facts` or of a folder of renders, a line each; what is not known is not said."""
+    """Format the facts of `media.facts.file_facts` or of a folder of renders, one per line; unknown values are
+    omitted.
+    """
     return [
         *_what(facts),
         *([facts["in_words"]] if facts["in_words"] else []),

@@ -206,7 +206,7 @@ def sizes_of(quality: str) -> tuple[int, int]:
 
 
 def use_of(intrinsics: Path | None, intrinsics_as: str | None) -> str:
-    """How intrinsics are used, by --intrinsics-as.
+    """Return the use of intrinsics selected by --intrinsics-as.
 
     Raises:
         typer.BadParameter: not a way to use them, or there are none.

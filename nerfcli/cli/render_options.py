@@ -124,7 +124,7 @@ def tolerance_of(text: str) -> float:
 def video_settings(
     formats: str, *, layout: str, direction: str, fps: float, crf: int | None, loop: int | None
 ) -> "VideoSettings":
-    """The videos that --video-format and its companions ask for.
+    """Return the videos selected by --video-format and related options.
 
     Raises:
         typer.BadParameter: a value that does not exist, or does not fit the formats.
@@ -156,7 +156,7 @@ def video_settings(
 
 
 def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[float, float] | None:
-    """LOW:HIGH; None where nothing is said.
+    """Parse LOW:HIGH; None if not given.
 
     Raises:
         typer.BadParameter: anything else, or no depth is asked for.
@@ -192,7 +192,7 @@ def frame_range(text: str) -> slice:
 def look_of(
     width: int | None, height: int | None, *, lens: str | None, fov_deg: float | None, crop: str | None
 ) -> "Look":
-    """What --width, --height, --lens, --fov and --crop ask for.
+    """Return the picture geometry selected by --width, --height, --lens, --fov and --crop.
 
     Raises:
         typer.BadParameter: a lens that does not exist, --fov without --lens, or a part that is none.

@@ -1,4 +1,4 @@
-"""Camera axes by name, and captures whose files are to be understood otherwise than their format says.
+"""Camera axes by name, and conventions that override those of a file format.
 
 Axes are told by three letters, of the directions in which +x, +y and +z of the camera point: r(ight) or l(eft), d(own)
 or u(p), f(orward) or b(ackward). OpenCV's are rdf. Some have names.
@@ -56,7 +56,7 @@ def all_axes() -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Convention:
-    """How the numbers of a file are meant, where this may differ from what the format says.
+    """Convention of the numbers in a file, where it may differ from that of the format.
 
     Args:
         axes: of the camera in the file's poses.
@@ -92,7 +92,7 @@ def reinterpreted(capture: Capture, meant: Convention, *, parsed_axes: str) -> C
 
 
 def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Capture:
-    """A capture whose numbers, once written in the format's own convention, stand in the file in the wanted one.
+    """Return a capture whose numbers, written in the format's own convention, are in the requested one.
 
     The inverse of `reinterpreted`.
     """
@@ -116,7 +116,7 @@ def poses_of(capture: Capture) -> np.ndarray:
 
 
 def for_picture(camera: Camera, intrinsics_scale: float) -> Camera:
-    """The camera of the picture that it says, if its parameters are for one that is `intrinsics_scale` times as large.
+    """Return the camera for the stated picture size, if its parameters are for one `intrinsics_scale` times as large.
 
     A principal point in the very middle stays there: it is one that the file did not give.
     """

@@ -1,4 +1,4 @@
-"""Converting a capture: parse, apply what the user knows, refuse or accept losses, write, verify, keep."""
+"""Convert a capture: parse, apply corrections, refuse or accept losses, write, verify, keep."""
 
 import os
 import shutil
@@ -22,7 +22,7 @@ from nerfcli.errors import GATE_NOT_MET, UserError
 
 @dataclass(frozen=True)
 class Doubt:
-    """What the user knows better about the numbers in a file than its format does; None where they do not.
+    """Corrections of the convention that the user gives; None where the format is right.
 
     Args: see `Convention`.
     """
@@ -59,7 +59,7 @@ class TargetOptions:
 
 @dataclass(frozen=True)
 class Conversion:
-    """What a conversion did.
+    """Result of a conversion.
 
     Args:
         path: what was written.
@@ -81,7 +81,7 @@ class Conversion:
 
 
 def load(source: Path, given: Given, doubt: Doubt) -> tuple[Format, Path, Capture]:
-    """The capture in a file or folder, in the convention that the user knows to hold.
+    """Read the capture in a file or folder, in the convention given by the user.
 
     Returns:
         The format, the file or folder that was parsed, the capture.

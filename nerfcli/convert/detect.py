@@ -1,4 +1,4 @@
-"""Which convention a capture's numbers follow, when it is in doubt: hypotheses, each with what the photos say of it.
+"""Detect the convention of a capture: hypotheses, each compared with the photos.
 
 Four questions: the axes of the cameras and the direction of the transforms (which are asked together, with the size
 for which the intrinsics are), then the size alone, then the half pixel. Each question's answers are compared with the
@@ -67,7 +67,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Detection:
-    """What was found out about a capture's convention.
+    """Result of detecting a convention.
 
     Args:
         evidence: what it rests on, with numbers of items.
@@ -83,7 +83,7 @@ class Detection:
 
     @property
     def as_format_says(self) -> bool:
-        """Whether nothing speaks against the format's own convention."""
+        """Whether nothing contradicts the format's own convention."""
         return self.convention == self.declared and not any(
             question.verdict == "none holds" for question in self.questions
         )

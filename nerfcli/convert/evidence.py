@@ -1,4 +1,4 @@
-"""What tells whether a convention holds: how far, in pixels, photos and cameras contradict each other under it.
+"""Evidence for a convention: how far, in pixels, photos and cameras contradict each other.
 
 Each kind of evidence turns the directions in which pixels see (which depend on the intrinsics alone) and the poses into
 one error for every item. An item that lies behind a camera has an infinite error.

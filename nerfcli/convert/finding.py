@@ -1,4 +1,4 @@
-"""Where in a path, a file or a folder, the capture of a format stands: each finder gives the place, or None.
+"""Locate the capture of a format in a path; each finder returns the place, or None.
 
 A folder is known by the names of files in it, a file by its suffix and its beginning.
 """

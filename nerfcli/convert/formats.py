@@ -58,7 +58,7 @@ from nerfcli.media.masks import find_mask
 
 @dataclass(frozen=True)
 class Given:
-    """What the user gives besides the capture's own files.
+    """Additional input of the user besides the capture's own files.
 
     Args:
         images: the folder of the photos, that names are relative to.
@@ -134,7 +134,7 @@ def format_named(name: str) -> Format:
 
 
 def recording(form: Format, provenance: Mapping[str, Any]) -> Format:
-    """The format, whose files tell where they come from if they have a place for it, as scene.json has."""
+    """Return the format with the origin recorded in its files if they have a place for it, such as scene.json."""
     if form.write is not write_scene:
         return form
     return replace(form, write=lambda capture, folder: write_scene(capture, folder, provenance=provenance))

@@ -18,7 +18,7 @@ SYNTHETIC_PER_VIEW = 24
 
 @dataclass(frozen=True)
 class Probes:
-    """Where points are seen.
+    """Points used for verification.
 
     Args:
         frame_index: (M,) of the view.
@@ -70,7 +70,7 @@ def rows_of_each(labels: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def scene_distance(capture: Capture) -> float:
-    """How far away what the cameras see is, roughly: that of the points, the depth bounds, or the cameras' spread."""
+    """Estimate the distance of the scene: from points, depth bounds, or the spread of the cameras."""
     centres = poses_of(capture)[:, :3, 3]
     if len(capture.points):
         distance = np.linalg.norm(np.median(capture.points, axis=0) - centres, axis=1).mean()
@@ -111,7 +111,7 @@ def _seen(capture: Capture, frame_index: np.ndarray, point_index: np.ndarray, po
 
 
 def projected(capture: Capture, probes: Probes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the views of a capture see points: pixels (M, 2), whether they do (M,) bool, distances (M,)."""
+    """Project points into the views of a capture: pixels (M, 2), whether visible (M,) bool, distances (M,)."""
     cam_from_world = rigid.inverse(poses_of(capture))[probes.frame_index]
     in_camera = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], probes.points) + cam_from_world[:, :3, 3]
     cameras, camera_of_frame = distinct([frame.camera for frame in capture.frames])

@@ -1,4 +1,4 @@
-"""What stands in a file that was just written, read by other means than the ones that wrote it or that parse it.
+"""Read a written file back with code other than the writer's and the parser's.
 
 Nothing here comes from `cameras`: COLMAP models are read by pycolmap, JSON field by field, quaternions by SciPy. It
 reads only what nerfcli writes, so it is short and checks nothing: whatever is wrong shows as a residual or as an
@@ -21,12 +21,12 @@ from nerfcli.convert.opencv_lenses import FileLens
 
 
 class UnreadableError(Exception):
-    """A file that was just written does not hold what its format asks for."""
+    """A file that was just written does not conform to its format."""
 
 
 @dataclass(frozen=True)
 class Beside:
-    """What a file may say beside cameras, poses and points; None where its format does not.
+    """Optional content of a file besides cameras, poses and points; None where its format has no place for it.
 
     Args:
         images, masks: of each view, as paths; "" for none.

@@ -1,5 +1,4 @@
-"""What is left of a capture in a format that cannot hold all of it: the cameras, without the terms that are lost, and
-names, as far as other programs read them.
+"""Reduce a capture to what a format can hold: cameras without the lost terms, and names as other programs read them.
 
 A written file is compared with this when losses were accepted. It says in its own words what a writer keeps, so that a
 writer that loses something else is found out.

@@ -15,7 +15,7 @@ SCENE_FILES = (scene.SCENE_FILE, *(f"{scene.MODEL_FOLDER}/{name}.bin" for name i
 
 
 def losses_scene(capture: Capture) -> tuple[str, ...]:
-    """What of a capture a scene cannot hold.
+    """List what a scene folder cannot hold of a capture.
 
     The names of photos lead to them from one folder; where they do not, photos get other names. Photos that the capture
     lists and that have no file are told when the scene is loaded.

@@ -1,4 +1,4 @@
-"""Which pixels of photos with an EXIF orientation the cameras of a capture refer to, and turning them to the others.
+"""Pixels that cameras refer to for photos with an EXIF orientation (stored or upright), and conversion between them.
 
 COLMAP, nerfstudio, instant-ngp and OpenSfM read pixels as they are stored. nerfcli shows photos upright, and its own
 scenes have cameras for that.
@@ -32,7 +32,7 @@ _MOST_MEASURED = 200
 
 @dataclass(frozen=True)
 class Turned:
-    """A capture whose cameras refer to the pixels that were asked for.
+    """Capture whose cameras refer to the requested pixels.
 
     Args:
         capture: the capture.

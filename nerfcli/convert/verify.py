@@ -24,7 +24,7 @@ _ROUNDINGS = 16 * 2.0**-53
 
 @dataclass(frozen=True)
 class Verification:
-    """How far a written file is from what it was written from.
+    """Differences between a written file and its source.
 
     Args:
         max_px: the largest distance between the two projections of a point.
@@ -55,7 +55,7 @@ class Verification:
 
     @property
     def holds(self) -> bool:
-        """Whether the file says the same as the capture."""
+        """Whether the file agrees with the capture."""
         moved = max(np.radians(self.max_deg), self.max_centre_shift, self.max_point_shift)
         return not self.fault and self.max_px <= self.tolerance_px and moved <= self.tolerance_rad
 
@@ -110,7 +110,7 @@ def verify(capture: Capture, back: ReadBack, *, listed: np.ndarray, tolerance_px
 
 
 def unreadable(capture: Capture, fault: str, *, tolerance_px: float = TOLERANCE_PX) -> Verification:
-    """What is to be said of a file that could not be compared."""
+    """Return the verification of a file that could not be compared."""
     tolerance_rad = tolerance_px / max(frame.camera.focal_px for frame in capture.frames)
     return Verification(np.inf, np.inf, np.inf, np.inf, "", 0, 0, 0, tolerance_px, tolerance_rad, fault)
 
@@ -131,7 +131,7 @@ def verify_points(
 
 
 def listed_order(capture: Capture, format_name: str) -> np.ndarray:
-    """The indices of the frames in the order in which a file of the format lists them, where names do not tell."""
+    """Return the indices of the frames in the order of a file of the format, where names do not determine it."""
     places = range(len(capture.frames))
     if format_name == "llff":
         return np.array(sorted(places, key=lambda index: PurePosixPath(capture.frames[index].name).name))

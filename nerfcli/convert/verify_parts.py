@@ -1,4 +1,4 @@
-"""The proof that a file holds what stands beside cameras and poses: colours, observations, photos, masks, the split."""
+"""Verify content besides cameras and poses: colours, observations, photos, masks, the split."""
 
 import os
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""How a camera moved between two photos: turned only, past something flat, or sideways past things at all distances.
+"""Camera motion between two photos: rotation only, in front of a plane, or with parallax at all depths.
 
 Letters: x and y are the pixels of a match, from the pictures' centres; H a homography, K diag(f, f, 1), R a rotation.
 """
@@ -17,7 +17,7 @@ _FOCAL_TRIALS = np.geomspace(0.7, 1.45, 15)
 
 @dataclass(frozen=True)
 class TwoViews:
-    """How the camera moved.
+    """Camera motion between two photos.
 
     Args:
         homography_share: of the matches that one homography explains within `WITHIN_PX`: near 1 where the camera only
@@ -32,7 +32,7 @@ class TwoViews:
 
     @property
     def flat(self) -> bool:
-        """Whether a homography explains the pair: no depth can be seen in it."""
+        """Whether a homography explains the pair, so that it shows no depth."""
         return self.homography_share >= _EXPLAINS
 
 

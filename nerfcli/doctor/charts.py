@@ -38,7 +38,7 @@ def bars(names: Sequence[str], values: np.ndarray, *, marked: np.ndarray, unit: 
 
 
 def match_matrix(count: int, linked: Sequence[tuple[int, int, int]]) -> str:
-    """A picture of count x count cells whose strength tells the matches of (i, j, matches)."""
+    """Draw a picture of count x count cells whose intensity shows the number of matches of (i, j, matches)."""
     strength = np.zeros((count, count))
     for i, j, matches in linked:
         strength[i, j] = strength[j, i] = min(1.0, np.log2(matches / 16) / 5)

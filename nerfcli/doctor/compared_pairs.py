@@ -1,4 +1,4 @@
-"""What two photos tell together: which points they share, whether the camera moved between them, and what else did.
+"""Compare two photos: matches, camera motion between them, moving objects.
 
 Everything is found at `photos.LONGER_SIDE_PX` without poses. Letters: x and y are the pixels of a match in the first
 and the second photo, F their fundamental matrix, H a homography between them, K the matrix of a camera.
@@ -32,7 +32,7 @@ _LEAST_COMPARED = 12
 
 @dataclass(frozen=True)
 class Pair:
-    """What was found of two photos. Differences are second minus first.
+    """Result of comparing two photos. Differences are second minus first.
 
     Args:
         first, second: numbers of the photos, first < second.
@@ -63,7 +63,7 @@ class Pair:
 
     @property
     def linked(self) -> bool:
-        """Whether the photos certainly show the same things."""
+        """Whether the photos certainly show the same scene."""
         return self.inliers >= LEAST_MATCHES
 
 
@@ -116,7 +116,7 @@ def compare(
 
 
 def focal_px(features: PhotoFeatures, exif: Exif) -> float:
-    """The focal length at the features' size: as EXIF tells it, else as most phones and cameras have it."""
+    """Return the focal length at the size of the features: from EXIF, else a typical value."""
     longer = max(features.size)
     known_px = focal_evidence(exif).focal_px
     return longer * (1.0 if known_px is None else known_px / max(exif.width, exif.height))

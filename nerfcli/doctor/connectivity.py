@@ -1,4 +1,4 @@
-"""Which photos are compared, and whether their matches hold the capture together."""
+"""Choice of pairs to compare, and connectivity of the capture by matches."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -52,7 +52,7 @@ def apart(count: int, pairs: Sequence[Pair]) -> set[int]:
 
 
 def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
-    """Whether all photos hang together by matches, and which do so by little."""
+    """Check whether all photos are connected by matches, and which only weakly."""
     linked = [pair for pair in pairs if pair.linked]
     parts = connected_groups(range(len(photos)), [(pair.first, pair.second) for pair in linked])
     loose = [photo for part in parts[1:] for photo in part]

@@ -1,4 +1,4 @@
-"""How the cameras of a scene stand: how far apart for the depth they see, from which sides, and whether all belong."""
+"""Layout of the cameras of a scene: baseline relative to depth, coverage of directions, outliers."""
 
 import json
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ _GPS_WIDE = 100.0
 
 
 def spread(scene: Scene) -> Finding:
-    """How far apart the cameras are, against the distance of what they see; and cameras far off the others."""
+    """Check the spread of the cameras relative to scene depth, and cameras far from the others."""
     centres = centres_of(scene.frames)
     depths = _depths(scene)
     middle = np.median(centres, axis=0)
@@ -57,7 +57,7 @@ def spread(scene: Scene) -> Finding:
 
 
 def directions(scene: Scene) -> Finding:
-    """From which sides the cameras see the place that they look at."""
+    """Check from which sides the cameras see the scene."""
     up = up_direction(scene.frames)
     east, north = horizontal_axes(up)
     centres, views = centres_of(scene.frames), views_of(scene.frames)
@@ -94,7 +94,7 @@ def directions(scene: Scene) -> Finding:
 
 
 def points(scene: Scene) -> Finding | None:
-    """How many points of the model each photo shows; None where the format does not say."""
+    """Check the number of 3D points per photo; None where the format does not provide it."""
     model = model_folder(scene.root)
     if scene.kind not in ("nerfcli", "colmap") or model is None:
         return None
@@ -113,7 +113,7 @@ def points(scene: Scene) -> Finding | None:
 
 
 def intrinsics(scene: Scene) -> Finding | None:
-    """Whether the photos determined the lens, by the report of `nerfcli poses`; None where there is no such report."""
+    """Check whether the photos determined the intrinsics, by the report of `nerfcli poses`; None without a report."""
     path = scene.root / "poses_report.json"
     if scene.kind != "nerfcli" or not path.is_file():
         return None
@@ -173,7 +173,7 @@ def belongings(scene: Scene) -> list[Finding]:
 
 
 def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
-    """What the photos' GPS says of the place; None without."""
+    """Report the GPS positions of the photos; None without."""
     positions = [photo.exif.gps for photo in photos if photo.exif.gps is not None and photo.exif.gps[:2] != (0.0, 0.0)]
     if not positions:
         return None

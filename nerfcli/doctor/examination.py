@@ -23,7 +23,7 @@ _FEW_APART = 3
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found.
+    """Result of an examination.
 
     Args:
         subject: what was examined.
@@ -61,7 +61,7 @@ def examine(
     progress: Callable[[float, str], None],
     calibration: Calibration | None = None,
 ) -> Diagnosis:
-    """Examine a capture: read every photo once, compare pairs, and judge; with intrinsics, where they are known.
+    """Examine a capture: read every photo once, compare pairs, and run all checks; with intrinsics if given.
 
     Deterministic: the same photos give the same findings.
 
@@ -99,7 +99,7 @@ def compare_all(
     threads: int,
     progress: Callable[[int], None],
 ) -> list[Pair]:
-    """Compare the photos of each place (i, j), in this order; progress is told how many are done."""
+    """Compare the photos of each pair (i, j), in this order; `progress` receives the number done."""
 
     def work(place: tuple[int, int]) -> Pair:
         i, j = place
@@ -131,7 +131,7 @@ def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Seq
 def judged(
     subject: ExaminedCapture, photos: list[PhotoFacts], pairs: list[Pair], *, unreadable: dict[str, str]
 ) -> Diagnosis:
-    """All findings on photos that were read and compared; unreadable tells by name why others could not be read.
+    """Run all checks on photos that were read and compared; `unreadable` gives the reasons for the others, by name.
 
     A check that raises is listed among those that were not made, and the others go on.
     """

@@ -1,4 +1,4 @@
-"""What a check comes to: a number, the threshold that it was held against, a verdict, and what to do."""
+"""Result of a check: a number, its threshold, a verdict, and advice."""
 
 import math
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Whether the camera moved enough for depth to be seen, and whether there is any depth: from pairs, without poses."""
+"""Check from pairs, without poses, whether the camera moved enough for depth, and whether the scene has depth."""
 
 from collections.abc import Sequence
 
@@ -34,7 +34,7 @@ def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
 
 
 def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | None:
-    """Whether the camera moved sideways between the photos, or only turned; None where no pair tells."""
+    """Check whether the camera moved sideways between photos, or only turned; None without usable pairs."""
     largest = baselines(len(photos), pairs)
     known = ~np.isnan(largest)
     if not known.any():
@@ -62,7 +62,7 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
 
 
 def flatness(pairs: Sequence[Pair]) -> Finding | None:
-    """Whether all that is seen is flat; None where too few pairs moved far enough to tell."""
+    """Check whether the scene is flat; None where too few pairs moved far enough."""
     moved = [pair.views for pair in pairs if pair.views is not None and pair.views.baseline_over_depth > _MOVED]
     if len(moved) < _LEAST_PAIRS:
         return None

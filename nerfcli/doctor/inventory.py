@@ -1,4 +1,4 @@
-"""What the files alone tell: which can be read, how many, how large, from which cameras, and which are the same."""
+"""Checks of the files: readability, number, size, cameras, duplicates."""
 
 import math
 from collections import Counter
@@ -27,7 +27,7 @@ _SAME_PIXELS = 0.0003
 
 
 def readable(unreadable: Mapping[str, str], count: int) -> Finding:
-    """Whether the files can be read; count is the number of those that can."""
+    """Check whether the files can be read; `count` is the number of those that can."""
     bad = len(unreadable)
     total = max(bad + count, 1)
     return Finding(
@@ -42,7 +42,7 @@ def readable(unreadable: Mapping[str, str], count: int) -> Finding:
 
 
 def enough(count: int) -> Finding:
-    """Whether there are enough photos for a reconstruction that can be checked."""
+    """Check whether there are enough photos for a reconstruction that can be checked."""
     verdict = verdict_below(count, look=ENOUGH_PHOTOS, bad=FEWEST_PHOTOS)
     advice = {
         GOOD: "",
@@ -60,7 +60,7 @@ def enough(count: int) -> Finding:
 
 
 def size(photos: Sequence[PhotoFacts]) -> Finding:
-    """Whether the photos have enough pixels."""
+    """Check whether the photos have enough pixels."""
     longer = [max(photo.exif.width, photo.exif.height) for photo in photos]
     smallest = min(longer)
     sizes = Counter(f"{photo.exif.width} x {photo.exif.height}" for photo in photos)
@@ -79,7 +79,7 @@ def size(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def cameras(photos: Sequence[PhotoFacts]) -> Finding:
-    """Whether one camera with one lens at one zoom took all photos, as far as EXIF tells."""
+    """Check whether one camera with one lens and zoom took all photos, as far as EXIF shows."""
     groups = _camera_groups(photos)
     largest = max(groups.values(), key=len)
     others = [(name, optics) for optics, names in groups.items() if names is not largest for name in names]
@@ -104,7 +104,7 @@ def cameras(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
-    """Whether the focal length that EXIF tells is that of the files, or of photos before they were cropped."""
+    """Check whether EXIF's focal length is that of the files, or of photos before cropping."""
     found = [(photo, focal_evidence(photo.exif)) for photo in photos]
     doubtful = [(photo.name, evidence.doubt) for photo, evidence in found if evidence.doubt]
     shares = [
@@ -133,7 +133,7 @@ def focal_length(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def orientation(photos: Sequence[PhotoFacts]) -> Finding:
-    """Whether the photos are all upright or all on their side."""
+    """Check whether all photos have the same orientation."""
     portrait = [photo.name for photo in photos if photo.exif.height > photo.exif.width]
     landscape = [photo.name for photo in photos if photo.exif.height < photo.exif.width]
     turned = Counter(photo.exif.orientation for photo in photos)

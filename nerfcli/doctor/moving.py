@@ -1,4 +1,4 @@
-"""What moved between two photos by itself: a patch whose matches agree with each other, but with no camera's motion.
+"""Detect moving objects between two photos: a patch whose matches are consistent, but with no camera motion.
 
 Sought with care, since a false alarm costs more trust than a miss: a patch counts only if its matches move together,
 if hardly any match in it follows the camera, and if no single geometry of two views explains it together with the rest.

@@ -33,7 +33,7 @@ def write_page(diagnosis: Diagnosis, path: Path) -> None:
 
 
 def refuse_foreign(path: Path, capture: Path) -> None:
-    """Raise unless a page of this capture may be written at a path: nothing stands there, or an earlier such page.
+    """Raise unless a page of this capture may be written at a path: it is free, or holds an earlier such page.
 
     Raises:
         UserError: something else stands there.

@@ -1,4 +1,4 @@
-"""What one photo tells by itself. It is read once, and what is kept of it is small: a thousand fit into memory."""
+"""Measurements of a single photo. It is read once, and little of it is kept: a thousand fit into memory."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -84,7 +84,7 @@ class Source:
 def read_all(
     sources: Sequence[Source], *, threads: int, progress: Callable[[int], None]
 ) -> tuple[list[PhotoFacts], dict[str, str]]:
-    """What the photos tell, in their order, and by name why the others cannot be read.
+    """Measure all photos, in their order, and return the reasons for unreadable ones by name.
 
     Args:
         threads: photos that are held at full size at a time.
@@ -104,7 +104,7 @@ def read_all(
 
 
 def read_photo(source: Source, most_features: int) -> PhotoFacts:
-    """What a photo tells, with so many features at most.
+    """Measure one photo, with at most so many features.
 
     Raises:
         UserError: the photo or its mask cannot be read.

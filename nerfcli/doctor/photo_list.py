@@ -1,4 +1,4 @@
-"""What is examined: a folder of photos, or a scene."""
+"""The subject of an examination: a folder of photos, or a scene."""
 
 from dataclasses import dataclass
 from pathlib import Path

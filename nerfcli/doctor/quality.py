@@ -1,4 +1,4 @@
-"""Which photos are blurred, too light or too dark, judged within their capture and by what their neighbours show."""
+"""Check for blur and exposure, relative to the capture and to neighbouring photos."""
 
 from collections.abc import Sequence
 
@@ -46,7 +46,7 @@ def lacking_detail(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> np.nd
 
 
 def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
-    """Photos that are blurred against the others; and whether all of them are."""
+    """Check for photos that are blurred relative to the others, and whether all of them are."""
     own = np.array([photo.sharpness.detail for photo in photos])
     ratios = np.array([photo.sharpness.direction_ratio for photo in photos])
     usual = float(np.median(ratios))
@@ -87,7 +87,7 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
 
 
 def texture(photos: Sequence[PhotoFacts]) -> Finding:
-    """Whether the photos show enough to find again in other photos."""
+    """Check whether the photos have enough features to match."""
     poor = [
         (
             photo.name,
@@ -109,7 +109,7 @@ def texture(photos: Sequence[PhotoFacts]) -> Finding:
 
 
 def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarray, np.ndarray]:
-    """How many stops lighter than the capture's median each photo shows the same places, and how much redder.
+    """Compute how many stops brighter than the median each photo shows the same points, and how much redder.
 
     Returns:
         stops (photos,) and stops of red over blue (photos,); NaN for photos without matches that tell.
@@ -124,7 +124,7 @@ def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarr
 
 
 def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
-    """Whether the same places are about as light in all photos; and what EXIF says of it."""
+    """Check whether the same points are about equally bright in all photos; reports EXIF's exposures."""
     known = ~np.isnan(lighter)
     spread = float(np.ptp(lighter[known])) if known.any() else float("nan")
     settings = [
@@ -163,7 +163,7 @@ def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
 
 
 def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
-    """Whether the same places have the same colour in all photos."""
+    """Check whether the same points have the same colour in all photos."""
     known = ~np.isnan(redder)
     spread = float(np.ptp(redder[known])) if known.any() else float("nan")
     verdict = verdict_above(spread, look=_BALANCE_LOOK, bad=_BALANCE_BAD) if known.any() else GOOD

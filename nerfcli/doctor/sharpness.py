@@ -1,4 +1,4 @@
-"""How sharp a photo is, told so that what it shows matters little.
+"""Sharpness of a photo, nearly independent of its content.
 
 Natural pictures have about as much energy in every octave of detail, whatever they show; blur takes it from the finest
 octaves and leaves the coarse ones. So `detail` compares two neighbouring octaves: near 0 in a sharp photo of anything
@@ -28,7 +28,7 @@ _WINDOW_PX = 12.0
 
 @dataclass(frozen=True)
 class Sharpness:
-    """How sharp a photo is by itself.
+    """Sharpness measures of a photo.
 
     Args:
         detail: log2 of fine against coarse amplitude in the sharpest quarter of the tiles; NaN without texture.

@@ -1,4 +1,4 @@
-"""Whether an object turns, or is moved, before a background that keeps its place in the picture: from pairs."""
+"""Check from pairs whether an object moves in front of a static background."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -42,7 +42,7 @@ SEED = 7
 
 @dataclass(frozen=True)
 class Shape:
-    """What speaks for a shape, over all held-out photos.
+    """Evidence for geometry, over all held-out photos.
 
     Args:
         psnr: of the billboards, mean over the photos, dB.
@@ -175,7 +175,7 @@ def _colours_at(photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def reduction(frame: Frame) -> float:
-    """By how much a view is made smaller for the billboards, 1 at least."""
+    """Return the factor, at least 1, by which a view is reduced for the billboards."""
     return max(1.0, max(frame.camera.width, frame.camera.height) / LONGER_SIDE_PX)
 
 
@@ -228,7 +228,7 @@ class ShapeEvidence:
         self._seconds += time.perf_counter() - began
 
     def shape(self) -> Shape | None:
-        """What speaks for a shape; None where no photo could be compared."""
+        """Return the evidence for geometry; None where no photo could be compared."""
         if not self._pairs or self.failure is not None:
             return None
         pairs = np.array(self._pairs)

@@ -1,4 +1,4 @@
-"""Colour alignment: what a held-out photo's own exposure and white balance cost, told apart from the rest."""
+"""Colour alignment: separate the error of a held-out photo's exposure and white balance from the rest."""
 
 import numpy as np
 

@@ -15,7 +15,7 @@ _TEXTS = {True: "yes", False: "no", None: "not known"}
 
 @dataclass(frozen=True)
 class Entry:
-    """A stage, whether it saw the held-out photos (None where nobody can tell), and how that is known."""
+    """A stage, whether it used the held-out photos (None if unknown), and the source of that information."""
 
     stage: str
     saw_held_out: bool | None
@@ -26,7 +26,7 @@ class Entry:
 
 
 def leak_ledger(config: RunConfig) -> list[Entry]:
-    """The ledger of a run.
+    """Return the ledger of a run.
 
     `config.history` is the provenance of the scene: {"command": "poses", ...} where `nerfcli poses` found the
     cameras.

@@ -1,4 +1,4 @@
-"""How close a rendered picture is to a photo: in dB, in structure, and to the eye of a network.
+"""Similarity of a rendered picture to a photo: PSNR, SSIM.
 
 Colours are sRGB in [0, 1], as float or rounded to 8 bits. Pixels that do not count (masked, or without a ray) are
 left out entirely: of PSNR pixel by pixel, of SSIM with every window that holds one.
@@ -16,7 +16,7 @@ WINDOW = 11
 
 
 def to_8_bit(picture: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1] as they would stand in a PNG: clipped, rounded to the nearest of 256 levels."""
+    """Convert colours in [0, 1] as in a PNG: clipped, rounded to the nearest of 256 levels."""
     return np.round(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""How new a held-out view is: how far, in place and in direction, the nearest training view is from it.
+"""Novelty of held-out views: distance and angle to the nearest training view.
 
 A number measured between training views says how well a field fills gaps; one beyond them says what it knows.
 """
@@ -20,7 +20,7 @@ MOST_TURN = 0.5
 
 @dataclass(frozen=True)
 class Novelty:
-    """Of one held-out view.
+    """Novelty of one held-out view.
 
     Args:
         nearest: name of the training view whose centre is nearest.
@@ -43,7 +43,7 @@ class Novelty:
 
 
 def novelty(held_out: Sequence[Frame], training: Sequence[Frame]) -> list[Novelty]:
-    """How new each held-out view is; `training` holds at least one."""
+    """Compute the novelty of each held-out view; `training` has at least one view."""
     centres = np.array([frame.centre for frame in training])
     radius = float(np.median(np.linalg.norm(centres - focus_point(training), axis=1)))
     spacing = _spacing(centres)

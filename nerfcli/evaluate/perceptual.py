@@ -23,7 +23,7 @@ _ANSWER_SECONDS = 20.0
 
 
 def find_perceptual(notify: Callable[[str], None]) -> Perceptual | None:
-    """The distance, ready to use; None where it cannot be had, with one line that says why.
+    """Load the perceptual distance; None, with one line for the user, if it is not available.
 
     Source: Zhang et al. 2018, The unreasonable effectiveness of deep features as a perceptual metric,
     arXiv:1801.03924; computed by torchmetrics.

@@ -1,4 +1,4 @@
-"""Pose alignment: what the error of a held-out photo's own pose costs, told apart from the field's.
+"""Pose alignment: separate the error of a held-out photo's pose from that of the field.
 
 The pose is refined on the left half of the photo, with the field held, and the picture is measured on the right half,
 which the refinement did not see.

@@ -1,4 +1,4 @@
-"""What was compared, as files that other programs can measure, in the layout that nerfbaselines has.
+"""Save compared pictures in the layout of nerfbaselines, for evaluation with other programs.
 
 predictions/color/NAME.png         the rendered picture, 8 bit sRGB
 predictions/gt-color/NAME.png      the photo as it was compared: upright, averaged to the size of the training
@@ -42,7 +42,7 @@ def save_unrounded(folder: Path, stem: str, compared: Compared) -> None:
 
 
 def predictions_are_there(folder: Path, kind: str, *, checkpoint: str) -> bool:
-    """Whether predictions of this checkpoint have been saved, unrounded ones included where `kind` is "float"."""
+    """Return whether predictions of this checkpoint are saved, including unrounded ones if `kind` is "float"."""
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
     except (OSError, ValueError):

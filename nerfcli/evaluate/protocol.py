@@ -49,7 +49,7 @@ class HeldOutPhoto:
 
 @dataclass(frozen=True)
 class Compared:
-    """What was compared: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and which pixels count (H, W).
+    """A compared pair: rendered (H, W, 3) float sRGB, the photo (H, W, 3) uint8, and the mask of counted pixels (H, W).
 
     on_white: whether the photo has alpha and stands on white. The colour correction leaves saturated pixels out and
     would carry white anywhere, so there is none.
@@ -64,7 +64,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Extras:
-    """What is measured besides.
+    """Optional measurements.
 
     Args:
         training: the training views, to tell how new the held-out ones are.
@@ -88,7 +88,7 @@ def evaluate_model(
     on_image: Callable[[int, int], None],
     extras: Extras = Extras(),
 ) -> dict[str, Any]:
-    """How close the model comes to every held-out photo, the means, and the render time beside them.
+    """Compare the model with every held-out photo: metrics per photo, means, and render time.
 
     Per photo: psnr, ssim and lpips of the 8-bit picture; psnr_float and ssim_float of the picture before rounding;
     *_colour_aligned after `colour.colour_aligned`; with `align_poses`, *_pose_aligned and *_right_half: the right half

@@ -1,4 +1,4 @@
-"""What a run has to reach: psnr>=25,registered>=0.9."""
+"""Requirements on the metrics of a run: psnr>=25,registered>=0.9."""
 
 import operator
 import re
@@ -29,7 +29,7 @@ class Requirement:
         return f"{self.name}{self.comparison}{self.bound:g}"
 
     def is_met(self, value: float | None) -> bool:
-        """Whether a number fulfils it; one that is not known does not."""
+        """Return whether a number meets the requirement; an unknown one does not."""
         return value is not None and bool(_COMPARISONS[self.comparison](value, self.bound))
 
 
@@ -63,7 +63,7 @@ def known_numbers(metrics: Mapping[str, Any], config: RunConfig) -> dict[str, fl
 
 
 def unmet(requirements: Sequence[Requirement], numbers: Mapping[str, float | None]) -> list[str]:
-    """What is not met, and what was found instead, in words."""
+    """List the requirements that are not met, with the values found."""
     failures = []
     for requirement in requirements:
         value = numbers.get(requirement.name)

@@ -1,4 +1,4 @@
-"""Random pixels of held-out photos: an estimate of what `evaluate` tells of whole photos, at little cost."""
+"""Evaluation on random pixels of held-out photos: a cheap estimate of `evaluate` on whole photos."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class SampledPixels:
         return SampledPixels(tuple(photos), tuple(chosen))
 
     def protocol(self) -> str:
-        """How `psnr` measures, in words."""
+        """Description of the measurement."""
         sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in self.photos})
         return (
             f"{PROTOCOL}, sampled: {sum(map(len, self.pixels))} random pixels of {len(self.photos)} held-out photos at "
@@ -64,7 +64,7 @@ class SampledPixels:
 
 
 def background_of(model: Model, photo: HeldOutPhoto) -> Background:
-    """What is behind the field where a photo is compared with it."""
+    """Return the background to compare with a photo."""
     return WHITE if photo.pixels.shape[-1] == 4 else model.background
 
 

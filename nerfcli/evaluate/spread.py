@@ -1,4 +1,4 @@
-"""How much numbers of the same training differ from seed to seed: what a difference has to exceed to mean anything."""
+"""Spread of metrics over seeds: the size that a difference must exceed to be significant."""
 
 import statistics
 from collections.abc import Mapping, Sequence

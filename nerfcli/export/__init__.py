@@ -1,1 +1,1 @@
-"""Rendered frames as files: what is asked for, one frame's files, the walk over all frames, videos."""
+"""Write rendered frames to files: settings, files of one frame, all frames, videos."""

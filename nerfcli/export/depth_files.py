@@ -1,4 +1,4 @@
-"""What is measured of a picture, in files of any format: depth, spread, disagreement, each with its meaning.
+"""Depth, spread and disagreement of a picture in files of any format, each with its definition.
 
 TIFF, NPY and 16-bit PNG hold one map each; OpenEXR and NPZ hold all that was asked for of a picture, and its opacity.
 16-bit levels are made last, from the floats, because all frames share the length of a level.
@@ -29,7 +29,7 @@ _AXES_OF_VIEW = "OpenCV: +x right, +y down, +z forward; the top-left pixel's cen
 
 
 def map_path(folder: Path, output: str, name: str, file_format: str) -> Path:
-    """Where a map of a picture stands."""
+    """Return the path of a map of a picture."""
     match file_format:
         case "exr" | "npz":
             return with_suffix(folder / file_format / name, f".{file_format}")
@@ -42,7 +42,7 @@ def map_path(folder: Path, output: str, name: str, file_format: str) -> Path:
 def frame_meta(
     meta: DepthMeta, frame: Frame, *, provenance: Mapping[str, Any], error_bounds: Mapping[str, Any]
 ) -> DepthMeta:
-    """The meaning of one frame's depth: `meta` with its camera, its origin and what rendering says of its own error."""
+    """Return the description of one frame's depth: `meta` with camera, origin and rendering error."""
     view = {
         "name": frame.name,
         "camera": frame.camera.to_json(),
@@ -55,7 +55,7 @@ def frame_meta(
 def write_maps(
     picture: RenderedPicture, folder: Path, name: str, *, settings: ExportSettings, meta: DepthMeta
 ) -> list[Path]:
-    """Write what is measured of a picture in the float formats that `settings` asks for; each file atomically.
+    """Write the maps of a picture in the float formats of `settings`; each file atomically.
 
     Args:
         picture: with depth.
@@ -122,7 +122,7 @@ def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Levels:
-    """What `write_levels` did: the length of a level, and how many pixels of all frames lie beyond the last one."""
+    """Result of `write_levels`: the length of a level, and how many pixels of all frames exceed the last one."""
 
     units_per_level: float
     pixels_beyond: int

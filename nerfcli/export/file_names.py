@@ -1,4 +1,4 @@
-"""What the files of an export are called."""
+"""File names of an export."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ def file_names(frames: Sequence[Frame]) -> list[str]:
 
 
 def describe_frames(frames: Sequence[Frame]) -> list[dict[str, Any]]:
-    """The files, cameras and poses of the pictures, as they stand in render.json."""
+    """Return files, cameras and poses of the pictures, as stored in render.json."""
     return [
         {"file": name, "camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
         for frame, name in zip(frames, file_names(frames), strict=True)
@@ -29,5 +29,5 @@ def describe_frames(frames: Sequence[Frame]) -> list[dict[str, Any]]:
 
 
 def with_suffix(stem: Path, suffix: str) -> Path:
-    """The name with a suffix added; one that it has already stays, as it tells a.jpg from a.png."""
+    """Add a suffix to a name; an existing suffix is kept, since it distinguishes a.jpg from a.png."""
     return stem.with_name(stem.name + suffix)

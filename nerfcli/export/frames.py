@@ -25,7 +25,7 @@ MOST_PROCESSES = 4
 
 @dataclass(frozen=True)
 class Workers:
-    """Who renders.
+    """Number of processes and threads to render with.
 
     Args:
         jobs: processes that each take a frame at a time; 1 renders in this process.

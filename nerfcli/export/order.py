@@ -1,4 +1,4 @@
-"""An order: which views, what of them, from which field; and whether a folder holds what was ordered."""
+"""An order: which views of which field to render; and whether a folder already holds the result."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ _IN_WORDS = {"colour_map": "colours", "colour_range": "range of colours", "level
 
 @dataclass(frozen=True)
 class Order:
-    """What is to be rendered and written.
+    """Views, settings and provenance of a rendering job.
 
     Args:
         frames: cameras and poses in the scene's frame.
@@ -35,7 +35,7 @@ class Order:
 
     @cached_property
     def names(self) -> list[str]:
-        """Of the files of each frame, without suffix."""
+        """File names of the frames, without suffix."""
         return file_names(self.frames)
 
     def of_pictures(self) -> dict[str, Any]:
@@ -80,7 +80,7 @@ class Order:
             )
 
     def is_held_by(self, folder: Path) -> bool:
-        """Whether the finished folder holds this order, pictures and presentation.
+        """Return whether the finished folder holds this order, pictures and presentation.
 
         False, too, where it holds the same pictures and nothing that would be replaced: videos are added.
 
@@ -115,7 +115,7 @@ class Order:
         )
 
     def shares_pictures_with(self, folder: Path) -> bool:
-        """Whether a finished folder holds the same pictures, and only previews, 16-bit files or videos differ."""
+        """Return whether a finished folder holds the same pictures, with other previews, 16-bit files or videos."""
         try:
             made = _made(folder)
         except UserError:  # a description that is damaged says nothing; all is rendered again

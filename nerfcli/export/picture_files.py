@@ -25,7 +25,7 @@ def write_picture(
     meta: DepthMeta,
     background: Background,
 ) -> list[Path]:
-    """Write what `settings` asks for; each file atomically.
+    """Write the outputs of one picture; each file atomically.
 
     Args:
         picture: what was rendered; rgb with straight alpha or without.

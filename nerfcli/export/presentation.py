@@ -1,4 +1,4 @@
-"""What needs all frames of an order: previews on one range of colours, and videos."""
+"""Outputs that need all frames of an order: previews with a common range of colours, and videos."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence

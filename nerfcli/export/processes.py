@@ -1,4 +1,4 @@
-"""Frames over processes: each renders a frame at a time; one that dies is told, and its frame is rendered again."""
+"""Distribute frames over processes, one frame at a time; a crashed process is reported and its frame rendered again."""
 
 import multiprocessing
 import signal

@@ -1,4 +1,4 @@
-"""What an export shall hold: which pictures, in which files, and which videos of them."""
+"""Settings of an export: outputs, file formats, videos."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -22,7 +22,7 @@ DIRECTIONS = ("forward", "reverse", "ping-pong")
 
 @dataclass(frozen=True)
 class VideoSettings:
-    """Which videos to make of the pictures.
+    """Settings of the videos.
 
     Args:
         formats: some of `media.video.FORMATS`; a video in each.
@@ -43,7 +43,7 @@ class VideoSettings:
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """What to write.
+    """Settings of an export.
 
     Args:
         outputs: some of `OUTPUTS`.
@@ -79,7 +79,7 @@ class ExportSettings:
 
     @property
     def folders_of_formats(self) -> tuple[str, ...]:
-        """The folders of files that hold all that was asked for of a view, and of levels."""
+        """Folders of files that hold all requested outputs of a view, and of 16-bit levels."""
         if not self.measured:
             return ()
         together = [name for name in self.float_formats if name in TOGETHER]
@@ -87,7 +87,7 @@ class ExportSettings:
 
     @property
     def in_levels(self) -> bool:
-        """Whether depth is written in 16-bit levels too."""
+        """Whether depth is also written as 16-bit levels."""
         return "png16" in self.formats and "depth" in self.outputs
 
     def of_pictures(self) -> dict[str, Any]:

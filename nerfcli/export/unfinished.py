@@ -1,4 +1,4 @@
-"""The folder of an order that is not complete yet: it stays when the command ends early, and the next one goes on.
+"""Folder of an incomplete order: it stays when the command ends early, and the next one continues it.
 
     .NAME.unfinished-DIGEST/           beside the folder NAME that it will become; DIGEST tells orders apart
         rgb/...  depth/...             files, each atomic
@@ -43,7 +43,7 @@ class Unfinished:
         write_json(self._path(name), {"files": digests, "facts": facts, "note": _digest_of_note(digests, facts)})
 
     def has(self, name: str) -> bool:
-        """Whether a frame is complete, and nothing of it is damaged."""
+        """Return whether a frame is complete and undamaged."""
         try:
             note = json.loads(self._path(name).read_text(encoding="utf-8"))
             return note["note"] == _digest_of_note(note["files"], note["facts"]) and all(
@@ -53,7 +53,7 @@ class Unfinished:
             return False  # it is rendered again
 
     def facts(self, name: str) -> dict[str, Any]:
-        """What `note` was told about a frame."""
+        """Return the facts that `note` stored for a frame."""
         return json.loads(self._path(name).read_text(encoding="utf-8"))["facts"]
 
     def files(self, name: str) -> dict[str, str]:
@@ -66,7 +66,7 @@ class Unfinished:
         return self.folder / _NOTES / "lock"
 
     def finish(self, folder: Path) -> None:
-        """Put the folder in its place; one that stands there is replaced in this step.
+        """Move the folder to its final place, replacing an existing one in the same step.
 
         Raises:
             UserError: it cannot be moved.

@@ -1,4 +1,4 @@
-"""What is infinitely far, beyond all that the field holds: a colour by direction."""
+"""Background beyond the field: a colour by direction."""
 
 import torch
 from torch import Tensor, nn

@@ -35,7 +35,7 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], description: dict[str, 
 
 
 def load_tensors(path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What `save_tensors` wrote, on `device`.
+    """Load tensors that `save_tensors` wrote, on `device`.
 
     Raises:
         UserError: the file is missing, cut short, damaged, or not one of ours.

@@ -50,7 +50,7 @@ def described_cost(
 
 
 def others_of_equal_storage(settings: FieldSettings, footprint: float) -> dict[str, FieldSettings]:
-    """By kind, the fields of the other kinds that come nearest to the bytes of this one; none where all are larger."""
+    """Return, by type, the other fields closest in bytes to this one; none where all are larger."""
     memory = parameter_bytes(work(settings).parameters)
     template = HashFieldSettings(contraction=settings.contraction, view_degree=settings.view_degree)
     others = {}

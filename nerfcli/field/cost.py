@@ -40,7 +40,7 @@ def field_bytes(field: nn.Module) -> int:
 
 @dataclass(frozen=True)
 class Work:
-    """What asking a field costs, per sample, forward.
+    """Cost of querying a field, per sample, forward.
 
     Operations are multiplications and additions of products and interpolations; activations, sines, harmonics and
     index arithmetic are left out. Bytes moved are those of the rows that a sample reads, each once; of a network

@@ -12,7 +12,7 @@ _SRGB_BORDER, _LINEAR_BORDER = 0.04045, 0.0031308
 
 
 def linear_from_srgb(levels: Tensor) -> Tensor:
-    """Linear light of sRGB levels >= 0; levels above 1 go on along the curve. Differentiable."""
+    """Convert sRGB levels >= 0 to linear light; levels above 1 continue along the curve. Differentiable."""
     curved = ((levels.clamp_min(_SRGB_BORDER) + 0.055) / 1.055) ** 2.4
     return torch.where(levels <= _SRGB_BORDER, levels / 12.92, curved)
 

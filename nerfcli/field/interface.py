@@ -1,4 +1,4 @@
-"""What training, rendering and checkpoints ask of a field, whatever it is made of."""
+"""Interface of a field of any type, as training, rendering and checkpoints use it."""
 
 import abc
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from nerfcli import kernels
 
 @dataclass(frozen=True)
 class FieldSettings(abc.ABC):
-    """What makes two fields of one kind have the same shape: all that a checkpoint needs besides the numbers.
+    """Settings that determine the shapes of a field: all that a checkpoint needs besides the tensors.
 
     Args:
         contraction: how space becomes the unit cube, one of `kernels.CONTRACTIONS`.
@@ -45,7 +45,7 @@ class Field(nn.Module, abc.ABC):
 
     @property
     def backend(self) -> kernels.Backend:
-        """Who computes with this field: chosen when first asked for, again after a move to another device or type."""
+        """Backend of this field, chosen on first use and again after a move to another device or type."""
         if self._backend is None:
             some = next(self.parameters())
             self._backend = kernels.backend_for(some.device, some.dtype)
@@ -74,7 +74,7 @@ class Field(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def medium(self, detail: float = 1.0) -> kernels.HashGrid | kernels.Medium:
-        """What backends render.
+        """Medium that backends render.
 
         Args:
             detail: the share of a training's budget whose details are in it; 1 for all, below 0 for fewer than at

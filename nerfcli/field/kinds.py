@@ -25,7 +25,7 @@ def fresh_field(settings: FieldSettings) -> Field:
 
 
 def settings_from_json(content: dict[str, Any]) -> FieldSettings:
-    """What `FieldSettings.to_json` gave; before there were kinds, all fields were hash grids.
+    """Read settings from `FieldSettings.to_json`; without a type, they are of a hash grid.
 
     Raises:
         UserError: the kind is not known here.

@@ -1,4 +1,4 @@
-"""How large a field is made: from how fine the photos are, and the memory it may take."""
+"""Size of a field: from the resolution of the photos and the memory limit."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -70,7 +70,9 @@ def chosen_size(
 
 
 def cells_of_footprint(footprint: float, contraction: str) -> float:
-    """How many cells along the cube's side are as wide as a pixel's footprint; see `kernels.grid_coordinates`."""
+    """Return the number of cells along the cube's side that are as wide as a pixel's footprint; see
+    `kernels.grid_coordinates`.
+    """
     return (2.0 if contraction == "none" else 4.0) / footprint
 
 

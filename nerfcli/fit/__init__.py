@@ -1,1 +1,1 @@
-"""The step of a training, and its parts: losses, optimiser, cameras that learn, space, known depth."""
+"""The training step and its parts: losses, optimizer, learned cameras, extent, point depth."""

@@ -64,11 +64,11 @@ class Adam:
         )
 
     def state(self, prefix: str) -> dict[str, Tensor]:
-        """What `restore` needs, by names that begin with `prefix`."""
+        """Return the state for `restore`, with names that begin with `prefix`."""
         return {f"{prefix}.{i}.{name}": value for i, entry in enumerate(self._state) for name, value in entry.items()}
 
     def restore(self, tensors: dict[str, Tensor], prefix: str) -> None:
-        """Take up what `state` gave; other tensors may stand beside it. What is not there has not been stepped."""
+        """Restore the state from `state`; other tensors are ignored. Parameters without state have not been stepped."""
         for index, entry in enumerate(self._state):
             for name, value in entry.items():
                 known = tensors.get(f"{prefix}.{index}.{name}")

@@ -1,4 +1,4 @@
-"""Where photos are explained worst, block by block, so that more of their pixels are drawn."""
+"""Error map: the training error of blocks of pixels, used to sample more pixels where it is large."""
 
 import torch
 from torch import Tensor

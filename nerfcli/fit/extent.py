@@ -1,4 +1,4 @@
-"""What of space a field covers, and how: chosen for a scene before anything is learned."""
+"""Extent of the field: the covered part of space and its contraction, chosen before training."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,7 +20,7 @@ _IN_WORDS = {"none": "bounded scene", "l2": "unbounded scene", "linf": "unbounde
 
 @dataclass(frozen=True)
 class Extent:
-    """Where a field lives.
+    """Extent of a field.
 
     Args:
         contraction: one of `kernels.CONTRACTIONS`.
@@ -64,8 +64,8 @@ class Extent:
 
 
 def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> bool:
-    """Whether nothing tells how far away surfaces are, and a field with these settings has to know: then points have to
-    be found first.
+    """Return whether the scene gives no depth although these settings need it, so that points must be triangulated
+    first.
 
     Args:
         scene: cameras, and points or depth bounds where it has them.
@@ -78,7 +78,7 @@ def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> 
 
 
 def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> Extent:
-    """The extent that the settings ask for.
+    """Choose the extent for the settings.
 
     Args:
         scene: cameras, and points or depth bounds; see `lacks_depth`.

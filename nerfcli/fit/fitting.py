@@ -45,7 +45,7 @@ DETAILED_STEPS = 2500
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one step did: its loss, and how many samples and rays it took."""
+    """Result of one step: its loss, and the number of samples and rays."""
 
     loss: float
     samples: int
@@ -214,8 +214,9 @@ class Fitting:
 
     @torch.no_grad()
     def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
-        """What the model says of pixels now, in steps as it learns in, and what the photos say; both (N, 3) sRGB, alpha
-        on white."""
+        """Render pixels at the current step length: the model's and the photos' colours, both (N, 3) sRGB, alpha on
+        white.
+        """
         drawn = self.parts.refined(drawn)
         behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)
         edges = self.edges[:: self._stride(self.furthest)].contiguous()
@@ -287,7 +288,7 @@ class Fitting:
             raise NonFiniteError
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Everything that `restore` needs to go on bit for bit."""
+        """Return everything that `restore` needs to continue bit for bit."""
         tensors = {
             **{f"field.{name}": tensor for name, tensor in self.field.state_dict().items()},
             "generator": self.generator.get_state(),

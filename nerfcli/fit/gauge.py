@@ -1,4 +1,4 @@
-"""What refined cameras may not do together: turn, move and grow as a whole, which no photo of theirs can tell.
+"""Gauge freedom of refined cameras: keep their common rotation, translation and scale fixed.
 
 A field that turns with its cameras looks the same from all of them. Cameras that were not refined, those of held-out
 photos, would be left behind: the similarity that is in the mean of all corrections is taken out of them.

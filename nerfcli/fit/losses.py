@@ -1,4 +1,4 @@
-"""What training minimises."""
+"""Losses of the training."""
 
 import torch
 from torch import Tensor

@@ -47,14 +47,14 @@ class FieldOptimiser:
             )
 
     def state(self) -> dict[str, Tensor]:
-        """What `restore` needs; the field's own numbers are not in it."""
+        """Return the state for `restore`, without the field's own tensors."""
         tensors: dict[str, Tensor] = {}
         if self._first is not None and self._second is not None:
             tensors |= {"table_first": self._first, "table_second": self._second}
         return tensors | self._adam.state("adam")
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Take up what `state` gave; other tensors may stand beside it."""
+        """Restore the state from `state`; other tensors are ignored."""
         if self._first is not None:
             self._first, self._second = tensors["table_first"], tensors["table_second"]
         if self.sink is not None:
@@ -83,13 +83,13 @@ class PartsOptimiser:
             adam.step(rate * multiple)
 
     def state(self) -> dict[str, Tensor]:
-        """What `restore` needs; the parts' own numbers are not in it."""
+        """Return the state for `restore`, without the parts' own tensors."""
         tensors: dict[str, Tensor] = {}
         for number, (adam, _) in enumerate(self._groups):
             tensors |= adam.state(f"parts_adam.{number}")
         return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Take up what `state` gave; other tensors may stand beside it."""
+        """Restore the state from `state`; other tensors are ignored."""
         for number, (adam, _) in enumerate(self._groups):
             adam.restore(tensors, f"parts_adam.{number}")

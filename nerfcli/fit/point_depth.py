@@ -1,4 +1,4 @@
-"""Depth that is known before training: points that several photos saw, in each of them."""
+"""Depth supervision: 3D points seen by several photos."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ HALF_ERROR_PX = 1.0
 
 @dataclass(frozen=True)
 class PointDepths:
-    """Pixels whose surface is known: M of them.
+    """Pixels at known distances: M of them.
 
     Args:
         numbers: (M,) int64, pixels of the pool.
@@ -34,7 +34,7 @@ class PointDepths:
     trust: Tensor
 
     def among(self, pool: PixelPool) -> "PointDepths":
-        """Those at usable pixels of a pool."""
+        """Select the pixels that are usable in a pool."""
         usable = pool.is_usable(self.numbers)
         return PointDepths(self.numbers[usable], self.distances[usable], self.trust[usable])
 
@@ -45,7 +45,7 @@ class PointDepths:
 
 
 class PointRays:
-    """Known pixels among those that a step draws.
+    """Pixels at known distances that are added to each step.
 
     Args:
         known: the pixels.
@@ -57,7 +57,7 @@ class PointRays:
         self._pool = pool
 
     def added_to(self, drawn: Drawn, generator: torch.Generator) -> Drawn:
-        """The pixels drawn, and known ones behind them. Their colours count like all others."""
+        """Append pixels at known distances to the sampled ones. Their colours count like all others."""
         chosen = self.known.draw(max(1, len(drawn.numbers) // PIXELS_PER_POINT), generator)
         both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
         weights = drawn.weights
@@ -67,7 +67,7 @@ class PointRays:
 
 
 def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
-    """Where points that photos agree on are seen, at usable pixels; none where nothing is known.
+    """Project triangulated points to usable pixels; empty if there are none.
 
     trust = 1 / (1 + (miss / 1 px)^2), in pixels of the training photos
 
@@ -101,7 +101,9 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
 
 
 def fading(share: float) -> float:
-    """How much the points count at a share of the budget: 1 at the start, 0 from `LAST_SHARE` on, a line between."""
+    """Return the weight of the points at a fraction of the budget: 1 at the start, 0 from `LAST_SHARE` on, linear
+    between.
+    """
     return max(0.0, 1.0 - share / LAST_SHARE)
 
 

@@ -41,7 +41,7 @@ HOLDING_SHARES, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
 
 
 def rate_at(share: float) -> float:
-    """The rate of cameras at a share of the budget, in [0, 1]: a line up, then level, then an exponential down."""
+    """Return the learning rate of cameras at a fraction of the budget: linear warm-up, constant, exponential decay."""
     if not FIRST_SHARE < share < LAST_SHARE:
         return 0.0
     if share < FULL_SHARE:

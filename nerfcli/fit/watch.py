@@ -1,4 +1,4 @@
-"""Who looks at the tensors of a training step: nobody, or one that remembers the first that is not finite."""
+"""Observers of the tensors of a training step: none, or one that records the first non-finite tensor."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class NonFiniteError(Exception):
 
 
 class Watch(Protocol):
-    """What a step shows its tensors to, in the order in which they come to be."""
+    """Observer that receives the tensors of a step in the order of computation."""
 
     def state(self, give: Callable[[], tuple[dict[str, Tensor], Any]]) -> None:
         """Look at the state between two steps, which `give` collects."""
@@ -42,7 +42,7 @@ class Watch(Protocol):
 
 
 class Unwatched:
-    """Nobody looks: no time is spent."""
+    """Null object: records nothing, costs nothing."""
 
     def state(self, give: Callable[[], tuple[dict[str, Tensor], Any]]) -> None:
         pass
@@ -91,7 +91,7 @@ def that_must_be_finite(state: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def is_finite(tensor: Tensor) -> bool:
-    """Whether every number of a tensor is finite; without a temporary of its size."""
+    """Return whether all values of a tensor are finite, without a temporary of its size."""
     if tensor.numel() == 0 or not tensor.is_floating_point():
         return True
     smallest, largest = tensor.detach().aminmax()

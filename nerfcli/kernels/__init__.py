@@ -81,7 +81,7 @@ def backend_for(device: torch.device, dtype: torch.dtype, *, wanted: str = "auto
 
 
 def has_compiled() -> bool:
-    """Whether the compiled CPU kernels work here."""
+    """Return whether the compiled CPU kernels work on this machine."""
     return _numba_cpu() is not None
 
 

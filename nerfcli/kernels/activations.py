@@ -1,4 +1,4 @@
-"""From what a network puts out to what the volume integral takes, and from optical depth to opacity."""
+"""Activations: from network outputs to density and colour, and from optical depth to opacity."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Whole operations on rays, composed of single ones on their samples: what backends of separate kernels share."""
+"""Ray operations composed of per-sample kernels, shared by backends with separate kernels."""
 
 import abc
 import math

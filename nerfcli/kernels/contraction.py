@@ -1,4 +1,4 @@
-"""How space becomes the unit cube that holds the field's grids: as it is, or with all that is far away drawn near.
+"""Contraction of space to the unit cube of the field's grids: none, or with distant space mapped inside.
 
     none    the cube [-1, 1]^3 of the training frame is all there is
     l2      the unit ball stays as it is, all beyond it goes into the ball of radius 2
@@ -80,7 +80,7 @@ def grid_coordinates(points: Tensor, contraction: str) -> Tensor:
 
 
 def cube_widths(points: Tensor, widths: Tensor, contraction: str) -> Tensor:
-    """How wide what a pixel sees at some points is, in coordinates of the cube of `grid_coordinates`.
+    """Compute the width of a pixel's footprint at points, in coordinates of the cube of `grid_coordinates`.
 
     The stretch across the line from the centre: 1/2 without contraction, else 1/4 of (2 - 1/m) / m with m the norm of
     the contraction, at least 1. What is far away is seen along that line.

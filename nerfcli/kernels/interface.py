@@ -1,4 +1,4 @@
-"""What a backend takes and gives. Above this line of the program a ray is the smallest thing; below it, a sample is.
+"""Interface of backends: everything above works per ray, everything inside per sample.
 
 Letters: rays R; samples N of all rays together, packed ray after ray; `offsets` (R + 1,) int64, so that ray r owns
 samples offsets[r] up to offsets[r + 1]; intervals S of a ray; cells G along a side of the occupancy grid; table levels
@@ -34,7 +34,7 @@ class Rays(NamedTuple):
 
 
 class March(NamedTuple):
-    """Where rays are sampled.
+    """Sampling of rays.
 
     Args:
         edges: (S + 2,) increasing distances, shared by the rays, for S intervals: ray r is cut at
@@ -69,7 +69,7 @@ class HashGrid(NamedTuple):
 
 
 class Medium(Protocol):
-    """Any other radiance field, which says itself what it is at points."""
+    """A radiance field of another type, evaluated by its own code."""
 
     def density(self, coordinates: Tensor) -> Tensor:
         """Density (N,) in 1 / training unit at coordinates (N, 3) of the unit cube."""
@@ -87,7 +87,7 @@ class Medium(Protocol):
 
 
 class Targets(NamedTuple):
-    """What a training measures of rays besides their colours.
+    """Additional losses of a training besides colours.
 
     Args:
         near_scaling: whether gradients of samples at distance t < 1 are multiplied by t^2, see `scale_gradients`.
@@ -101,7 +101,7 @@ class Targets(NamedTuple):
 
 
 class RaySums(NamedTuple):
-    """What R rays of a training sum up.
+    """Sums over the samples of R training rays.
 
     Args:
         rgb: (R, 3) sRGB on the background.
@@ -119,7 +119,7 @@ class RaySums(NamedTuple):
 
 
 class LightEnds(NamedTuple):
-    """Where light ends along each of R rays; see `light_ends`."""
+    """Distribution of absorption along each of R rays; see `light_ends`."""
 
     opacity: Tensor
     transmittance: Tensor
@@ -140,7 +140,7 @@ class Intervals(NamedTuple):
 
 
 class RaysSeen(NamedTuple):
-    """What R rays of a picture saw.
+    """Rendered values of R rays.
 
     Args:
         rgb: (R, 3) sRGB on the background.
@@ -209,7 +209,7 @@ class Backend(Protocol):
     def deterministic(self) -> bool: ...
 
     def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
-        """Why tensors of this kind cannot be worked on; None if they can."""
+        """Return why tensors of this kind are not supported; None if they are."""
         ...
 
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
@@ -227,7 +227,7 @@ class Backend(Protocol):
         sink: Tensor | None = None,
         trace: Trace | None = None,
     ) -> RaySums:
-        """What a training needs of rays.
+        """Render rays for training, with gradients.
 
         Args:
             background: (R, 3) sRGB, without gradient.
@@ -249,7 +249,7 @@ class Backend(Protocol):
         shares: tuple[float, ...] = (),
         negligible: float = 0.0,
     ) -> RaysSeen:
-        """What a picture needs of rays, without gradients.
+        """Render rays for pictures, without gradients.
 
         Args:
             background: (R, 3) or (3,) sRGB.
@@ -259,7 +259,7 @@ class Backend(Protocol):
         ...
 
     def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, share: float) -> Tensor:
-        """(R / rays_per_pixel,) the distance by which a share of all light of groups of rays has ended."""
+        """Return (R / rays_per_pixel,) the distance by which a fraction of the light of groups of rays is absorbed."""
         ...
 
     def density(self, coordinates: Tensor, medium: HashGrid | Medium) -> Tensor:

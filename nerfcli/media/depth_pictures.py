@@ -1,4 +1,4 @@
-"""What the numbers of a depth map mean, in a form that travels with every file and can be read back.
+"""Definition of the values of a depth map, stored in every file and read back.
 
 A depth map without its convention is a riddle: along the ray or along the optical axis, in which unit, a mean or a
 median, and what stands where nothing was hit. Two files whose answers differ do not belong into one folder, one video
@@ -41,7 +41,7 @@ _WHAT_MUST_AGREE = (
 
 @dataclass(frozen=True)
 class DepthMeta:
-    """What the numbers of a map mean, and where they come from.
+    """Definition and provenance of the values of a map.
 
     Args:
         convention: which depth of the ray's distribution: "conditional", "median", "quantile:0.05", ...; for other
@@ -112,7 +112,7 @@ class DepthMeta:
 
     @classmethod
     def from_json(cls, entries: Any) -> Self:
-        """What `to_json` gave; files of earlier versions have fewer entries.
+        """Read the content that `to_json` returned; files of earlier versions have fewer entries.
 
         Raises:
             ValueError: the entries are not those of a depth map.
@@ -133,7 +133,9 @@ class DepthMeta:
 
 
 def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:
-    """In what two maps differ that must not be mixed: "convention median and conditional"; None where they agree."""
+    """Describe how two maps differ if they must not be mixed: "convention median and conditional"; None if they
+    agree.
+    """
     for name in _WHAT_MUST_AGREE:
         a, b = getattr(one, name), getattr(other, name)
         if a != b:

@@ -1,4 +1,4 @@
-"""What a file says about the depth in it, whatever its format: the description alone, without the pixels."""
+"""Read the description of depth from a file of any format, without the pixels."""
 
 import io
 import struct

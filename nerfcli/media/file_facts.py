@@ -1,4 +1,4 @@
-"""What is known about a file of depth, a picture or a video: its own description, its size, the range of its numbers.
+"""Facts about a depth, picture or video file: its description, size, and range of values.
 
 A file of another program is told as what it is: numbers whose convention nobody states.
 """

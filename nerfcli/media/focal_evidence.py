@@ -1,4 +1,4 @@
-"""What EXIF says of a photo's focal length in pixels, and whether that still holds for the file.
+"""Focal length from EXIF, in pixels, and whether it applies to the file.
 
 EXIF describes the picture as the camera took it. A program that crops or resizes the photo usually copies EXIF, so the
 size that it records is compared with the file's. Resizing keeps the focal length relative to the picture; cropping
@@ -44,7 +44,7 @@ class FocalEvidence:
 
 
 def focal_evidence(exif: Exif) -> FocalEvidence:
-    """The focal length of a photo by its EXIF, and whether it holds for the file as it is.
+    """Return the focal length of a photo from EXIF, and whether it applies to the file as it is.
 
     From the 35 mm equivalent, by the diagonal; without one, from the focal length and the sensor's resolution. The
     latter counts the pixels of the recorded size, whatever size the file has now.

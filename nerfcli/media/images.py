@@ -53,7 +53,7 @@ _SAME_COLOUR_LEVELS = 2
 
 @dataclass(frozen=True)
 class Exif:
-    """What the camera wrote beside the pixels; None where it wrote nothing, or nothing that makes sense.
+    """EXIF data of a photo; None where it is missing or implausible.
 
     focal_35mm is the equivalent focal length on 36 x 24 mm film. orientation is 1...8, 1 where absent.
     width and height are those of the upright picture. gps is (latitude_deg, longitude_deg, altitude in metres
@@ -127,7 +127,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Pixels that are stored with an EXIF orientation (1...8), turned and mirrored as it says.
+    """Rotate and mirror stored pixels according to an EXIF orientation (1...8).
 
     Args:
         pixels: uint8 (height, width), or with 3 or 4 channels.

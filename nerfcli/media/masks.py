@@ -35,7 +35,7 @@ def find_mask(name: str, masks: Path) -> Path | None:
 
 
 def read_mask(path: Path, photo: Path) -> np.ndarray:
-    """How much of each pixel of a photo may be used.
+    """Read the mask of a photo.
 
     Args:
         path: the mask. If its largest level is 1, that is white.

@@ -33,7 +33,7 @@ _ANOTHER_FFMPEG = "install ffmpeg, and set the environment variable IMAGEIO_FFMP
 
 @dataclass(frozen=True)
 class VideoFormat:
-    """How ffmpeg makes one kind of video.
+    """Encoder settings of one video format.
 
     Args:
         suffix: of the files; two formats never share one, so that their videos stand side by side.
@@ -65,7 +65,7 @@ FORMATS = {
 
 
 def check_encoders(formats: Iterable[str]) -> None:
-    """Whether this machine's ffmpeg can make these formats; asked before hours of rendering.
+    """Check that this machine's ffmpeg supports these formats, before hours of rendering.
 
     Args:
         formats: keys of `FORMATS`.

@@ -39,7 +39,7 @@ _LINES_KEPT = 60
 
 @dataclass(frozen=True)
 class Video:
-    """What the head of a video says.
+    """Header of a video.
 
     width and height are those of its frames, upright and with square pixels. seconds (stated duration) and fps (stated
     mean frame rate) are NaN where nothing is stated. hdr: the colours are stored for HDR screens (PQ or HLG).
@@ -96,7 +96,7 @@ def open_video(path: Path) -> Video:
 def measure_frames(
     video: Video, measure: Callable[[np.ndarray], T], *, longer_side: int, progress: Callable[[float], None]
 ) -> MeasuredFrames[T]:
-    """What `measure` says of every frame, in order.
+    """Apply `measure` to every frame, in order.
 
     Args:
         video: from `open_video`.

@@ -1,1 +1,1 @@
-"""What several photos of one scene have in common: matches, tracks, points, and what they say of cameras."""
+"""Multi-view geometry of the photos of a scene: matches, tracks, points, consistency of cameras."""

@@ -1,4 +1,4 @@
-"""Whether the cameras that a scene gives fit its photos, by what two photos have in common.
+"""Check given cameras against matched features of pairs of photos.
 
 A field that learns the world through a lens of the wrong length learns a world that is bent to fit, and its residuals
 tell little of it. Matched features do: the ray of one photo lies in the plane that the ray of the other spans with the
@@ -32,7 +32,7 @@ NODES = FARTHEST * np.cos(np.pi * (np.arange(6) + 0.5) / 6)
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """What matches say of the cameras.
+    """Result of a check of cameras against matches.
 
     Args:
         log_focal: all focal lengths should be exp of this times as long.
@@ -48,7 +48,7 @@ class CameraCheck:
 
 
 def check_cameras(photos: Sequence[LoadedPhoto], matched: Sequence[Matches]) -> CameraCheck | None:
-    """What matches say of the cameras; None where there are too few.
+    """Check cameras against matches; None where there are too few.
 
     The factor has the least sum of log(1 + (miss / MISS_PX)^2) over all matches. Its error comes from a jackknife over
     photos: a wrong pose moves all matches of a photo alike.

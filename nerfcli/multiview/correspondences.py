@@ -1,4 +1,4 @@
-"""What training photos have in common, found out when it is first asked for."""
+"""Correspondences between training photos, computed on first use."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -15,7 +15,7 @@ SECONDS_PER_PIXEL = 0.7e-6
 
 
 class Shared:
-    """Features and points that training photos share.
+    """Features and 3D points shared by training photos.
 
     Args:
         scene: may have a COLMAP model.
@@ -28,7 +28,7 @@ class Shared:
 
     @property
     def matching_seconds(self) -> float:
-        """What `matched` will take, roughly; 0 where it is there already."""
+        """Estimated time of `matched`; 0 if it is already computed."""
         if "matched" in self.__dict__:
             return 0.0
         wanted = {index for pair in chosen_pairs(self._photos) for index in pair}
@@ -43,7 +43,7 @@ class Shared:
 
     @cached_property
     def of_model(self) -> Tracks:
-        """Points of structure from motion; none where the scene does not tell who saw them."""
+        """Points of structure from motion; none where the scene does not give their observations."""
         return tracks_of_model(self._scene, self._photos)
 
     @cached_property

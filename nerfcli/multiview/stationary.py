@@ -1,4 +1,4 @@
-"""Whether a capture shows two motions: a background that keeps its place in the picture, and an object that turns.
+"""Detect two motions in a capture: a background fixed in the image, and a moving object.
 
 A tripod and a turntable give two sets of matches. Those of the background do not move at all, whatever the two photos
 are; those of the object follow an epipolar geometry of their own, which the first set contradicts. No other capture
@@ -45,7 +45,7 @@ _LEAST_EXTENT = 0.25
 
 @dataclass(frozen=True)
 class Motions:
-    """What the matches of two photos say.
+    """Motions found in the matches of two photos.
 
     Args:
         stays: (N,) bool, matches in their place; none if they are no more than what a smooth motion leaves there.
@@ -76,18 +76,18 @@ class Motions:
 
     @property
     def only_still(self) -> bool:
-        """Whether nothing but the still matches is there."""
+        """Whether there are only static matches."""
         return self.still >= _LEAST_MATCHES and self.moving < _LEAST_MATCHES
 
     @property
     def one(self) -> bool:
-        """Whether all that moved follows one motion, and what stayed with it."""
+        """Whether all moving matches follow one motion, and are consistent with the static ones."""
         return self.moving >= _LEAST_MATCHES and not self.two
 
 
 @dataclass(frozen=True)
 class Stationary:
-    """What many pairs say together.
+    """Summary over many pairs.
 
     Args:
         two, still, moved: pairs with two motions, with the still one alone, and with one that moves.
@@ -105,27 +105,27 @@ class Stationary:
 
     @property
     def share(self) -> float:
-        """Of the pairs that tell, those with two motions; 0 where none tells."""
+        """Fraction of the informative pairs with two motions; 0 without such pairs."""
         return self.two / max(self.two + self.moved, 1)
 
     @property
     def two_motions(self) -> bool:
-        """Whether most pairs show two motions, however small what stays is."""
+        """Whether most pairs show two motions, however small the static part is."""
         return self.two >= _LEAST_PAIRS and self.share >= LEAST_SHARE
 
     @property
     def wide(self) -> bool:
-        """Whether what stays in its place is wide enough for a background."""
+        """Whether the static part is wide enough for a background."""
         return self.cells * _CELLS[0] * _CELLS[1] >= _LEAST_CELLS and self.extent >= _LEAST_EXTENT
 
     @property
     def found(self) -> bool:
-        """Whether an object turns, or is moved, before a background that stays."""
+        """Whether an object moves in front of a static background."""
         return self.two_motions and self.wide
 
 
 def still_px(size: tuple[int, int]) -> float:
-    """How far a feature of what stands still may be found from its place, pixels, in a picture of (width, height)."""
+    """Return the tolerance for a static feature, pixels, in a picture of (width, height)."""
     return max(_LEAST_STILL_PX, _STILL * float(np.hypot(*size)))
 
 
@@ -165,7 +165,7 @@ def _densest(motion: np.ndarray, start: np.ndarray, within: float) -> np.ndarray
 
 
 def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
-    """What matches (N, 2) of two pictures of the same size (width, height) say. Deterministic."""
+    """Find the motions in matches (N, 2) of two pictures of the same size (width, height). Deterministic."""
     within = still_px(size)
     stays, shift = in_place(x, y, size)
     moves = np.linalg.norm(y - x - shift, axis=1) > _MOVED * within
@@ -185,7 +185,7 @@ def motions(x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> Motions:
 
 
 def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:
-    """What pairs (photo, photo, motions) say together."""
+    """Summarize pairs (photo, photo, motions)."""
     two = [pair for pair in pairs if pair[2].two]
     often = [cell for _, _, pair in two for cell in pair.cells]
     cells = [cell for cell in set(often) if often.count(cell) >= 2]

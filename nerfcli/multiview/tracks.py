@@ -1,4 +1,4 @@
-"""Which training photos saw which points of the surface: by structure from motion, or by features of their own.
+"""Tracks: which training photos saw which points, from structure from motion or from matched features.
 
 Held-out photos take no part: of what structure from motion saw, only the sightings in training photos are read, and
 neither the other ones nor the places that points have got from them.
@@ -31,12 +31,12 @@ class Tracks:
 
     @property
     def count(self) -> int:
-        """Of points."""
+        """Number of points."""
         return int(self.points.max(initial=-1)) + 1
 
 
 def tracks_of_model(scene: Scene, photos: Sequence[LoadedPhoto]) -> Tracks:
-    """What the scene's COLMAP model says that these photos saw; nothing where there is no such model."""
+    """Return the observations of these photos in the scene's COLMAP model; empty without such a model."""
     folder = model_folder(scene.root)
     capture = parse_colmap(folder) if folder is not None else None
     parts = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))]

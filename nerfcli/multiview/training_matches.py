@@ -67,5 +67,5 @@ def _in_common(pair: tuple[int, int], features: tuple[Features, Features]) -> Ma
 
 
 def radians_per_pixel(camera: Camera) -> float:
-    """At the size in which features are sought."""
+    """Return the angle of a pixel at the size used for feature extraction."""
     return float(np.radians(max(camera.fov_deg))) / min(LONGER_SIDE_PX, max(camera.width, camera.height))

@@ -1,4 +1,4 @@
-"""Where points of the surface are, by the training photos that saw them and the poses that the scene gives."""
+"""Triangulate surface points from tracks and the poses of the scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,1 +1,1 @@
-"""What the HTML pages of all commands have in common: one file, no network, light and dark, and nothing unescaped."""
+"""Common parts of the HTML pages of all commands: one file, no network, light and dark, everything escaped."""

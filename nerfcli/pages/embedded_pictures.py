@@ -33,7 +33,7 @@ def png_bytes(picture: np.ndarray) -> bytes:
 
 
 def fitted(picture: np.ndarray, longest_px: int | None) -> np.ndarray:
-    """The picture, averaged down where its longer side is more than asked for."""
+    """Reduce a picture if its longer side exceeds the limit."""
     scale = 1.0 if longest_px is None else longest_px / max(picture.shape[:2])
     if scale >= 1.0:
         return picture

@@ -1,4 +1,4 @@
-"""The page around what a command tells: head, common style, whose page it is; and how it is written."""
+"""HTML page around the content of a command: head, common style, origin; and writing it."""
 
 import hashlib
 import json
@@ -29,13 +29,13 @@ class Mark:
     source: Path
 
     def html(self) -> str:
-        """What stands in the page's head."""
+        """HTML of the mark in the page's head."""
         identity = hashlib.sha256(str(self.source.resolve()).encode()).hexdigest()[:16]
         return f'<meta name="nerfcli-{self.kind}" content="{identity}">'
 
 
 def page_html(*, title: str, mark: Mark, style: str, body: str, script: str = "", origin: str | None = None) -> str:
-    """A whole page that loads nothing; a browser that knows content security policies would refuse to.
+    """Return a complete page that loads nothing, enforced by a content security policy.
 
     Args:
         title: plain text.
@@ -71,7 +71,7 @@ def data_element(name: str, content: Any) -> str:
 
 @cache
 def asset(name: str) -> str:
-    """The text of a style sheet or script that stands beside this file."""
+    """Return the text of a style sheet or script next to this file."""
     return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
@@ -86,7 +86,7 @@ def write_page(text: str, path: Path) -> None:
 
 
 def is_made_from(path: Path, origin: str) -> bool:
-    """Whether the page at a path says that it was made from what has this digest."""
+    """Return whether the page at a path was made from content with this digest."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -98,7 +98,7 @@ def _origin_html(origin: str) -> str:
 
 
 def refuse_foreign(path: Path, mark: Mark, *, about: str) -> None:
-    """Raise unless a page may be written at a path: nothing stands there, or an earlier page with the same mark.
+    """Raise unless a page may be written at a path: it is free, or holds an earlier page with the same mark.
 
     Args:
         about: what such a page is of, for the message: "capture".

@@ -1,4 +1,4 @@
-"""How photos were exposed, as their cameras wrote it down."""
+"""Exposures of photos from EXIF."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from nerfcli.media.images import read_exif
 
 
 def log_exposures(frames: Sequence[Frame]) -> np.ndarray:
-    """Logarithms of the exposures of photos, for comparison among them: (n,), NaN where EXIF does not tell.
+    """Return logarithms of the exposures of photos, for comparison among them: (n,), NaN where EXIF lacks them.
 
     exposure = shutter time * ISO speed / f-number^2, to which the linear light of a photo is proportional
 
@@ -20,13 +20,13 @@ def log_exposures(frames: Sequence[Frame]) -> np.ndarray:
 
 
 def mean_log_exposure(frames: Sequence[Frame]) -> float | None:
-    """The mean of `log_exposures` over the photos whose exposure is known; None where none is."""
+    """Return the mean of `log_exposures` over photos with a known exposure; None without any."""
     known = [value for value in log_exposures(frames) if math.isfinite(value)]
     return math.fsum(known) / len(known) if known else None
 
 
 def relative_log_exposures(frames: Sequence[Frame], reference: float | None) -> np.ndarray:
-    """`log_exposures` minus `reference`; 0 where a photo's exposure is not known, or no reference is."""
+    """Return `log_exposures` minus `reference`; 0 where either is unknown."""
     if reference is None:
         return np.zeros(len(frames))
     return np.nan_to_num(log_exposures(frames) - reference, nan=0.0)

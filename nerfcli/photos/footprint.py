@@ -1,4 +1,4 @@
-"""How fine the photos of a capture are."""
+"""Resolution of the photos of a capture."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from nerfcli.cameras.rigid import Similarity
 
 
 def pixel_footprint(frames: Sequence[Frame], training_from_scene: Similarity) -> float:
-    """What a pixel of the median photo covers at the centre of the training frame, in its units.
+    """Return the footprint of a pixel of the median photo at the centre of the training frame, in its units.
 
     distance / focal length, the distance at least 1: what cameras inside the unit ball look at is about its radius
     away.

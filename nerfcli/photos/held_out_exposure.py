@@ -1,4 +1,4 @@
-"""How held-out photos are exposed, without a look at them: as EXIF tells it, or the photos taken before and after."""
+"""Exposures of held-out photos, without using their pixels: from EXIF, or from photos taken before and after."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from nerfcli.render.model import Model
 
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """(T, 3) gains of photos taken between others, interpolated along the capture; 0, the mean, where that says less.
+    """Interpolate (T, 3) gains along the capture for photos between others; 0, the mean, where that is a better guess.
 
     A camera that adapts to what it sees does so from photo to photo: then the neighbours of a photo tell its gains.
     Whether they do is seen by leaving out each known photo in turn: the squared differences to what its neighbours tell

@@ -94,7 +94,7 @@ class Drawn(NamedTuple):
 
 
 class Pool(Protocol):
-    """Where a training takes its pixels from: photos with poses (P, 4, 4), training frame, and cameras."""
+    """Source of training pixels: photos with poses (P, 4, 4), training frame, and cameras."""
 
     colours: Tensor
     first_pixel: Tensor
@@ -113,7 +113,7 @@ class Pool(Protocol):
         ...
 
     def photo_of(self, numbers: Tensor) -> Tensor:
-        """Which photo each pixel (N,) is of."""
+        """Return the photo index of each pixel (N,)."""
         ...
 
 
@@ -195,12 +195,12 @@ class PixelPool:
         return self.rays_of(self.numbers(count, generator))
 
     def numbers(self, count: int, generator: torch.Generator) -> Tensor:
-        """Those of `count` random pixels, with replacement."""
+        """Return the indices of `count` random pixels, with replacement."""
         chosen = torch.randint(self.usable_count, (count,), generator=generator, device=self.colours.device)
         return chosen if self.usable is None else self.usable[chosen]
 
     def is_usable(self, numbers: Tensor) -> Tensor:
-        """(N,) whether pixels (N,), counted through all photos, may be trained on."""
+        """Return (N,) whether pixels (N,), numbered through all photos, may be used for training."""
         if self.usable is None:
             return torch.ones_like(numbers, dtype=torch.bool)
         places = torch.searchsorted(self.usable, numbers).clamp_max(self.usable_count - 1)
@@ -214,7 +214,7 @@ class PixelPool:
         return Drawn(*rays, numbers, distances=none, trust=none, weights=none)
 
     def photo_of(self, numbers: Tensor) -> Tensor:
-        """Which photo each pixel (N,) is of."""
+        """Return the photo index of each pixel (N,)."""
         return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
 
     def place(self, number: int) -> tuple[str, int, int]:

@@ -1,4 +1,4 @@
-"""Where the photos of a training stand: in memory, or in a file that is mapped into it; asked up front, by their sizes.
+"""Storage of training photos: in memory or in memory-mapped files, decided from their sizes.
 
 What is resident is what counts. Pages of a mapped file are given back when they become too many, and read again from
 the system's cache or the disk when they are needed: the numbers are the same, bit for bit.
@@ -39,7 +39,7 @@ class Needs:
 
 
 def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -> Needs:
-    """What the photos of `frames` and the field will take, from sizes alone, on top of what is resident now."""
+    """Estimate the memory of photos and field from their sizes, in addition to what is resident now."""
     sizes = [(frame.camera.width // factor) * (frame.camera.height // factor) for frame in frames]
     of_cameras = {frame.camera: size for frame, size in zip(frames, sizes, strict=True)}
     may_have_alpha = any(
@@ -120,7 +120,7 @@ IN_MEMORY = InMemory()
 
 
 def room_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[Room, str]:
-    """Where the photos go, and a sentence for the user.
+    """Choose the storage of the photos, and a message for the user.
 
     Args:
         needs: of all photos and the field.

@@ -1,4 +1,4 @@
-"""How far a rendering can be from what its field says: bounds that come with every picture, and a measurement.
+"""Accuracy of a rendering relative to its field: bounds stored with every picture, and a measurement.
 
 Two errors are kept apart. What was left out for speed (the early stop, colours of negligible samples) is bounded for
 every pixel. That density and colour are taken as constant inside each interval is measured: some rays are rendered
@@ -33,7 +33,7 @@ TIGHT = 1e-6
 
 @dataclass(frozen=True)
 class Spread:
-    """How large absolute differences are: over how many values, and three of their statistics."""
+    """Statistics of absolute differences, and the number of values."""
 
     values: int
     median: float
@@ -60,7 +60,7 @@ class MeasuredError:
     depth_stop: Spread | None
 
     def to_json(self) -> dict[str, float]:
-        """Plain numbers by name; nothing of depth where none was asked for."""
+        """Return plain numbers by name, without depth if none was requested."""
         named = {
             "quadrature_of_colour": self.colour,
             "quadrature_of_colour_halved": self.colour_halved,
@@ -76,7 +76,7 @@ class MeasuredError:
 
 
 def truncation_bounds(picture: RenderedPicture, tolerance: float) -> dict[str, float]:
-    """What a picture states about itself: the tolerance asked for, the largest and the mean bound of its pixels."""
+    """Return the error bounds stored in a picture: the tolerance, the maximum and the mean bound of its pixels."""
     error = picture.truncation_error
     return {
         "tolerance": tolerance,

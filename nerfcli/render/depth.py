@@ -31,7 +31,7 @@ MEDIAN = 0.5
 
 @dataclass(frozen=True)
 class DepthRequest:
-    """Which depth to render.
+    """Definition of the depth to render.
 
     Args:
         convention: one of `CONVENTIONS`, or "quantile:0.05" with a share between 0 and 1.
@@ -57,14 +57,14 @@ class DepthRequest:
 
     @property
     def share(self) -> float | None:
-        """The share of light of a quantile or the median; None for the others."""
+        """Fraction of light of a quantile or the median; None for other definitions."""
         if self.convention == "median":
             return MEDIAN
         return float(self.convention.removeprefix(QUANTILE)) if self.convention.startswith(QUANTILE) else None
 
 
 def is_convention(name: str) -> bool:
-    """Whether a depth goes by this name."""
+    """Return whether a definition of depth has this name."""
     if not name.startswith(QUANTILE):
         return name in CONVENTIONS
     try:
@@ -81,12 +81,12 @@ def effective_floor(request: DepthRequest) -> float:
 
 
 def shares(request: DepthRequest) -> tuple[float, ...]:
-    """The quantiles that a picture needs: the median, and the one asked for."""
+    """Return the quantiles that a picture needs: the median, and the requested one."""
     return (MEDIAN,) if request.share in (None, MEDIAN) else (MEDIAN, request.share)
 
 
 def requested(request: DepthRequest, ends: LightEnds, *, background_distance: Tensor) -> Tensor:
-    """The depth (R,) that was asked for.
+    """Select the requested depth (R,).
 
     Args:
         request: which depth.

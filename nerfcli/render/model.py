@@ -26,7 +26,7 @@ BACKGROUND = "background.logits"
 
 @dataclass(frozen=True)
 class Marching:
-    """Where rays are cut, in units of the training frame; see `sampling.step_edges`."""
+    """Sampling of rays, in units of the training frame; see `sampling.step_edges`."""
 
     near: float
     far: float
@@ -44,7 +44,7 @@ class Marching:
 
 @dataclass(frozen=True)
 class Model:
-    """What `train` leaves and `render` takes.
+    """A trained field with everything that rendering needs.
 
     Args:
         field: the radiance field, on points of the training frame.
@@ -74,7 +74,7 @@ class Model:
 
     @property
     def contraction(self) -> str:
-        """How space becomes the unit cube of the field."""
+        """Contraction of space to the unit cube of the field."""
         return self.field.settings.contraction
 
     @property

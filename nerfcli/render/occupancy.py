@@ -1,4 +1,4 @@
-"""Which cells of space hold anything: a coarse grid over the field's unit cube that lets rays skip the rest."""
+"""Occupancy grid: a coarse grid over the field's unit cube that lets rays skip empty space."""
 
 import torch
 from torch import Tensor
@@ -10,7 +10,7 @@ DECAY = 0.8
 
 
 class Occupancy:
-    """What fills each cell: a decaying maximum of the optical depth of one ray step.
+    """Content of each cell: a decaying maximum of the optical depth of one ray step.
 
     It comes from asking the field at random points. What lies behind surfaces stays as it is, and costs nothing: rays
     stop before they get there.
@@ -38,7 +38,7 @@ class Occupancy:
         growth: float,
         generator: torch.Generator,
     ) -> None:
-        """Ask the field at one random point in each of some cells.
+        """Evaluate the field at one random point in each of some cells.
 
         Args:
             field: the field being trained.
@@ -62,7 +62,7 @@ class Occupancy:
         chosen.copy_(torch.maximum(torch.where(chosen.isinf(), 0.0, chosen * DECAY), density * step))
 
     def state(self) -> dict[str, Tensor]:
-        """What `restore` needs."""
+        """Return the state for `restore`."""
         return {"optical_depth": self.optical_depth}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:

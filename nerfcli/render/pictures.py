@@ -23,7 +23,7 @@ RAYS_PER_BLOCK = 2**18
 
 @dataclass(frozen=True)
 class Quality:
-    """How much work goes into a picture.
+    """Rendering quality of a picture.
 
     Args:
         tolerance: what a channel of a colour may miss for speed, in (0, 1]; see `tracing`.

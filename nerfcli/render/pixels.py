@@ -1,4 +1,4 @@
-"""From rays to pixels: one ray, or the mixture of several, all of which count alike.
+"""Pixels from rays: one ray per pixel, or the equally weighted mixture of several.
 
 The end distance of a pixel of several rays is that of a ray drawn from them: the conditional mean is the mean of the
 rays' means weighted by their opacity, its variance holds that between the rays, a quantile is that of all their light,
@@ -15,7 +15,7 @@ from nerfcli.kernels import Backend, Intervals, LightEnds, RaysSeen
 
 
 class Pixels(NamedTuple):
-    """What P pixels saw.
+    """Values of P pixels.
 
     Args:
         rgb: (P, 3) sRGB on the background.
@@ -42,7 +42,7 @@ def pixels_of_rays(
     count: int,
     backend: Backend,
 ) -> Pixels:
-    """Pixels of `count` rays each, which stand side by side.
+    """Combine `count` adjacent rays into each pixel.
 
     Args:
         seen: of R rays, with the quantiles `shares`.

@@ -67,7 +67,7 @@ def pixel_rays(
 
 
 def places_in_pixel(count: int) -> np.ndarray:
-    """Where to look inside each pixel: (count, 2) in [0, 1]^2, the same for every pixel and every picture.
+    """Return the sample positions inside each pixel: (count, 2) in [0, 1]^2, the same for every pixel and picture.
 
     x_i = (i + 1/2) / count, y_i = (rank of the base-2 radical inverse of i + 1/2) / count: one place in every row and
     every column of a count x count grid, and one in each of count equal boxes where count is a power of two. Their mean

@@ -1,4 +1,4 @@
-"""Where rays are cut: schedules of distances, stratified places, and draws from a histogram."""
+"""Sampling along rays: schedules of distances, stratified samples, and draws from a histogram."""
 
 import math
 

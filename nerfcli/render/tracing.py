@@ -1,4 +1,4 @@
-"""What rays see: their colour, where their light ends, and how much of it was not looked at.
+"""Trace rays: colour, distribution of depth, and the error of early stopping.
 
 Two things are left out for speed. A ray ends where little light is left (the stop), and samples whose weights are
 negligible are not asked for their colour, which is taken as grey. Together they change a colour by at most the

@@ -1,4 +1,4 @@
-"""What the folders of a run and of its scene tell: settings, log, numbers, poses, and what was warned about."""
+"""Facts in the folders of a run and of its scene: settings, log, metrics, poses, warnings."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -45,7 +45,7 @@ class RunFacts:
 
 
 def read_facts(run: Run, label: str, *, checkpoint_sha256: str) -> RunFacts:
-    """Everything that the folders tell of a run.
+    """Read all facts of a run.
 
     Args:
         run: the run.
@@ -71,7 +71,7 @@ def read_facts(run: Run, label: str, *, checkpoint_sha256: str) -> RunFacts:
 
 
 def labels_of(runs: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths that tell them apart."""
+    """Return the shortest ends of the paths that are unique."""
     parts = [run.resolve().parts for run in runs]
     for depth in range(1, max(map(len, parts)) + 1):
         labels = ["/".join(part[-depth:]) for part in parts]
@@ -101,7 +101,7 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
 
 
 def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
-    """Why numbers of these runs must not be compared with each other."""
+    """List the reasons why metrics of these runs must not be compared."""
     measured = [run for run in runs if run.metrics is not None]
     if len({run.config.split_sha256 for run in runs}) > 1:
         yield "the runs have different held-out photos"

@@ -11,12 +11,12 @@ _MEGA = 1e6
 
 
 def numbers_html(runs: Sequence[RunFacts]) -> str:
-    """What was measured, and by which protocols."""
+    """Format metrics and their protocols."""
     return _columns(runs, _NUMBERS) + _protocols_html(runs)
 
 
 def capture_html(runs: Sequence[RunFacts]) -> str:
-    """What the runs were trained on, and how its poses were found."""
+    """Format the captures of the runs and their poses."""
     return _columns(runs, _CAPTURE)
 
 
@@ -64,7 +64,7 @@ def _shape(run: RunFacts) -> str:
 
 
 def number(value: float | None, digits: int) -> str:
-    """With so many digits; "" where there is none."""
+    """Format a number with so many digits; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 
 
@@ -126,7 +126,7 @@ def _novelty(view: dict[str, Any] | None) -> list[str]:
 
 
 def ledger_html(runs: Sequence[RunFacts]) -> str:
-    """Which stages have seen the held-out photos."""
+    """Format which stages used the held-out photos."""
     words = {True: "yes", False: "no", None: "not known"}
     rows = [
         (run.label, entry["stage"], words[entry["saw_held_out"]], entry["how"])
@@ -139,7 +139,7 @@ def ledger_html(runs: Sequence[RunFacts]) -> str:
 
 
 def selection_html(runs: Sequence[RunFacts]) -> str:
-    """How the scene decided on the components of the model; "" where nobody asked it."""
+    """Format the automatic selection of components; "" without one."""
     rows = [
         (
             run.label,

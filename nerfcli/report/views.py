@@ -22,7 +22,7 @@ _RANGE_PERCENT = (1, 99)
 
 @dataclass(frozen=True)
 class Seen:
-    """What a run renders of a held-out photo.
+    """Renderings of a held-out photo by a run.
 
     Args:
         name: of the photo.
@@ -41,7 +41,7 @@ class Seen:
 
     @property
     def with_depth(self) -> float:
-        """The share of the pixels that have a depth."""
+        """Fraction of the pixels with a depth."""
         return float(np.isfinite(self.depth).mean())
 
 

@@ -1,4 +1,4 @@
-"""How far refined cameras are from those that a scene had."""
+"""Differences between refined cameras and those of the scene."""
 
 from collections.abc import Sequence
 from typing import Any

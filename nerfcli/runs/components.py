@@ -27,7 +27,7 @@ MOST_DEGREES = 3
 
 @dataclass(frozen=True)
 class Components:
-    """What is in the model and in its loss. The defaults are what nearly every scene needs.
+    """Components of the model and of its loss. The defaults suit nearly every scene.
 
     Args:
         background: behind the field: "black"; a learned colour, "constant" or by direction ("sphere"); "random" colours
@@ -65,7 +65,7 @@ class Components:
 
 @dataclass(frozen=True)
 class Choice:
-    """What a component may be.
+    """Allowed values of a component.
 
     Args:
         what: it does, in a few words.
@@ -79,7 +79,7 @@ class Choice:
     allowed: tuple[Value, ...] | None
 
     def value(self, name: str, text: str) -> Value:
-        """The value that a text stands for.
+        """Parse the value of a component.
 
         Raises:
             UserError: it stands for none.

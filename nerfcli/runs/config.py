@@ -22,7 +22,7 @@ from nerfcli.sealed import read_sealed, write_sealed
 
 @dataclass(frozen=True)
 class RunConfig:
-    """What a run was trained from and how; what an earlier version did not write down has its default.
+    """Source and settings of a run; entries missing in files of earlier versions have their defaults.
 
     Args:
         settings: as they were asked for, with the downscale and contraction that were chosen.
@@ -94,7 +94,7 @@ class RunConfig:
 
     @property
     def components(self) -> Components:
-        """The components of the model: those that the scene decided on, or as asked for."""
+        """Components of the model: those selected automatically, or as requested."""
         return self.settings.components if self.selection is None else self.selection.components
 
     @property

@@ -33,7 +33,7 @@ _REQUIRED = ("step", "seconds", "loss", "samples", "rays", "peak_memory_bytes")
 
 @dataclass(frozen=True)
 class TrainingSummary:
-    """What a training took: seconds, optimiser steps, mean speeds and the largest resident memory."""
+    """Summary of a training: seconds, optimizer steps, mean speeds and peak resident memory."""
 
     seconds: float
     steps: int

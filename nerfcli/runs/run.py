@@ -20,7 +20,7 @@ from nerfcli.scene import Scene, fingerprint
 
 
 class Run:
-    """A run folder, read file by file as it is asked for, each file once.
+    """A run folder; each file is read on first use.
 
     Args:
         path: the folder; nothing is read yet.
@@ -41,7 +41,7 @@ class Run:
 
     @cached_property
     def cameras(self) -> RunCameras:
-        """The frames that were trained on and those held out, with their cameras as the field knows them."""
+        """Training and held-out frames, with their cameras as the field was trained with."""
         return read_cameras(self.path)
 
     @cached_property
@@ -56,7 +56,7 @@ class Run:
 
     @property
     def summary(self) -> TrainingSummary | None:
-        """What the training took; None without a log."""
+        """Summary of the training; None without a log."""
         return summary_of(self.log)
 
     @property
@@ -66,7 +66,7 @@ class Run:
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
-        """What the scene decided on; none where it was not asked."""
+        """Decisions of the automatic selection; empty without one."""
         return () if self.config.selection is None else self.config.selection.decisions
 
     @property
@@ -76,7 +76,7 @@ class Run:
 
     @property
     def is_trained(self) -> bool:
-        """Whether there is a field."""
+        """Whether the run has a field."""
         return self.field_path.exists()
 
     @property
@@ -105,7 +105,7 @@ class Run:
             raise UserError(f"{self.field_path} cannot be read: {error.strerror}", hint) from error
 
     def metrics(self) -> dict[str, Any] | None:
-        """What `evaluate` measured; None before it has.
+        """Return the metrics written by `evaluate`; None if there are none.
 
         Raises:
             UserError: the file is damaged.
@@ -140,7 +140,9 @@ class Run:
         )
 
     def is_complete(self, settings: TrainSettings) -> bool:
-        """Whether training reached the budget, by its last checkpoint: the log of a killed training is ahead of it."""
+        """Return whether training reached the budget, by its last checkpoint: the log of a killed training is ahead of
+        it.
+        """
         if not self.is_trained:
             return False
         if (self.path / STATE).exists():

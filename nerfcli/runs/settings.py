@@ -17,7 +17,7 @@ AUTO_LONGER_SIDE_PX = 800
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """How long and how to train.
+    """Settings of a training.
 
     Args:
         budget_seconds: training time to spend, without loading and held-out checks; None for no limit.
@@ -96,7 +96,7 @@ class TrainSettings:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> "TrainSettings":
-        """What `to_json` gave; what an earlier version did not know has its default."""
+        """Read the content that `to_json` returned; missing entries have their defaults."""
         names = {entry.name for entry in dataclasses.fields(cls)}
         known: dict[str, Any] = {name: value for name, value in content.items() if name in names}
         known["components"] = Components(**content.get("components", {}))

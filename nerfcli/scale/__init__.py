@@ -1,1 +1,1 @@
-"""How many metres a scene unit is: from known distances, GPS, or printed markers, each with its uncertainty."""
+"""Metric scale: metres per scene unit from known distances, GPS, or printed markers, with its uncertainty."""

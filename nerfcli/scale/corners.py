@@ -1,4 +1,4 @@
-"""Corners of printed patterns, from the photos to points of the scene, and the scale from their known distances.
+"""Corners of printed patterns: triangulate them from the photos and compute the scale from known distances.
 
 Letters: a corner p is seen from camera centres c_i in unit directions d_i; a pixel there is 1 / f_i wide, in radians.
 """

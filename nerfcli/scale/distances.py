@@ -54,7 +54,7 @@ class KnownDistance:
 
 
 def known_distance(text: str, frames: Sequence[Frame]) -> KnownDistance:
-    """The distance that "A B METRES" or "A B METRES+-ERROR" tells; A and B are names of images or points x,y,z.
+    """Parse "A B METRES" or "A B METRES+-ERROR"; A and B are names of images or points x,y,z.
 
     Raises:
         UserError: something else, an unknown image, or a length that is none.

@@ -1,4 +1,4 @@
-"""What every source of scale gives, and a capture in metres."""
+"""Estimate of metric scale, and a capture in metres."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ from nerfcli.cameras.rigid import Similarity
 
 @dataclass(frozen=True)
 class ScaleEstimate:
-    """How long a scene unit is.
+    """Estimate of metres per scene unit.
 
     Args:
         metres_per_unit: above 0.

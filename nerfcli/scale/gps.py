@@ -54,7 +54,7 @@ class GpsFit:
 
 
 def gps_positions(frames: Sequence[Frame]) -> dict[str, Position]:
-    """What the photos' EXIF says, by the frames' names; photos without a position are left out.
+    """Read the GPS positions of photos from EXIF, by frame name; photos without a position are omitted.
 
     Latitude 0 and longitude 0 is what some cameras write before they know.
 

@@ -1,1 +1,1 @@
-"""Which components a scene needs: short trainings against each other, and how they are judged."""
+"""Automatic selection of components: paired short trainings and their evaluation."""

@@ -1,4 +1,4 @@
-"""What the residuals of a short training say about what its model lacks: reasons to try a component, no proof."""
+"""Diagnostics from the residuals of a short training: hints which components to try."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ _OF_MEDIAN, _OF_DEVIATION = 1.2533, 1.4826
 
 @dataclass(frozen=True)
 class Signs:
-    """Of a scene, as a trained model sees it.
+    """Diagnostics of a scene from a short training.
 
     Args:
         log_gains: (photos, 3) how much brighter each photo is than its rendering, in logarithms of linear light; their
@@ -40,7 +40,7 @@ class Signs:
 def signs_of(
     rendered: Tensor, measured: Tensor, photos: Tensor, *, directions: Tensor, from_beyond: Tensor, count: int
 ) -> Signs:
-    """The signs in some pixels.
+    """Compute the diagnostics from some pixels.
 
     The gain of a photo is the median over its pixels of log(measured / rendered), channel by channel: highlights and
     edges that the model does not have yet do not move it.

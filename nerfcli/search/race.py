@@ -89,7 +89,7 @@ class Race:
 
     @property
     def log_gains(self) -> Tensor | None:
-        """Of the exposures that the model which won has found."""
+        """Exposures found by the winning model."""
         return self._base[0].log_gains if self._base else None
 
     def run(

@@ -1,4 +1,4 @@
-"""Which components a scene needs: each against the model as it is, in paired short trainings, with their noise.
+"""Select the components of a model: each candidate against the current model, in paired short trainings.
 
 A component is added only if it is better by more than the noise, and left out only if that surely loses nothing. Gain
 and noise are measured, not assumed: every candidate goes on from the same start with the same seeds and pixels as the
@@ -51,7 +51,7 @@ LEARN_FOCAL = ("focal", "all")
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known of a scene and asked for, before anything is learned.
+    """Facts about a scene and the requested components, before training.
 
     Args:
         field: the kind of field.
@@ -113,7 +113,7 @@ def with_known_cameras(asked: Components, facts: Facts) -> tuple[Components, flo
 
 
 def tells_points(asked: Components, facts: Facts) -> bool:
-    """Whether points that photos share may be asked how far away surfaces are.
+    """Return whether triangulated points may be used for depth supervision.
 
     The cameras have to fit. And where alpha tells what is empty, points gain at first only: they have cost half a
     decibel on lego, in the time that their rays take.
@@ -194,7 +194,7 @@ def _against_sky(signs: Signs) -> str | None:
 
 
 def rules(candidates: Sequence[Change], signs: Signs, facts: Facts) -> dict[Change, Rule]:
-    """How those of the candidates are judged that more than a trial speaks for."""
+    """Return the rules for candidates that other evidence supports."""
     found: dict[Change, Rule] = {}
     for change in candidates:
         if change[0] == "cameras" and facts.cameras is not None:
@@ -207,7 +207,9 @@ def rules(candidates: Sequence[Change], signs: Signs, facts: Facts) -> dict[Chan
 
 
 def removals(start: Components, facts: Facts) -> list[Change]:
-    """What may be left out of a half-trained model: only a hash grid can be, as its shape stays the same."""
+    """List the components that can be removed from a half-trained model: only of a hash grid, whose shape stays the
+    same.
+    """
     return [("view", 0)] if start.view and "view" not in facts.fixed and facts.field == "hash" else []
 
 
@@ -218,7 +220,7 @@ def _without_poses(model: Components) -> Components:
 
 
 def is_worth_a_search(seconds: float | None, steps: int | None) -> bool:
-    """Whether a training of so long can spare what a search takes; see `select`."""
+    """Return whether the budget is large enough for a search; see `select`."""
     if seconds is not None:
         return START_SHARE * SEARCH_SHARE * seconds >= LEAST_START_SECONDS
     return round(START_SHARE * SEARCH_SHARE * (steps or 0)) >= FEWEST_STEPS

@@ -48,7 +48,7 @@ SEED = 20_211
 
 @dataclass(frozen=True)
 class Trial:
-    """What a short training achieved.
+    """Result of a short training.
 
     Args:
         errors: (photos,) sums of squared differences of the judged pixels of each photo, sRGB.
@@ -68,7 +68,7 @@ class Trial:
 
     @property
     def psnr(self) -> float:
-        """In dB over all judged pixels."""
+        """PSNR in dB over all judged pixels."""
         return psnr_of(float(self.errors.sum() / self.counts.sum()))
 
 
@@ -189,7 +189,7 @@ class Trials:
         return TrialStart(copies, description, sum(took), trial, signs)
 
     def go_on(self, start: TrialStart, components: Components, *, seed: int, steps: int) -> Trial:
-        """Go on to the end of the schedule with these components, and judge.
+        """Continue to the end of the schedule with these components, and measure.
 
         Args:
             start: what `begin` gave.

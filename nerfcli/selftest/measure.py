@@ -1,4 +1,4 @@
-"""What a row of the selftest is, and how an error is measured."""
+"""Rows of the selftest, and the definition of errors."""
 
 import math
 from collections.abc import Sequence
@@ -45,7 +45,7 @@ class Precision:
 
     @property
     def deepest(self) -> float:
-        """The optical depth behind which no light is left that this precision could tell from none."""
+        """Optical depth beyond which this precision cannot represent the remaining light."""
         return -math.log(self.tiny)
 
     def tensor(self, values: Any) -> Tensor:
@@ -91,7 +91,7 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """Whether the bounds are met; NaN meets none."""
+        """Verdict on the bounds; NaN exceeds all."""
         return MET if self.holds(self.errors) else NOT_MET
 
     def holds(self, errors: Errors) -> bool:
@@ -101,11 +101,11 @@ class Row:
 
     @property
     def textbook_fails(self) -> bool:
-        """Whether the textbook's formula is beyond the bounds of this row."""
+        """Whether the textbook formula exceeds the bounds of this row."""
         return self.textbook is not None and not self.holds(self.textbook)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers; what is not finite by name, as JSON knows no such numbers."""
+        """Return plain numbers; non-finite ones by name, since JSON has none."""
 
         def plain(value: Any) -> Any:
             if isinstance(value, dict):

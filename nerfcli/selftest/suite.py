@@ -11,7 +11,7 @@ from nerfcli.selftest.table import checks, row_of
 
 
 def precisions(device: str) -> tuple[Precision, ...]:
-    """What can be tried on a device; the compiled kernels are the CPU's, and are tried wherever they work."""
+    """List the precisions to test on a device; compiled kernels run on the CPU wherever they work."""
     plain = tuple(
         Precision(name, dtype, device) for name, dtype in (("float32", torch.float32), ("bfloat16", torch.bfloat16))
     )

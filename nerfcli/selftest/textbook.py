@@ -56,7 +56,7 @@ def optical_depth_before(density: Tensor, lengths: Tensor, *, offsets: Tensor) -
 
 
 def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
-    """Of a single ray: 2 sum w_i (m_i W_i - M_i) + sum w_i^2 length_i / 3, a difference of running sums."""
+    """Distortion of a single ray: 2 sum w_i (m_i W_i - M_i) + sum w_i^2 length_i / 3, a difference of running sums."""
     middles = (starts + ends) / 2
     before, moment = (x.cumsum(0) - x for x in (weights, weights * middles))
     return (2 * weights * (middles * before - moment) + weights.square() * (ends - starts) / 3).sum()

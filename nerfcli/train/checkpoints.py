@@ -1,4 +1,4 @@
-"""What of a training is in the run folder, so that it can be looked at, and gone on with bit for bit."""
+"""Checkpoints: write a training's state to the run folder and restore it bit for bit."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,8 +31,9 @@ ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
 
 @dataclass
 class Totals:
-    """What accumulates over the whole training, resumed parts included; `searched` is the part of the seconds that the
-    choice of the components took."""
+    """Totals over the whole training, including resumed parts; `searched` is the time spent on the selection of
+    components.
+    """
 
     seconds: float = 0.0
     searched: float = 0.0
@@ -55,7 +56,7 @@ class Checkpoints:
         self._prepared, self._scene = prepared, scene
 
     def model(self) -> Model:
-        """What the field is now."""
+        """Return the current field as a model."""
         fitting, prepared = self._fitting, self._prepared
         alone = ALPHA_BACKGROUND if prepared.pool.has_alpha else OPAQUE_BACKGROUND
         return Model(
@@ -119,7 +120,7 @@ class Checkpoints:
 
 
 def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]) -> Begun:
-    """What the run was begun with, as its last checkpoint and its settings say.
+    """Return the decisions of an earlier call, from its last checkpoint and its settings.
 
     Raises:
         UserError: another version wrote it, or it was begun with another contraction than is asked for.
@@ -136,7 +137,7 @@ def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]
 
 
 def restore(fitting: Fitting, run: Path, tensors: dict[str, Tensor], description: dict[str, Any]) -> Totals:
-    """Bring `fitting` to the run's last checkpoint, which says this.
+    """Restore `fitting` from the run's last checkpoint.
 
     Raises:
         UserError: it is of another field or of other components, or holds numbers that are not finite.

@@ -23,7 +23,7 @@ RAYS_AT_A_TIME = 512
 
 
 class HeldoutPixels:
-    """The same few thousand random pixels of the held-out photos, whenever it is asked.
+    """A fixed sample of a few thousand pixels of the held-out photos.
 
     Args:
         photos: held out.

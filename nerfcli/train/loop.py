@@ -30,7 +30,7 @@ CHECKPOINT_SECONDS = 30.0
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a training stands: share of the budget, steps, training seconds, loss, speed."""
+    """State of a training: fraction of the budget, steps, training seconds, loss, speed."""
 
     share: float
     step: int

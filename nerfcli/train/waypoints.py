@@ -48,7 +48,7 @@ def forget_waypoints(run: Path, *, after: int = -1) -> None:
 def measure_waypoints(
     held_out: Sequence[Frame], run: Path, prepared: Prepared, *, notify: Callable[[str], None]
 ) -> None:
-    """Add the PSNR of some held-out pixels to the entries of RUN/log.jsonl that stand for waypoints, and remove these.
+    """Add the PSNR of a sample of held-out pixels to the waypoint entries of RUN/log.jsonl, and remove the waypoints.
 
     Held-out photos that cannot be read are told, and nothing is measured: the training is done without them.
     """

@@ -1,4 +1,4 @@
-"""From a scene to what each component is worth on it: every variant with every seed, trained and measured."""
+"""Run an ablation: train and measure every variant with every seed."""
 
 from collections.abc import Callable
 from dataclasses import replace

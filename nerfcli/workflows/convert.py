@@ -1,4 +1,4 @@
-"""From a capture in one format to another, proved; or to the convention that it follows."""
+"""Convert a capture and verify it, or detect its convention."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

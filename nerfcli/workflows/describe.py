@@ -1,4 +1,4 @@
-"""What a folder or a file is, as plain values: scenes, runs, renders, depth, pictures, videos, states of a training.
+"""Describe a folder or file as plain values: scenes, runs, renders, depth, pictures, videos, training states.
 
 Imports stand where they are needed: what a depth file holds is told without torch.
 """

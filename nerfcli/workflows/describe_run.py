@@ -1,4 +1,4 @@
-"""What a run or a file of tensors is, as plain values: settings, decisions, numbers, costs."""
+"""Describe a run or a file of tensors as plain values: settings, decisions, metrics, costs."""
 
 from pathlib import Path
 from typing import Any

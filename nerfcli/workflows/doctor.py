@@ -1,4 +1,4 @@
-"""From a capture to what an expert would say of it: the findings, and a page with thumbnails."""
+"""Examine a capture: findings, and a page with thumbnails."""
 
 import os
 from pathlib import Path

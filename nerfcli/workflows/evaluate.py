@@ -1,4 +1,4 @@
-"""From a run to its numbers on held-out photos: measure them, or keep those of this very checkpoint."""
+"""Evaluate a run on its held-out photos, or keep the metrics of the same checkpoint."""
 
 import platform
 from collections.abc import Callable, Iterator, Sequence

@@ -1,4 +1,4 @@
-"""How a workflow reports: lines for the user, warnings, progress; silent, but for warnings, where nobody says how."""
+"""Callbacks of workflows: messages, warnings, progress; by default only warnings are shown."""
 
 import warnings
 from collections.abc import Callable

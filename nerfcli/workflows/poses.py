@@ -1,4 +1,4 @@
-"""From photos or a video to a scene: estimate poses, keep a scene that is already there, or refuse to touch another."""
+"""Estimate poses of photos or a video, keep an existing scene, or refuse to overwrite another one."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""From a run to pictures, depth maps and videos: render them, go on, or keep what is there."""
+"""Render pictures, depth maps and videos of a run, resume, or keep existing ones."""
 
 from dataclasses import replace
 from pathlib import Path

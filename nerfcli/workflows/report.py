@@ -1,4 +1,4 @@
-"""From runs to one page about them, for which held-out photos are rendered anew."""
+"""Write one page about one or more runs, with held-out photos rendered again."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""From a scene to a run: train it, keep a run that is already there, resume one, or refuse to touch another."""
+"""Train a scene, keep an existing run, resume one, or refuse to overwrite another one."""
 
 import shlex
 from dataclasses import replace
@@ -87,7 +87,7 @@ def train_scene(
 
 
 def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout: str | None = None) -> bool:
-    """Whether a training of this scene with these settings stopped before its end and left a checkpoint."""
+    """Return whether a training of this scene with these settings was interrupted and left a checkpoint."""
     trained = Run(run)
     if not trained.is_trained:
         return False

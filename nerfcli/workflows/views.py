@@ -32,7 +32,7 @@ SCENES = ("nerfcli", "colmap", "transforms", "blender", "llff")
 
 @dataclass(frozen=True)
 class Look:
-    """What pictures of the views are like, where it is not as trained or as the file of cameras says.
+    """Size, lens and crop of the pictures, where they differ from training or from the file of cameras.
 
     Args:
         width, height: in pixels; with one of them the other follows, and with both the picture is cut, never stretched.
@@ -55,7 +55,7 @@ class Look:
         return [*size, *lens, *([] if self.crop is None else ["crop", *map(str, self.crop)])]
 
     def of(self, camera: Camera) -> Camera:
-        """The camera that takes such a picture where another one stands.
+        """Return the camera for such a picture in place of another one.
 
         Raises:
             UserError: a part outside of the picture, or a size or an angle that the lens does not have.
@@ -72,7 +72,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Views:
-    """Which views of a run to see.
+    """Views of a run to render.
 
     Args:
         cameras: test, train, a path, or a file or folder of cameras.

@@ -47,7 +47,7 @@ _SPLITS = ("", "train", "val", "test")
 
 
 def losses_npz(capture: Capture) -> tuple[str, ...]:
-    """What of a capture the file cannot hold: nothing."""
+    """List what the file cannot hold of a capture: nothing."""
     return ()
 
 

@@ -77,7 +77,7 @@ def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None)
 
 
 def losses_blender(capture: Capture) -> tuple[str, ...]:
-    """What of a capture the files of Blender cannot hold.
+    """List what Blender files cannot hold of a capture.
 
     They hold pictures' sizes only through the pictures, so that those of frames without an image are lost; frames
     without a split go to train.

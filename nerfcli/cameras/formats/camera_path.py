@@ -50,7 +50,7 @@ class CameraPath:
 
 
 def is_camera_path(content: dict[str, Any]) -> bool:
-    """Whether a JSON object is a camera path rather than a transforms.json."""
+    """Return whether a JSON object is a camera path rather than a transforms.json."""
     return "camera_path" in content and "frames" not in content
 
 
@@ -87,7 +87,7 @@ def parse_camera_path(path: Path) -> Capture:
 
 
 def losses_camera_path(capture: Capture) -> tuple[str, ...]:
-    """What `write_camera_path` cannot write of a capture, one clause each."""
+    """List what a camera path cannot hold of a capture, one clause each."""
     frames = capture.frames
     kept = _common_cameras(frames)
     counts = {

@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 def is_model(folder: Path) -> bool:
-    """Whether a folder holds the three files of a COLMAP model, binary or text."""
+    """Return whether a folder contains the three files of a COLMAP model, binary or text."""
     return any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in (".bin", ".txt"))
 
 
@@ -68,7 +68,7 @@ def colmap_on_disk(model: ColmapModel, image_dir: Path, measure: Measure, model_
 
 
 def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
-    """All that a COLMAP model says: cameras, poses, points with colours, and every 2D feature.
+    """Read a COLMAP model: cameras, poses, points with colours, and all 2D features.
 
     Frames are in the order of their image ids, and those of one camera share its object. What no capture holds: the
     ids themselves, the mean reprojection error of each point, and rigs.

@@ -97,7 +97,7 @@ def images_of_parts(
 
 
 def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
-    """All that a model says, its frames in the order of the image ids.
+    """Convert a model to a capture, with frames ordered by image id.
 
     Cameras stay shared: frames of one camera id hold the same object. Where the model has no points at all (some people
     empty that file), features have no point. COLMAP leaves points black until it has looked up their colours, so where
@@ -176,7 +176,7 @@ def pose_rows(model: ColmapModel) -> np.ndarray:
 
 
 def tracks(model: ColmapModel) -> tuple[np.ndarray, np.ndarray]:
-    """Where the points of a model were seen.
+    """Return the observations of the points of a model.
 
     Returns:
         elements (M, 2) uint32: image id and index of the feature in that image, point after point; lengths (N,) int64:

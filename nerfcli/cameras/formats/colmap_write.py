@@ -20,12 +20,12 @@ _MODEL_FILES = {
 
 
 def losses_colmap(capture: Capture) -> tuple[str, ...]:
-    """What of a capture a binary COLMAP model cannot hold."""
+    """List what a binary COLMAP model cannot hold of a capture."""
     return tuple(lost_parts(capture, holds=("points", "colours", "observations")))
 
 
 def losses_colmap_text(capture: Capture) -> tuple[str, ...]:
-    """What of a capture a COLMAP model as text cannot hold: COLMAP cuts names at their first space on reading."""
+    """List what a COLMAP text model cannot hold of a capture: COLMAP truncates names at their first space."""
     spaced = sum(" " in frame.name for frame in capture.frames)
     names = [f"{spaced} names with spaces (COLMAP truncates them at the first space)"] if spaced else []
     return (*losses_colmap(capture), *names)

@@ -18,7 +18,7 @@ _LONGEST_NAME = 1000
 
 
 def malformed(where: str, what: str, hint: str) -> UserError:
-    """The error for a field: where it stands, what was found there, and what was expected."""
+    """Create the error for a field: its location, the value found, and the value expected."""
     return UserError(f"{where}: {what}", hint)
 
 
@@ -153,7 +153,7 @@ def name_of(value: Any, where: str) -> str:
 
 
 def refuse_twins(names: Iterable[str], path: Path) -> None:
-    """Check that no name stands for two frames.
+    """Check that no two frames have the same name.
 
     Raises:
         UserError: a name is listed twice, or none is listed.

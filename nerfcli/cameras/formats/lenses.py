@@ -74,7 +74,7 @@ def fisheye_camera(
 def long_fisheye_camera(
     size: tuple[int, int], focal: Pair, centre: Pair, *, radial: tuple[float, ...], where: str
 ) -> Camera:
-    """As `fisheye_camera`, with six radial terms up to k6 r^12 and no other.
+    """Create a camera like `fisheye_camera`, with six radial terms up to k6 r^12 and no other.
 
     Raises:
         UserError: numbers that make no camera; `where` is named.

@@ -16,7 +16,7 @@ MOST_PARAMETER = 1e12
 
 
 def plausible(positions: np.ndarray) -> np.ndarray:
-    """Whether each position (..., 3), or number (..., 1), is finite and below `MOST_UNITS`; (...,) bool."""
+    """Return whether each position (..., 3), or number (..., 1), is finite and below `MOST_UNITS`; (...,) bool."""
     return np.asarray((np.abs(positions) < MOST_UNITS).all(axis=-1))  # False at NaN
 
 

@@ -54,7 +54,7 @@ def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list
 
 
 def parse_llff(folder: Path, list_images: Callable[[Path], list[Path]]) -> Capture:
-    """All that poses_bounds.npy says; cameras are for the full-size photos.
+    """Read poses_bounds.npy; cameras are for the full-size photos.
 
     The file names no photos. They are those of the first image folder that holds one per row; where there is no image
     folder at all, frames are named image000, image001, ... and have no image.
@@ -79,7 +79,7 @@ def parse_llff(folder: Path, list_images: Callable[[Path], list[Path]]) -> Captu
 
 
 def losses_llff(capture: Capture) -> tuple[str, ...]:
-    """What of a capture poses_bounds.npy cannot hold.
+    """List what poses_bounds.npy cannot hold of a capture.
 
     The order of the photos' file names stands for their names, so these are lost only where that order does not tell
     them apart: where photos are in more than one folder.

@@ -81,7 +81,7 @@ def parse_opensfm(path: Path) -> Capture:
 
 
 def losses_opensfm(capture: Capture) -> tuple[str, ...]:
-    """What reconstruction.json cannot hold of a capture. Observations stand in OpenSfM's tracks.csv, not there."""
+    """List what reconstruction.json cannot hold of a capture. Observations are in OpenSfM's tracks.csv."""
     return (*lost_of_cameras(capture, _lost_of), *lost_parts(capture, holds=("points", "colours")))
 
 

@@ -65,7 +65,7 @@ def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def losses_ply(capture: Capture) -> tuple[str, ...]:
-    """What of a capture a PLY file of its points cannot hold."""
+    """List what a PLY file of points cannot hold of a capture."""
     cameras = f"{len(capture.frames)} cameras and their poses"
     return (cameras, *lost_parts(capture, holds=("points", "colours")))
 

@@ -23,7 +23,7 @@ FindMask = Callable[[str, Path], Path | None]
 
 @dataclass(frozen=True)
 class Description:
-    """What a scene.json says.
+    """Content of a scene.json.
 
     Args:
         path: the file.
@@ -77,7 +77,7 @@ class Description:
 
 
 def read_description(root: Path) -> Description:
-    """What the scene.json of a folder says, whichever photos are on disk.
+    """Read the scene.json of a folder, whether or not its photos exist.
 
     Raises:
         UserError: it is missing, of another version, or malformed; the key is named.

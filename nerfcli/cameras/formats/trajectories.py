@@ -57,12 +57,12 @@ def parse_kitti(path: Path, camera: Camera | None) -> Capture:
 
 
 def losses_tum(capture: Capture) -> tuple[str, ...]:
-    """What a TUM trajectory cannot hold of a capture."""
+    """List what a TUM trajectory cannot hold of a capture."""
     return _losses(capture, named=_timestamps(capture) == [frame.name for frame in capture.frames])
 
 
 def losses_kitti(capture: Capture) -> tuple[str, ...]:
-    """What a KITTI trajectory cannot hold of a capture."""
+    """List what a KITTI trajectory cannot hold of a capture."""
     return _losses(capture, named=all(frame.name == _indexed(i) for i, frame in enumerate(capture.frames)))
 
 

@@ -56,7 +56,7 @@ def read_transforms(path: Path, measure: Measure) -> Capture:
 
 
 def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
-    """All that a transforms.json says, whichever images are on disk.
+    """Read a transforms.json, whether or not its images exist.
 
     Poses and points stay in the file's own world. nerfstudio's applied_transform and applied_scale say how that world
     came from the one of the poses' first home (COLMAP's); they are not undone, which would part the cameras from every
@@ -79,7 +79,7 @@ def parse_transforms(path: Path, measure: Measure | None = None) -> Capture:
 
 
 def losses_transforms(capture: Capture) -> tuple[str, ...]:
-    """What of a capture a transforms.json cannot hold. Its points go into a PLY file beside it."""
+    """List what a transforms.json cannot hold of a capture. Points go into a PLY file next to it."""
     parts = lost_parts(capture, holds=("masks", "points", "colours", "splits"))
     return (*lost_of_cameras(capture, lost_to_transforms), *parts)
 
@@ -196,7 +196,7 @@ def listed_frames(
     suffix: str = "",
     images: Path | None = None,
 ) -> list[Frame]:
-    """All frames of a file as it states them; frames of equal intrinsics share one camera.
+    """Return all frames of a file as listed; frames with equal intrinsics share one camera.
 
     Args:
         path: of the file.

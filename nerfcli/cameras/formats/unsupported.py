@@ -1,4 +1,4 @@
-"""What a capture has that a format cannot hold, told in clauses such as "k3 of 12 cameras" or "3 masks"."""
+"""Losses of a conversion, as clauses such as "k3 of 12 cameras" or "3 masks"."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
@@ -11,7 +11,7 @@ _PINHOLE = ("f", "fx", "fy", "cx", "cy")
 
 
 def lost_parts(capture: Capture, *, holds: Collection[str]) -> list[str]:
-    """Clauses for what stands beside the cameras and poses of a capture.
+    """List the losses beyond cameras and poses of a capture.
 
     Args:
         capture: to be written.
@@ -54,12 +54,14 @@ def distortion(camera: Camera) -> dict[str, float]:
 
 
 def projection(camera: Camera) -> str:
-    """How a model maps angles without its distortion terms: "perspective", "fisheye" (equidistant) or "spherical"."""
+    """Return the projection of a model without its distortion: "perspective", "fisheye" (equidistant) or
+    "spherical".
+    """
     return "spherical" if camera.is_spherical else "fisheye" if "FISHEYE" in camera.model else "perspective"
 
 
 def lost_to_pinhole(camera: Camera) -> list[str]:
-    """What of a camera one focal length and the picture's size do not tell, its centre being the principal point."""
+    """List what of a camera is lost if only one focal length and the size are kept, with a centred principal point."""
     if camera.is_spherical:
         return ["the spherical projection"]
     lost = ["the fisheye projection"] if projection(camera) == "fisheye" else []

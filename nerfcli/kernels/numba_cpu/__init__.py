@@ -43,7 +43,7 @@ machine_code.discard_outdated(machine_code.sources(), machine_code.folder())
 
 
 def is_compiled() -> bool:
-    """Whether an earlier process has left compiled kernels on disk."""
+    """Return whether compiled kernels are cached on disk."""
     return machine_code.is_there()
 
 

@@ -1,4 +1,4 @@
-"""Where light ends on CPU threads, a ray at a time: mean, spread, heaviest interval and quantiles in one pass.
+"""Depth of rays on CPU threads, one ray at a time: mean, spread, heaviest interval and quantiles in one pass.
 
 Same operation as `depth.light_ends`, for float32; everything is computed in float64. Mean and variance are updated
 sample by sample around the mean so far, which cancels nothing.

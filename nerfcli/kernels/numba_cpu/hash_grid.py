@@ -251,7 +251,9 @@ class _HashEncode(torch.autograd.Function):
 
 
 def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> bool:
-    """Whether `hash_encode` of this module takes these tensors; what is malformed goes to the reference's checks."""
+    """Return whether this module's `hash_encode` supports these tensors; malformed ones go to the reference's
+    checks.
+    """
     rows, features = table.shape[1:]
     return (
         points.device.type == table.device.type == "cpu"

@@ -1,4 +1,4 @@
-"""Compiled kernels on disk, and that they are those of the sources as they stand.
+"""Cache of compiled kernels on disk, invalidated when the sources change.
 
 Numba compiles a kernel again when the file that it stands in has changed, but not for what it calls in other files.
 Where sources were replaced in place, as `git pull` does, old machine code then worked on buffers of a new shape: a
@@ -25,14 +25,14 @@ def _nothing() -> None:
 
 
 def folder() -> Path:
-    """Where the machine code of these kernels is: beside them or, where nothing can be written there, at the user's."""
+    """Return the cache folder: next to the kernels or, if that is not writable, in the user's cache."""
     place = _nothing.stats.cache_path
     assert place is not None  # it has cache=True
     return Path(place)
 
 
 def is_there() -> bool:
-    """Whether an earlier process has left compiled kernels."""
+    """Return whether compiled kernels are cached on disk."""
     return any(folder().glob("*.nbi"))
 
 

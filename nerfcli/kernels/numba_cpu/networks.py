@@ -302,7 +302,7 @@ class _Radiance(torch.autograd.Function):
 
 
 def can_radiance(encoded: Tensor, weights: tuple[Tensor, ...]) -> bool:
-    """Whether this module has code for these sizes, on this device, in this precision."""
+    """Return whether this module supports these sizes, device and precision."""
     shapes = [tuple(w.shape) for w in weights]
     wanted = [(WIDTH, WIDTH), (OUT, WIDTH), (WIDTH, WIDTH), (WIDTH, WIDTH), (3, WIDTH)]
     return (

@@ -1,4 +1,4 @@
-"""How many threads the compiled loops use."""
+"""Number of threads of the compiled loops."""
 
 import numba
 import torch

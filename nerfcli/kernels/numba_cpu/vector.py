@@ -1,5 +1,5 @@
-"""What Numba has no words for: asking for a cache line ahead of time, rows of a table as vectors, a block of a matrix
-product in registers.
+"""Intrinsics that Numba lacks: prefetching of a cache line, table rows as vectors, a register block of a matrix
+product.
 """
 
 from collections.abc import Callable

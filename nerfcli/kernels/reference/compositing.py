@@ -1,4 +1,4 @@
-"""What light does along rays: optical depths, the weights of intervals, colours, distortion. Letters: `interface`."""
+"""Compositing along rays: optical depth, weights of intervals, colours, distortion. Letters: `interface`."""
 
 import torch
 from torch import Tensor
@@ -39,7 +39,7 @@ def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> T
 
 
 def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-    """The share of light that ends in each interval, and the share that passes them all.
+    """Compute the fraction of light absorbed in each interval, and the fraction that passes all of them.
 
     alpha_i = 1 - exp(-density_i * length_i),  T_i = exp(-tau_i),  weight_i = T_i * alpha_i
 
@@ -94,7 +94,7 @@ def composite(
 
 
 def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
-    """How far the light of each ray ends apart: the mean distance between two places where it ends.
+    """Compute the distortion of each ray: the mean distance between two points at which its light is absorbed.
 
     sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 (ends_i - starts_i), with m the middles; 0 without samples.
 
@@ -126,7 +126,7 @@ def contracted_distance(distance: Tensor) -> Tensor:
 def off_target(
     weights: Tensor, transmittance: Tensor, middles: Tensor, *, offsets: Tensor, distances: Tensor
 ) -> Tensor:
-    """How far from known distances the light of the last K rays ends.
+    """Compute the distance of absorption from known distances, for the last K rays.
 
     sum_i weight_i min(1, |middle_i - distance| / (c distance)) + transmittance,  c = 0.25
 

@@ -1,4 +1,4 @@
-"""Where the light of rays ends: means, quantiles and spread of the end distance, in plain torch, as definitions.
+"""Depth of rays: means, quantiles and spread of the distance of absorption, in plain torch, as definitions.
 
 For a ray with density sigma(t), transmittance T(t) and end density p(t) = T(t) sigma(t), whose integral is the opacity.
 Density is constant inside an interval, and everything here is exact for that: no midpoints. Packed samples as in
@@ -36,7 +36,7 @@ BISECTIONS = 40
 
 
 def mean_fraction(optical_depth: Tensor) -> Tensor:
-    """Mean place, as a share of the interval, where light ends that ends inside an interval of constant density.
+    """Compute the mean position of absorption within an interval of constant density, as a fraction of the interval.
 
     g(x) = 1/x - 1/(exp(x) - 1), written as 1/x - exp(-x) / (1 - exp(-x)); 1/2 at 0, 1/x at infinity.
 
@@ -151,7 +151,7 @@ def max_weight(weights: Tensor, means: Tensor, offsets: Tensor) -> Tensor:
 
 
 def quantile(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, share: float) -> Tensor:
-    """The distance by which `share` of all light of the ray has ended, solved inside its interval, (R,).
+    """Compute the distance by which `share` of the light of a ray is absorbed, solved inside its interval, (R,).
 
     T(t) = 1 - share, so t = t0 + (-log(1 - share) - tau_before) / density in the interval where the optical depth
     passes -log(1 - share). Of all light, not of that which ends: NaN for a ray whose opacity stays below `share`, which
@@ -208,7 +208,7 @@ def light_ends(
 def mixture_quantile(
     density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, rays_per_pixel: int, share: float
 ) -> Tensor:
-    """The distance by which `share` of all light of a group of rays has ended, each ray counting alike.
+    """Compute the distance by which `share` of the light of a group of equally weighted rays is absorbed.
 
     mean_k T_k(t) = 1 - share, solved by bisection to 1e-12 of the group's farthest sample.
 

@@ -59,7 +59,7 @@ def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, 
 
 @torch.no_grad()
 def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
-    """The samples of `march` in front of which the optical depth is below a limit, with what the grid says of them.
+    """Return the samples of `march` in front of which the optical depth is below a limit, with their encoding.
 
     What is left out takes at most exp(-max_optical_depth) of a ray's light. Without gradients.
     """
