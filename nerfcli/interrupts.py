@@ -20,8 +20,8 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM came; what answers Ctrl-C answers this."""
 
 
-def hear_signals() -> None:
-    """Have SIGTERM raise `Terminated`, unless whoever started this process has it ignored; and lose no interrupt.
+def install_handlers() -> None:
+    """Make SIGTERM raise `Terminated`, unless the parent process ignores it; and lose no interrupt.
 
     Python drops what is raised in a callback of C code or while an object is freed, numba's compiler for instance: what
     was dropped is raised once more, elsewhere.
@@ -31,8 +31,8 @@ def hear_signals() -> None:
     sys.unraisablehook = _raise_again
 
 
-def give_back_sigterm() -> None:
-    """Have SIGTERM do what Python last had it do, after a C++ library has taken it without asking.
+def restore_sigterm() -> None:
+    """Restore Python's SIGTERM handler after a C++ library has replaced it.
 
     Outside of the main thread, which alone may do this, nothing changes.
     """
@@ -43,7 +43,7 @@ def give_back_sigterm() -> None:
 
 
 class Interrupts:
-    """Whether Ctrl-C or SIGTERM came."""
+    """Records whether Ctrl-C or SIGTERM arrived."""
 
     def __init__(self) -> None:
         self.came: type[KeyboardInterrupt] | None = None
@@ -57,8 +57,8 @@ class Interrupts:
         else:
             self.came = KeyboardInterrupt
 
-    def answer(self) -> None:
-        """Raise what came meanwhile.
+    def raise_if_pending(self) -> None:
+        """Raise the interrupt that arrived meanwhile.
 
         Raises:
             KeyboardInterrupt: Ctrl-C came.
@@ -69,8 +69,8 @@ class Interrupts:
 
 
 @contextmanager
-def held_back() -> Iterator[Interrupts]:
-    """Hold Ctrl-C back until it is asked for, and SIGTERM where `hear_signals` hears it.
+def deferred_interrupts() -> Iterator[Interrupts]:
+    """Defer Ctrl-C, and SIGTERM if `install_handlers` handles it, until `raise_if_pending`.
 
     Outside of the main thread, to which signals do not come, nothing is held back.
     """

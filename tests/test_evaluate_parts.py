@@ -17,7 +17,7 @@ from nerfcli.cameras.rigid import Similarity, apply, inverse, look_at, transform
 from nerfcli.errors import UserError
 from nerfcli.evaluate import perceptual
 from nerfcli.evaluate.colour import colour_aligned
-from nerfcli.evaluate.ledger import leak_ledger, told
+from nerfcli.evaluate.ledger import leak_ledger, summary_line
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.pose_refinement import align_pose, halves
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
@@ -189,7 +189,7 @@ def test_the_ledger_says_what_each_way_to_poses_has_seen():
     foreign = seen({"history": {"from": "blender"}})
     assert (foreign["poses"], foreign["training"]) == (None, False)
     assert seen({})["poses"] is None
-    assert told(leak_ledger(RunConfig(history={"from": "llff"}))).startswith(
+    assert summary_line(leak_ledger(RunConfig(history={"from": "llff"}))).startswith(
         "held-out photos were seen by normalisation; perhaps seen by poses, intrinsics, points; not seen by "
     )
 

@@ -22,7 +22,7 @@ from nerfcli.export.frames import RAYS_PER_PROCESS, Workers, automatic_workers, 
 from nerfcli.export.order import Order
 from nerfcli.export.presentation import playing_order
 from nerfcli.export.settings import ExportSettings, VideoSettings
-from nerfcli.interrupts import Terminated, hear_signals
+from nerfcli.interrupts import Terminated, install_handlers
 from nerfcli.media.descriptions import description_of
 from nerfcli.media.images import read_image
 from nerfcli.render.depth import DepthRequest
@@ -210,7 +210,7 @@ def test_ctrl_c_or_sigterm_while_a_process_starts_is_kept_and_ends_it(sent, rais
     monkeypatch.setattr(multiprocessing.get_context("spawn").Process, "start", start_and_interrupt)
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
-    hear_signals()
+    install_handlers()
     try:
         with pytest.raises(raised):
             export_frames(

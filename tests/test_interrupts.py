@@ -29,7 +29,7 @@ def test_pycolmap_leaves_sigterm_alone_and_keeps_its_traces_of_crashes():
 def test_a_process_that_ignores_sigterm_goes_on_doing_so():
     program = (
         "import os, signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
-        "from nerfcli.interrupts import hear_signals; hear_signals()\n"
+        "from nerfcli.interrupts import install_handlers; install_handlers()\n"
         "import nerfcli.cameras.camera; os.kill(os.getpid(), signal.SIGTERM); print('alive')"
     )
     assert ended(program).stdout == "alive\n"
@@ -39,9 +39,9 @@ def test_an_interrupt_that_python_drops_in_a_callback_of_c_comes_again():
     """While numba compiles, LLVM calls back into Python; there a KeyboardInterrupt becomes a message on stderr."""
     program = """
 import ctypes, os, signal, time
-from nerfcli.interrupts import Terminated, hear_signals
+from nerfcli.interrupts import Terminated, install_handlers
 
-hear_signals()
+install_handlers()
 
 @ctypes.CFUNCTYPE(None)
 def callback():

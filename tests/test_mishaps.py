@@ -19,7 +19,7 @@ from full_disk import files_of_at_most
 from nerfcli import atomic, kernels, scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
 from nerfcli.exclusive import exclusive
-from nerfcli.interrupts import hear_signals
+from nerfcli.interrupts import install_handlers
 from nerfcli.runs.files import LOCK
 
 ONE_STEP = ("--steps", "1", "--downscale", "8", "--threads", "2")
@@ -79,7 +79,7 @@ def interrupted_when_written(monkeypatch: pytest.MonkeyPatch, request: pytest.Fi
     monkeypatch.setattr(atomic.os, "replace", replace_and_interrupt)
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a suite in the background ignores it
-    hear_signals()
+    install_handlers()
     yield met
     signal.signal(signal.SIGINT, before)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

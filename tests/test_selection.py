@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Decision, Selection
-from nerfcli.search.diagnostics import Signs
+from nerfcli.search.diagnostics import Diagnostics
 from nerfcli.search.judgement import (
     CLEAR_ERRORS,
     FLOOR,
@@ -24,15 +24,15 @@ from nerfcli.search.judgement import (
     judge_removal,
     judge_supported,
 )
-from nerfcli.search.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_SHARE, Purse
+from nerfcli.search.race import COSTS_MORE, NO_TIME, ONCE, REMOVAL_SHARE, SearchBudget
 from nerfcli.search.selection import (
     MOST_START_STEPS,
     Facts,
     is_worth_a_search,
+    may_use_points,
     proposals,
     removals,
     select,
-    tells_points,
     with_known_cameras,
 )
 from nerfcli.search.trials import Trial, TrialStart
@@ -164,8 +164,8 @@ def test_a_photo_without_pixels_to_judge_by_counts_nothing():
 SKY = (15.0, 24.0)
 
 
-def signs(spread: float, far: float = 0.05, sky: tuple[float, float] = SKY) -> Signs:
-    return Signs(torch.zeros(PHOTOS, 3), spread, far, sky)
+def signs(spread: float, far: float = 0.05, sky: tuple[float, float] = SKY) -> Diagnostics:
+    return Diagnostics(torch.zeros(PHOTOS, 3), spread, far, sky)
 
 
 def test_proposals_leave_alone_what_the_user_decided_and_what_nothing_speaks_for():
@@ -283,11 +283,11 @@ def test_points_are_left_alone_where_the_user_decides_alpha_tells_or_there_are_n
 @pytest.mark.parametrize(("misses", "tells"), [(0.3, True), (0.7, False)])
 def test_points_are_asked_only_where_the_cameras_fit(misses, tells):
     facts = replace(FITTED, cameras=CameraCheck(0.0, 0.001, (misses, misses), 1000))
-    assert tells_points(Components(), facts) is tells
-    assert tells_points(Components(), FITTED)
-    assert not tells_points(Components(cameras="poses"), FITTED)
-    assert not tells_points(Components(), replace(FITTED, fixed=("points",)))
-    assert tells_points(Components(points=0.2), replace(facts, fixed=("points",)))
+    assert may_use_points(Components(), facts) is tells
+    assert may_use_points(Components(), FITTED)
+    assert not may_use_points(Components(cameras="poses"), FITTED)
+    assert not may_use_points(Components(), replace(FITTED, fixed=("points",)))
+    assert may_use_points(Components(points=0.2), replace(facts, fixed=("points",)))
 
 
 @pytest.mark.parametrize(("far", "kept"), [(0.05, False), (0.15, True)])
@@ -501,11 +501,11 @@ def test_of_values_that_gain_as_much_the_plainest_is_kept():
 
 
 def test_leaving_out_may_not_use_up_a_limit_of_time_but_may_use_up_steps():
-    purse = Purse(100.0, None)
-    assert purse.takes(3, of_steps=0, seconds_each=30.0)
-    assert not purse.takes(3, of_steps=0, seconds_each=30.0, share_of_time=REMOVAL_SHARE)
-    assert purse.takes(1, of_steps=0, seconds_each=60.0, share_of_time=REMOVAL_SHARE)
-    assert Purse(None, 100).takes(2, of_steps=50, seconds_each=math.inf, share_of_time=REMOVAL_SHARE)
+    purse = SearchBudget(100.0, None)
+    assert purse.can_afford(3, of_steps=0, seconds_each=30.0)
+    assert not purse.can_afford(3, of_steps=0, seconds_each=30.0, share_of_time=REMOVAL_SHARE)
+    assert purse.can_afford(1, of_steps=0, seconds_each=60.0, share_of_time=REMOVAL_SHARE)
+    assert SearchBudget(None, 100).can_afford(2, of_steps=50, seconds_each=math.inf, share_of_time=REMOVAL_SHARE)
 
 
 @pytest.mark.parametrize(("gain", "kept"), [(0.04, True), (-0.04, True), (-0.3, False)])

@@ -19,7 +19,7 @@ from nerfcli.media.images import downscale, write_png
 from nerfcli.memory import resident_bytes
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.photos.pool import Album, PixelPool, load_album
-from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, Room, room_for
+from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, PhotoStorage, storage_for
 from nerfcli.render.rays import frame_rays
 from nerfcli.scene import Scene
 
@@ -257,7 +257,7 @@ def test_photos_that_do_not_fit_their_camera_are_told(tmp_path):
         (replace(frame, image=tmp_path / "small.png"), r"small\.png is 20x15 pixels, but its camera is for 40x30"),
         (
             replace(frame, image=tmp_path / "photo.png", mask=tmp_path / "small.png"),
-            r"small\.png is 20x15, its photo is 40x30",
+            r"small\.png is 20x15, but its photo is 40x30",
         ),
         (replace(frame, image=tmp_path / "gone.png"), r"gone\.png is not there"),
     ):
@@ -305,9 +305,9 @@ def test_a_pixel_is_found_again_by_its_number():
         assert by_name[name][y, x, 0] == pool.colours[number, 0]
 
 
-def drawn_from(frames: list[Frame], room: Room) -> tuple[list[bytes], Album, PixelPool]:
-    album = load_album(frames, factor=2, threads=2, room=room)
-    pool = PixelPool(album.photos, SIMILARITY, CPU, colours=album.colours, room=room)
+def drawn_from(frames: list[Frame], room: PhotoStorage) -> tuple[list[bytes], Album, PixelPool]:
+    album = load_album(frames, factor=2, threads=2, storage=room)
+    pool = PixelPool(album.photos, SIMILARITY, CPU, colours=album.colours, storage=room)
     drawn = pool.draw(3000, torch.Generator().manual_seed(4))
     return [tensor.numpy().tobytes() for tensor in drawn], album, pool
 
@@ -341,22 +341,22 @@ def test_pages_are_given_back_beyond_the_limit(tmp_path):
     array = room.array((2**26,), np.uint8)
     for part in range(16):
         array[part * 2**22 : (part + 1) * 2**22] = part
-        room.relieve()
+        room.release_pages()
     assert resident_bytes(os.getpid()) < before + 2**24  # of 2**26 written
     assert [int(array[part * 2**22 + 7]) for part in range(16)] == list(range(16))
 
 
 def test_what_does_not_fit_is_refused_up_front(tmp_path):
     needs = Needs(photos=3 * 10**9, rest=10**9)
-    assert room_for(needs, None, folder=tmp_path)[0] is IN_MEMORY
-    assert room_for(needs, 4 * 10**9, folder=tmp_path)[0] is IN_MEMORY
-    room, told = room_for(needs, 2 * 10**9, folder=tmp_path)
+    assert storage_for(needs, None, folder=tmp_path)[0] is IN_MEMORY
+    assert storage_for(needs, 4 * 10**9, folder=tmp_path)[0] is IN_MEMORY
+    room, told = storage_for(needs, 2 * 10**9, folder=tmp_path)
     assert isinstance(room, InFiles)
     assert "about 4.00 GB needed, limit 2.00 GB: the photos (3.00 GB) are kept in temporary files" in told
     with pytest.raises(
         UserError, match=r"needs about 1\.00 GB of memory in addition to the photos, but the limit is 0\.90 GB"
     ) as caught:
-        room_for(needs, 9 * 10**8, folder=tmp_path)
+        storage_for(needs, 9 * 10**8, folder=tmp_path)
     assert caught.value.exit_code == OUT_OF_MEMORY
 
 

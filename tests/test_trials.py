@@ -17,7 +17,7 @@ from nerfcli.photos.pool import load_album
 from nerfcli.photos.storage import IN_MEMORY
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.search.diagnostics import signs_of
+from nerfcli.search.diagnostics import diagnose
 from nerfcli.search.trials import Trials, TrialStart
 
 SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=2**11, threads=1)
@@ -25,7 +25,7 @@ SETTINGS = TrainSettings(budget_seconds=None, steps=100, first_samples_per_step=
 
 @pytest.fixture(scope="module")
 def trials(spheres) -> Trials:
-    album = load_album(spheres.train_frames, factor=4, threads=1, room=IN_MEMORY)
+    album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
     extent = choose_extent(spheres, SETTINGS, fills_frame=False)
     return Trials(album.photos, extent, settings=SETTINGS, exif=np.zeros(len(album.photos)), colours=album.colours)
 
@@ -121,7 +121,7 @@ def test_cameras_learn_from_the_fork_on(trials, start):
 def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkeypatch, distance):
     """Fog of one density sigma everywhere: exp(-sigma t), t the way from the middle of the first step to that of the
     last one before the distance."""
-    album = load_album(spheres.train_frames, factor=4, threads=1, room=IN_MEMORY)
+    album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
     everywhere = replace(choose_extent(spheres, SETTINGS, fills_frame=False), contraction="l2")
     exif = np.zeros(len(album.photos))
     trials = Trials(album.photos, everywhere, settings=SETTINGS, exif=exif, colours=album.colours)
@@ -146,7 +146,7 @@ def test_light_from_beyond_a_distance_is_what_passes_until_there(spheres, monkey
 
 def test_trials_see_through_the_lens_that_is_known_before(spheres):
     """Matches say that lenses are 5 % longer: what learns them starts there, and its rays are closer together."""
-    album = load_album(spheres.train_frames, factor=4, threads=1, room=IN_MEMORY)
+    album = load_album(spheres.train_frames, factor=4, threads=1, storage=IN_MEMORY)
     extent = choose_extent(spheres, SETTINGS, fills_frame=False)
     exif = np.zeros(len(album.photos))
     trials = Trials(album.photos, extent, settings=SETTINGS, exif=exif, log_focal=math.log(1.05), colours=album.colours)
@@ -177,7 +177,7 @@ def test_the_brightness_of_photos_is_found_among_highlights_and_noise():
     lit = torch.rand(len(photos), generator=generator) < 0.2
     measured[lit] = exposed(measured[lit], torch.tensor(math.log(3.0)))
     measured = (measured + 2 / 255 * torch.randn(measured.shape, generator=generator)).clamp(0.0, 1.0)
-    signs = signs_of(rendered, measured, photos, directions=rendered, from_beyond=torch.zeros(len(photos)), count=9)
+    signs = diagnose(rendered, measured, photos, directions=rendered, from_beyond=torch.zeros(len(photos)), count=9)
     assert (signs.log_gains - gains).abs().max() < 0.03
     assert signs.exposure_spread == pytest.approx(gains.mean(1).std().item(), abs=0.02)
 
@@ -189,7 +189,7 @@ def test_photos_of_one_exposure_have_no_spread_and_an_empty_photo_is_left_alone(
     measured = rendered + 0.05 * torch.randn(rendered.shape, generator=generator)
     measured[photos == 5] = 1.0
     from_beyond = torch.linspace(0.0, 1.0, len(photos))
-    signs = signs_of(rendered, measured.clamp(0.0, 1.0), photos, directions=rendered, from_beyond=from_beyond, count=8)
+    signs = diagnose(rendered, measured.clamp(0.0, 1.0), photos, directions=rendered, from_beyond=from_beyond, count=8)
     assert signs.exposure_spread < 0.02
     assert signs.far_share == 0.5
     assert signs.log_gains[5].tolist() == [0.0] * 3

@@ -110,8 +110,8 @@ def _measure_run(subject: BenchedRun, run: Path, wanted: BenchOptions, session: 
     if model.sha256 != subject.identity:
         raise UserError(f"{run / FIELD} was replaced while bench started", "wait until the training has finished")
     if wanted.sweep != "train":
-        share = _RENDERING_SHARE if wanted.sweep == "both" and subject.scene is not None else 1.0
-        _render(subject, model, session, ends=share * ends)
+        fraction = _RENDERING_SHARE if wanted.sweep == "both" and subject.scene is not None else 1.0
+        _render(subject, model, session, ends=fraction * ends)
     if wanted.sweep == "render":
         return
     if subject.scene is None:
@@ -135,11 +135,11 @@ def _measure_scene(subject: BenchedRun, wanted: BenchOptions, session: Session) 
     assert subject.scene is not None
     ends = (1.0 - _KEPT_BACK) * wanted.budget_seconds
     settings = train_settings()
-    share = {"both": 1.0 - _RENDERING_SHARE, "train": 1.0, "render": _RENDERING_SHARE}[wanted.sweep]
+    fraction = {"both": 1.0 - _RENDERING_SHARE, "train": 1.0, "render": _RENDERING_SHARE}[wanted.sweep]
     if wanted.sweep == "render":
         settings = settings[:1]  # there must be a field to look at
     trainings = Trainings(subject.scene, subject.base, subject.shown, kept=settings[0].name)
-    measure_trainings(trainings, settings, session=session, seconds=share * ends - session.spent)
+    measure_trainings(trainings, settings, session=session, seconds=fraction * ends - session.spent)
     field = session.folder / KEPT_FIELD
     if wanted.sweep != "train" and field.exists():
         _render(subject, load_model(field, subject.base.device), session, ends=ends)

@@ -196,8 +196,8 @@ def affordable(
 
 def fraction(value: float) -> str:
     """1/255 where a number is one over a whole one, else plain."""
-    share = Fraction(value).limit_denominator(10**6)
-    return str(share) if share.numerator == 1 and value < 1 else f"{value:g}"
+    fraction = Fraction(value).limit_denominator(10**6)
+    return str(fraction) if fraction.numerator == 1 and value < 1 else f"{value:g}"
 
 
 def _fewer(threads: int) -> list[int]:

@@ -14,12 +14,12 @@ import pycolmap
 
 from nerfcli.cameras.lens import DISTORTIONS, Lens, lens_of
 from nerfcli.errors import UserError
-from nerfcli.interrupts import give_back_sigterm
+from nerfcli.interrupts import restore_sigterm
 
 # COLMAP warns through glog on stderr; what matters comes back as an exception or as NaN.
 pycolmap.logging.minloglevel = 2
 # Importing it has glog answer SIGTERM with a stack trace, as if it were a crash.
-give_back_sigterm()
+restore_sigterm()
 
 # Rows that are worked on at a time.
 BLOCK_SIZE = 2**15

@@ -208,20 +208,20 @@ class Distortion:
         plane, active, target = start.copy(), np.arange(targets.shape[1]), targets
         here = self._pulled_back(start)
         error = self.apply(here) - target
-        share = np.ones(len(active))
+        fraction = np.ones(len(active))
         for _ in range(MOST_STEPS):
-            step = share * _solve(self.jacobian(here), error)
+            step = fraction * _solve(self.jacobian(here), error)
             moved = self._pulled_back(here - step)
             error_moved = self.apply(moved) - target
             closer = _radius(error_moved) < _radius(error)
             here, error = np.where(closer, moved, here), np.where(closer, error_moved, error)
-            share = np.where(closer, 1.0, share / 2)
+            fraction = np.where(closer, 1.0, fraction / 2)
             plane[:, active] = here
             left = _radius(step) > LAST_STEP * _radius(here)
             if not left.any():
                 break
             active, here, target = active[left], here[:, left], target[:, left]
-            error, share = error[:, left], share[left]
+            error, fraction = error[:, left], fraction[left]
         return plane
 
     def _largest(self) -> float:

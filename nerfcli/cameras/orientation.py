@@ -142,7 +142,7 @@ def counted(sizes: Iterable[tuple[Size, Size] | None]) -> dict[tuple[Size, Size]
     return dict(Counter(pair for pair in sizes if pair is not None))
 
 
-def rescaling_told(rescaled: Mapping[tuple[Size, Size], int]) -> list[str]:
+def describe_rescaling(rescaled: Mapping[tuple[Size, Size], int]) -> list[str]:
     """Describe `Capture.rescaled`, one sentence per pair of sizes."""
     return [
         f"{count} photo{'s are' if count > 1 else ' is'} {width}x{height}, but the intrinsics are for {of_width}x"

@@ -20,7 +20,7 @@ from nerfcli.cli import (
     selftest,
     train,
 )
-from nerfcli.interrupts import hear_signals
+from nerfcli.interrupts import install_handlers
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -69,5 +69,5 @@ def main() -> None:
     # the same cores then wait for each other's waiting: 58 training steps in 10 s, where there are 245 with this.
     # libgomp reads it when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-    hear_signals()
+    install_handlers()
     app(prog_name="nerfcli")  # and not "python -m nerfcli", which no shell could complete

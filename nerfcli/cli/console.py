@@ -77,13 +77,13 @@ class Console:
         with ExitStack() as stack:
             bar: Callable[[float, str], None] | None = None
 
-            def update(share: float, detail: str) -> None:
+            def update(fraction: float, detail: str) -> None:
                 nonlocal bar
                 if bar is None:
                     bar = stack.enter_context(_bar(title) if sys.stderr.isatty() else _plain_lines(title))
-                bar(share, detail)
+                bar(fraction, detail)
 
-            yield (lambda share, detail: None) if self.quiet else update
+            yield (lambda fraction, detail: None) if self.quiet else update
 
 
 def _print_table(
@@ -115,18 +115,18 @@ def _bar(title: str) -> Iterator[Callable[[float, str], None]]:
     )
     with Progress(*columns, console=RichConsole(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=1.0, detail="")
-        yield lambda share, detail: bar.update(task, completed=share, detail=detail)
+        yield lambda fraction, detail: bar.update(task, completed=fraction, detail=detail)
 
 
 @contextmanager
 def _plain_lines(title: str) -> Iterator[Callable[[float, str], None]]:
     last = time.monotonic()
 
-    def update(share: float, detail: str) -> None:
+    def update(fraction: float, detail: str) -> None:
         nonlocal last
         if time.monotonic() - last >= PLAIN_LINE_SECONDS:
             last = time.monotonic()
-            _stderr(f"{title}: {100 * share:.0f} % {detail}".rstrip())
+            _stderr(f"{title}: {100 * fraction:.0f} % {detail}".rstrip())
 
     yield update
 

@@ -136,7 +136,7 @@ def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
 def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None:
     """Print what was measured in a few lines and a table; nothing of what was kept."""
     from nerfcli.evaluate.billboards import Shape
-    from nerfcli.evaluate.ledger import Entry, told
+    from nerfcli.evaluate.ledger import Entry, summary_line
 
     if evaluation.is_kept:
         return
@@ -159,7 +159,7 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
     if kinds:
         parts = [f"{group['images']} by {kind}, PSNR {group['psnr']:.2f} dB" for kind, group in kinds.items()]
         console.note(f"views: {'; '.join(parts)}")
-    console.note(told([Entry(**entry) for entry in metrics["ledger"]]))
+    console.note(summary_line([Entry(**entry) for entry in metrics["ledger"]]))
 
 
 def print_spread(folders: Sequence[Path], measured: Sequence[dict[str, Any]], console: Console) -> None:

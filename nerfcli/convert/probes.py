@@ -92,8 +92,8 @@ def _synthetic(capture: Capture, rng: np.random.Generator) -> tuple[np.ndarray, 
     size = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)
     centre = np.array([camera.principal_point for camera in cameras])
     focal_px = np.array([camera.focal_px for camera in cameras])
-    share = rng.random((len(cameras), SYNTHETIC_PER_VIEW, 2))
-    across = (share * size[:, None] - centre[:, None]) / focal_px[:, None, None]
+    fraction = rng.random((len(cameras), SYNTHETIC_PER_VIEW, 2))
+    across = (fraction * size[:, None] - centre[:, None]) / focal_px[:, None, None]
     theta = np.linalg.norm(across, axis=2, keepdims=True)
     directions = np.concatenate([across * np.sinc(theta / np.pi), np.cos(theta)], axis=2)
     distances = scene_distance(capture) * 2.0 ** rng.uniform(-1, 1, theta.shape)

@@ -47,10 +47,10 @@ def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> Tw
     Accuracy: with focal lengths that are off by 20 %, so is the baseline over the depth, about.
     """
     homography, inside = cv2.findHomography(x, y, cv2.USAC_MAGSAC, WITHIN_PX, None, 1000, 0.999)
-    share = 0.0 if homography is None or inside is None else float(inside.mean())
-    if homography is not None and share >= _EXPLAINS:
+    fraction = 0.0 if homography is None or inside is None else float(inside.mean())
+    if homography is not None and fraction >= _EXPLAINS:
         rotation_deg, ratio = _of_homography(homography, focals_px)
-        return TwoViews(share, rotation_deg, ratio)
+        return TwoViews(fraction, rotation_deg, ratio)
     one, other = x / focals_px[0], y / focals_px[1]
     threshold = WITHIN_PX / max(focals_px)
     essential, _ = cv2.findEssentialMat(one, other, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, 500)
@@ -60,7 +60,7 @@ def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> Tw
     distances = _distances(one, other, rotation=rotation, translation=translation.ravel())
     if len(distances) < 10:
         return None
-    return TwoViews(share, _angle_deg(rotation), float(1 / np.median(distances)))
+    return TwoViews(fraction, _angle_deg(rotation), float(1 / np.median(distances)))
 
 
 def _of_homography(homography: np.ndarray, focals_px: tuple[float, float]) -> tuple[float, float]:

@@ -68,8 +68,8 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
         if len(photos) > 2 and (best[i] < WEAK_MATCHES or partners[i] < _FEWEST_PARTNERS) and i not in loose
     ]
     said += [(photos[i].name, f"{several(partners[i], 'partner')}, best {best[i]} matches") for i in weak]
-    share = len(parts[0]) / len(photos)
-    verdict = worst([GOOD if len(parts) == 1 else BAD if share < 0.9 else LOOK, LOOK if weak else GOOD])
+    fraction = len(parts[0]) / len(photos)
+    verdict = worst([GOOD if len(parts) == 1 else BAD if fraction < 0.9 else LOOK, LOOK if weak else GOOD])
     sizes = " + ".join(str(len(part)) for part in parts[:6]) + (" + ..." if len(parts) > 6 else "")
     summary = (
         f"{len(parts)} parts without matches between them: {sizes}" if len(parts) > 1 else "all photos are connected"
@@ -80,7 +80,7 @@ def connectivity(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding
         "connectivity",
         verdict,
         summary,
-        share,
+        fraction,
         f"fraction of photos in the largest part: look below 1, bad below 0.9; per photo: look below {WEAK_MATCHES} "
         f"matches with its best partner or fewer than {_FEWEST_PARTNERS} partners",
         "" if verdict == GOOD else "add photos in between, so that each overlaps its neighbours by two thirds",

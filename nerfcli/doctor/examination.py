@@ -70,10 +70,10 @@ def examine(
     """
     count = len(subject.sources)
     reading = count * _SECONDS_PER_PHOTO
-    share = reading / (reading + connectivity.pair_count(count) * _SECONDS_PER_PAIR)
+    fraction = reading / (reading + connectivity.pair_count(count) * _SECONDS_PER_PAIR)
 
     def on_photo(done: int) -> None:
-        progress(share * done / count, f"photo {done} of {count}")
+        progress(fraction * done / count, f"photo {done} of {count}")
 
     facts, unreadable = read_all(subject.sources, threads=threads, progress=on_photo)
     if not facts:
@@ -83,7 +83,7 @@ def examine(
     places = connectivity.choose_pairs(facts)
 
     def on_pair(done: int) -> None:
-        progress(share + (1 - share) * done / max(len(places), 1), f"pair {done} of {len(places)}")
+        progress(fraction + (1 - fraction) * done / max(len(places), 1), f"pair {done} of {len(places)}")
 
     focals = _focals(subject, facts) if calibration is None else _known_focals(subject, facts, calibration)
     pairs = compare_all(facts, places, focals, threads=threads, progress=on_pair)

@@ -41,12 +41,12 @@ def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | N
         return None
     middle = float(np.median(largest[known]))
     standing = [i for i in np.argsort(np.where(known, largest, np.inf)) if known[i] and largest[i] < BASELINE_BAD]
-    share = len(standing) / int(known.sum())
-    verdict = worst([verdict_below(middle, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if share > 0.1 else GOOD])
+    fraction = len(standing) / int(known.sum())
+    verdict = worst([verdict_below(middle, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if fraction > 0.1 else GOOD])
     summary = f"median baseline / depth {middle:.2f}"
     if verdict == BAD:
         summary = f"the camera only turned or hardly moved: median baseline / depth {middle:.3f}"
-    elif share > 0.1:
+    elif fraction > 0.1:
         summary += f"; {several(len(standing), 'photo')} without sideways movement to any other"
     return Finding(
         "movement",
@@ -66,13 +66,13 @@ def flatness(pairs: Sequence[Pair]) -> Finding | None:
     moved = [pair.views for pair in pairs if pair.views is not None and pair.views.baseline_over_depth > _MOVED]
     if len(moved) < _LEAST_PAIRS:
         return None
-    share = float(np.mean([views.flat for views in moved]))
-    verdict = LOOK if share >= _FLAT_LOOK else GOOD
+    fraction = float(np.mean([views.flat for views in moved]))
+    verdict = LOOK if fraction >= _FLAT_LOOK else GOOD
     return Finding(
         "depth relief",
         verdict,
-        f"{100 * share:.0f} % of {len(moved)} pairs with movement show only a single plane",
-        share,
+        f"{100 * fraction:.0f} % of {len(moved)} pairs with movement show only a single plane",
+        fraction,
         f"look from {_FLAT_LOOK:g}",
         "a flat scene does not determine the focal length: include objects at other distances, or give --intrinsics"
         if verdict == LOOK
@@ -102,15 +102,15 @@ def moving_content(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Findi
             said.append(
                 (patch.matches, photos[photo].name, f"at {across:.0f} % across, {down:.0f} % down{stays}"),
             )
-    share = len(said) / len(photos)
+    fraction = len(said) / len(photos)
     advice = "mask it, or remove these photos: moving objects become fog and disturb poses"
     if still:
         advice += "; content fixed in the image is a watermark, a strap, or the background of a turntable"
     return Finding(
         "moving content",
-        BAD if share > 0.5 else LOOK if said else GOOD,
+        BAD if fraction > 0.5 else LOOK if said else GOOD,
         f"independent movement in {several(len(said), 'photo')}" if said else "none found",
-        share,
+        fraction,
         "look from 1 photo, bad from half of them",
         advice if said else "",
         tuple((name, what) for _, name, what in sorted(said, reverse=True)),

@@ -171,10 +171,10 @@ def duplicates(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding:
             exact += 1
         elif pair.shift < _SAME_PLACE and likeness > _ALIKE:
             said[other.name] = f"nearly the same as {one.name}"
-    share = len(said) / len(photos)
+    fraction = len(said) / len(photos)
     return Finding(
         "duplicates",
-        verdict_above(share, look=1e-9, bad=0.3) if exact or share > 0.1 else GOOD,
+        verdict_above(fraction, look=1e-9, bad=0.3) if exact or fraction > 0.1 else GOOD,
         f"{exact} exact duplicates, {len(said) - exact} taken from the same place as another" if said else "none",
         len(said),
         "look from 1 duplicate file or 10 % from the same place, bad from 30 % of the photos",

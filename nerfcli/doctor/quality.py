@@ -61,8 +61,8 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
     ]
     middle = float(np.median(own[~blank])) if (~blank).any() else float("nan")
     whole = GOOD if np.isnan(middle) else verdict_below(middle, look=SOFT, bad=VERY_SOFT)
-    share = float(blurred.mean())
-    verdict = worst([whole, BAD if share > 0.3 or very.mean() > 0.1 else LOOK if blurred.any() else GOOD])
+    fraction = float(blurred.mean())
+    verdict = worst([whole, BAD if fraction > 0.3 or very.mean() > 0.1 else LOOK if blurred.any() else GOOD])
     parts = []
     if blurred.any():
         parts.append(f"{blurred.sum()} of {several(len(photos), 'photo')} blurred")
@@ -79,7 +79,7 @@ def sharpness(photos: Sequence[PhotoFacts], lack: np.ndarray) -> Finding:
         "sharpness",
         verdict,
         "; ".join(parts),
-        share,
+        fraction,
         f"detail: look below {100 * 2 ** (-BLURRED):.0f} % of the usual detail, bad from 30 % of the photos",
         "; ".join(advice),
         tuple(said),
@@ -96,12 +96,12 @@ def texture(photos: Sequence[PhotoFacts]) -> Finding:
         for photo in photos
         if len(photo.features.pixels) < 150
     ]
-    share = len(poor) / len(photos)
+    fraction = len(poor) / len(photos)
     return Finding(
         "texture",
-        verdict_above(share, look=1e-9, bad=0.3),
+        verdict_above(fraction, look=1e-9, bad=0.3),
         f"{several(len(poor), 'photo')} with very few features" if poor else "enough in every photo",
-        share,
+        fraction,
         "look from 1 photo with fewer than 150 features, bad from 30 % of the photos",
         "step back, or include textured objects" if poor else "",
         tuple(sorted(poor, key=lambda item: int(item[1].split()[0]))),
@@ -195,14 +195,14 @@ def clipping(photos: Sequence[PhotoFacts]) -> Finding:
             verdict = verdict_below(light.mean, look=_DARK, bad=_VERY_DARK)
             said.append((_DARK - light.mean, photo.name, f"dark: mean level {255 * light.mean:.0f} of 255"))
         verdicts.append(verdict)
-    share = len(said) / len(photos)
+    fraction = len(said) / len(photos)
     return Finding(
         "clipping",
         BAD if verdicts.count(BAD) > 0.3 * len(photos) else LOOK if said else GOOD,
         f"{several(len(said), 'photo')} of {len(photos)} with large pure white or black areas, or dark"
         if said
         else "little",
-        share,
+        fraction,
         f"per photo: look from {100 * CLIPPED_LOOK:g} % of its pixels, bad from {100 * CLIPPED_BAD:g} %; all: bad "
         "from 30 % of the photos",
         "expose so that the subject is neither; such areas cannot be matched (in a background this is fine)"

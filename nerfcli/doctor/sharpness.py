@@ -68,11 +68,11 @@ def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
         for column, tile in enumerate(np.array_split(line, _TILES, axis=1))
         if tile.size and np.mean(~np.isnan(tile)) > 0.3
     ]
-    share = len(tiles) / _TILES**2
+    fraction = len(tiles) / _TILES**2
     if len(tiles) < _LEAST_TEXTURED_TILES:
-        return Sharpness(float("nan"), 1.0, share), local
+        return Sharpness(float("nan"), 1.0, fraction), local
     detail = float(np.percentile([tile[0] for tile in tiles], _SHARPEST_QUARTILE))
-    return Sharpness(detail, _direction_ratio(fine, coarse, textured), share), local
+    return Sharpness(detail, _direction_ratio(fine, coarse, textured), fraction), local
 
 
 def _direction_ratio(fine: np.ndarray, coarse: np.ndarray, textured: np.ndarray) -> float:

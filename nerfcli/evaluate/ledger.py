@@ -48,8 +48,8 @@ def leak_ledger(config: RunConfig) -> list[Entry]:
     ]
 
 
-def told(ledger: list[Entry]) -> str:
-    """One line: which stages have seen the held-out photos, and of which nobody knows."""
+def summary_line(ledger: list[Entry]) -> str:
+    """Summarize in one line which stages used the held-out photos, and for which it is unknown."""
     parts = []
     for answer, words in ((True, "seen by"), (None, "perhaps seen by"), (False, "not seen by")):
         stages = [entry.stage for entry in ledger if entry.saw_held_out is answer]

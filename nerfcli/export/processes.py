@@ -18,7 +18,7 @@ from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
 from nerfcli.export.unfinished import Unfinished
-from nerfcli.interrupts import held_back
+from nerfcli.interrupts import deferred_interrupts
 from nerfcli.render.model import Model
 
 # A frame at which processes died this often is not tried once more.
@@ -68,8 +68,8 @@ def render_in_processes(
 
     def start() -> None:
         ours, theirs = context.Pipe()
-        share = max(1, threads // jobs)
-        process = context.Process(target=_serve, args=(theirs, model, order, unfinished, share), daemon=True)
+        fraction = max(1, threads // jobs)
+        process = context.Process(target=_serve, args=(theirs, model, order, unfinished, fraction), daemon=True)
         with _interrupts_kept():  # an interrupt that was kept comes at the end, and has to find the process
             process.start()
             workers.append(_Worker(process, ours))
@@ -180,7 +180,7 @@ def _interrupts_kept() -> Iterator[None]:
     Starting takes seconds, as the new process reads the model only when it has come up. What comes to us meanwhile is
     kept for afterwards: a process that is left amid its model complains.
     """
-    with held_back() as interrupts:
+    with deferred_interrupts() as interrupts:
         if hasattr(signal, "pthread_sigmask"):
             resource_tracker.ensure_running()  # it would be started with the first process, and let signals in again
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
@@ -190,4 +190,4 @@ def _interrupts_kept() -> Iterator[None]:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
         else:  # Windows
             yield
-    interrupts.answer()
+    interrupts.raise_if_pending()

@@ -65,10 +65,10 @@ class Appearance(nn.Module):
         learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
         return [{"params": tensors, "multiple": rate} for tensors, rate in learned if tensors[0].requires_grad]
 
-    def share_of_detail(self, share: float) -> float:
+    def share_of_detail(self, fraction: float) -> float:
         """The share of the budget whose detail the field may have: cameras find their places in a coarse field, while
         a fine one learns to show each photo as it is, in its wrong place."""
-        return share if self.cameras is None else DETAIL_SLOPE * share - DETAIL_DELAY
+        return fraction if self.cameras is None else DETAIL_SLOPE * fraction - DETAIL_DELAY
 
     def gradients(self) -> dict[str, Tensor]:
         """By name, those that there are."""
@@ -78,26 +78,26 @@ class Appearance(nn.Module):
         """The same pixels, with the rays of the cameras as they are now."""
         return drawn if self.cameras is None else self.cameras.refined(drawn)
 
-    def with_learning_rays(self, drawn: Drawn, share: float) -> Drawn:
+    def with_learning_rays(self, drawn: Drawn, fraction: float) -> Drawn:
         """`refined`, with rays that collect gradients while cameras learn."""
         refined = self.refined(drawn)
-        if self.cameras is None or rate_at(share) == 0.0:
+        if self.cameras is None or rate_at(fraction) == 0.0:
             return refined
         return refined._replace(
             origins=refined.origins.clone().requires_grad_(), directions=refined.directions.clone().requires_grad_()
         )
 
-    def step_cameras(self, drawn: Drawn, losses: Tensor, share: float, *, factor: float) -> None:
+    def step_cameras(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float) -> None:
         """One step of the cameras against the gradients of rays of `with_learning_rays`.
 
         Args:
             drawn: those rays.
             losses: (R,) of each of them.
-            share: of the budget.
+            fraction: of the budget.
             factor: of the rate.
         """
         if self.cameras is not None:
-            self.cameras.step(drawn, losses, share, factor=factor)
+            self.cameras.step(drawn, losses, fraction, factor=factor)
 
     def behind(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) what rays are composited on: black or random colours.

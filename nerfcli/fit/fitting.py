@@ -137,7 +137,7 @@ class Fitting:
         drawn = self.parts.with_learning_rays(self.draw(share), of_cameras)
         rays = len(drawn.origins)
         edges = self.edges[:: self._stride(share)].contiguous()
-        loss, losses, samples = self._loss(drawn, edges=edges, share=share, watch=watch)
+        loss, losses, samples = self._loss(drawn, edges=edges, fraction=share, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
         if samples > 0:
@@ -153,7 +153,7 @@ class Fitting:
         self.in_step = False
         return StepResult(loss=loss.item(), samples=samples, rays=rays)
 
-    def draw(self, share: float) -> Drawn:
+    def draw(self, fraction: float) -> Drawn:
         """The pixels of the next step, after looking at what fills space if it is time."""
         settings = self.settings
         if self.step % REFRESH_EVERY == 0:
@@ -163,28 +163,28 @@ class Fitting:
         rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
         source = self.pool if self.error_map is None or self.furthest < BEGINS else self.error_map
         drawn = source.draw(rays, self.generator)
-        if self.points is None or fading(share) == 0.0:
+        if self.points is None or fading(fraction) == 0.0:
             return drawn
         return self.points.added_to(drawn, self.generator)
 
-    def _stride(self, share: float) -> int:
+    def _stride(self, fraction: float) -> int:
         """How many of the shortest steps along rays are taken as one."""
-        share = min(share, self.step / DETAILED_STEPS)
-        return next(stride for until, stride in STRIDES if share <= until)
+        fraction = min(fraction, self.step / DETAILED_STEPS)
+        return next(stride for until, stride in STRIDES if fraction <= until)
 
     def smaller_steps(self) -> None:
         """Halve the learning rate from here on, as numbers became non-finite."""
         self.rate_factor /= 2
         self.rollbacks += 1
 
-    def learning_rate(self, share: float) -> float:
+    def learning_rate(self, fraction: float) -> float:
         """Linear warm-up, then an exponential from the first to the final rate over the budget."""
         settings = self.settings
         decay = math.log(settings.final_learning_rate / settings.learning_rate)
-        warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, share / WARMUP_SHARE))
-        return self.rate_factor * settings.learning_rate * warmup * math.exp(decay * min(1.0, share))
+        warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, fraction / WARMUP_SHARE))
+        return self.rate_factor * settings.learning_rate * warmup * math.exp(decay * min(1.0, fraction))
 
-    def _loss(self, drawn: Drawn, *, edges: Tensor, share: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
+    def _loss(self, drawn: Drawn, *, edges: Tensor, fraction: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
         """Loss over some rays, that of the colour of each, and the number of samples it took."""
         count, components, device = len(drawn.origins), self.components, drawn.origins.device
         jitter = torch.rand(count, generator=self.generator, device=device)
@@ -207,7 +207,7 @@ class Fitting:
         if components.entropy:
             loss = loss + components.entropy * opacity_entropy(seen.transmittance)
         if len(drawn.distances):
-            loss = loss + components.points * fading(share) * point_depth_loss(seen.off_target, drawn.trust)
+            loss = loss + components.points * fading(fraction) * point_depth_loss(seen.off_target, drawn.trust)
         watch.rows("rendered colour", seen.rgb, torch.arange(count, device=device))
         watch.values("loss", loss)
         return loss, losses.detach(), int(seen.samples)

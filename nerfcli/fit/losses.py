@@ -30,8 +30,8 @@ def opacity_entropy(transmittance: Tensor) -> Tensor:
     Returns:
         Scalar in (0, log 2]. Differentiable.
     """
-    share = transmittance.clamp(1e-4, 1.0 - 1e-4)
-    return -(share * share.log() + (1.0 - share) * torch.log1p(-share)).mean()
+    fraction = transmittance.clamp(1e-4, 1.0 - 1e-4)
+    return -(fraction * fraction.log() + (1.0 - fraction) * torch.log1p(-fraction)).mean()
 
 
 def over_background(colours: Tensor, background: Tensor) -> Tensor:

@@ -100,11 +100,11 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
     ).among(pool)
 
 
-def fading(share: float) -> float:
+def fading(fraction: float) -> float:
     """Return the weight of the points at a fraction of the budget: 1 at the start, 0 from `LAST_SHARE` on, linear
     between.
     """
-    return max(0.0, 1.0 - share / LAST_SHARE)
+    return max(0.0, 1.0 - fraction / LAST_SHARE)
 
 
 def point_depth_loss(off_target: Tensor, trust: Tensor) -> Tensor:

@@ -40,18 +40,18 @@ DAMPING_SHARES, DAMPINGS = (0.2, 0.8), (1.0, 0.1)
 HOLDING_SHARES, HOLDINGS = (0.2, 0.5), (1e-3, 0.05)
 
 
-def rate_at(share: float) -> float:
+def rate_at(fraction: float) -> float:
     """Return the learning rate of cameras at a fraction of the budget: linear warm-up, constant, exponential decay."""
-    if not FIRST_SHARE < share < LAST_SHARE:
+    if not FIRST_SHARE < fraction < LAST_SHARE:
         return 0.0
-    if share < FULL_SHARE:
-        return (share - FIRST_SHARE) / (FULL_SHARE - FIRST_SHARE)
-    return _between(share, (FALLING_SHARE, LAST_SHARE), (1.0, LAST_RATE))
+    if fraction < FULL_SHARE:
+        return (fraction - FIRST_SHARE) / (FULL_SHARE - FIRST_SHARE)
+    return _between(fraction, (FALLING_SHARE, LAST_SHARE), (1.0, LAST_RATE))
 
 
-def _between(share: float, shares: tuple[float, float], values: tuple[float, float]) -> float:
+def _between(fraction: float, shares: tuple[float, float], values: tuple[float, float]) -> float:
     """The first value up to the first share, the second from the second on, and an exponential in between."""
-    return float(np.exp(np.interp(share, shares, np.log(values))))
+    return float(np.exp(np.interp(fraction, shares, np.log(values))))
 
 
 class PoseRefinement(nn.Module):
@@ -104,14 +104,14 @@ class PoseRefinement(nn.Module):
         cam_from_world = torch.from_numpy(self.poses()[:, :3, :3]).transpose(-1, -2)[photos]
         return (cam_from_world @ torch.stack([by_origin, torque], dim=-1)).transpose(-1, -2).flatten(-2)
 
-    def step(self, gradients: Tensor, losses: Tensor, photos: Tensor, share: float, *, rate: float) -> None:
+    def step(self, gradients: Tensor, losses: Tensor, photos: Tensor, fraction: float, *, rate: float) -> None:
         """A step against gradients (R, 6) of losses (R,) of rays; afterwards the mean similarity of all moves is taken
         out.
 
         Args:
             gradients, losses: of each ray by itself.
             photos: (R,) whose rays they are.
-            share: of the budget.
+            fraction: of the budget.
             rate: in [0, 1], of the step that would be the whole way.
         """
         so_far = self.motions.numpy()
@@ -119,8 +119,8 @@ class PoseRefinement(nn.Module):
         twists = rate * self.newton.change(
             self.newton.learn(gradients, losses, photos),
             torch.from_numpy(so_far),
-            damping=_between(share, DAMPING_SHARES, DAMPINGS),
-            holding=_between(share, HOLDING_SHARES, HOLDINGS) if share > HOLDING_SHARES[0] else 0.0,
+            damping=_between(fraction, DAMPING_SHARES, DAMPINGS),
+            holding=_between(fraction, HOLDING_SHARES, HOLDINGS) if fraction > HOLDING_SHARES[0] else 0.0,
         )
         seen = (twists[:, None] @ self.picture @ twists[..., None])[..., 0].sqrt()  # (P, 1) radians
         twists = (twists * (_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP))).numpy()
@@ -244,16 +244,16 @@ class Refinement(nn.Module):
         return drawn._replace(origins=origins, directions=directions)
 
     @torch.no_grad()
-    def step(self, drawn: Drawn, losses: Tensor, share: float, *, factor: float) -> None:
+    def step(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float) -> None:
         """One step against the gradients of the mean loss of `drawn`, which `refined` gave.
 
         Args:
             drawn: rays that have gradients.
             losses: (R,) of each.
-            share: of the budget, for `rate_at`.
+            fraction: of the budget, for `rate_at`.
             factor: of the rate.
         """
-        by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * rate_at(share)
+        by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * rate_at(fraction)
         if rate == 0.0 or by_origin is None or by_direction is None:
             return
         photos, numbers = self._pool.photo_of(drawn.numbers).cpu(), drawn.numbers.cpu()
@@ -266,7 +266,7 @@ class Refinement(nn.Module):
             by_lens = self.lenses.gradient(numbers, photos, turns=turns, by_direction=by_direction)
         if self.poses is not None:
             by_pose = self.poses.gradients(directions, photos, by_origin=by_origin, by_direction=by_direction)
-            self.poses.step(len(by_pose) * by_pose, losses.double().cpu(), photos, share, rate=rate)
+            self.poses.step(len(by_pose) * by_pose, losses.double().cpu(), photos, fraction, rate=rate)
         if self.lenses is not None and by_lens is not None:
             self.lenses.step(by_lens, LENS_RATE * rate)
 

@@ -125,10 +125,10 @@ class DepthMeta:
         """One line for people: "conditional depth along the optical axis (z), in metres (gps): the mean ..."."""
         unit = "metres" if self.unit == "metre" else f"{self.unit} units"
         source = f" (from: {self.unit_source})" if self.unit_source else ""
-        convention, _, share = self.convention.partition(":")
+        convention, _, fraction = self.convention.partition(":")
         meaning = _IN_WORDS.get(convention, "")
         if convention == "quantile":
-            meaning = f"the distance at which {share} of all light is absorbed"
+            meaning = f"the distance at which {fraction} of all light is absorbed"
         return f"{self.title} {AXES[self.axis]}, in {unit}{source}" + (f": {meaning}" if meaning else "")
 
 

@@ -56,7 +56,7 @@ def focal_evidence(exif: Exif) -> FocalEvidence:
     focal_px = _focal_px(exif, whole_px)
     if focal_px is None:
         return FocalEvidence(None, not doubt, doubt, whole_px)
-    shortest, longest = (share * whole_px[0] for share in _FOCAL_RANGE)
+    shortest, longest = (fraction * whole_px[0] for fraction in _FOCAL_RANGE)
     if not shortest <= focal_px <= longest:
         doubt = f"EXIF gives a focal length of {focal_px / whole_px[0]:.3g} times the longer side, which is implausible"
         return FocalEvidence(None, False, doubt, whole_px)

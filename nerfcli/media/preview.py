@@ -90,11 +90,11 @@ def _legend(meta: DepthMeta, *, lo: float, hi: float, colour_map: str, width: in
     draw = ImageDraw.Draw(sheet)
     below = size // 2 + bar[1]
     for index, number in enumerate(numbers):
-        share = index / (len(numbers) - 1)
-        x = margin + share * (bar[0] - 1)
+        fraction = index / (len(numbers) - 1)
+        x = margin + fraction * (bar[0] - 1)
         draw.line((x, below, x, below + size // 4), fill=_INK)
         # Anchored left at the left end and right at the right end, so that no number leaves the sheet.
-        draw.text((x - share * font.getlength(number), below + size // 4), number, fill=_INK, font=font)
+        draw.text((x - fraction * font.getlength(number), below + size // 4), number, fill=_INK, font=font)
     for index, text in enumerate(lines):
         draw.text((margin, size // 2 + line * (2 + index)), text, fill=_INK, font=font)
     return np.asarray(sheet)

@@ -27,7 +27,7 @@ def quantiles(maps: Callable[[], Iterable[np.ndarray]], shares: Sequence[float])
     total = int(upper_counts.sum())
     if total == 0:
         return []
-    ranks = [min(max(int(np.ceil(share * total)) - 1, 0), total - 1) for share in shares]
+    ranks = [min(max(int(np.ceil(fraction * total)) - 1, 0), total - 1) for fraction in shares]
     below = np.cumsum(upper_counts)
     uppers = [int(np.searchsorted(below, rank, side="right")) for rank in ranks]
     lower_counts = {upper: np.zeros(_HALF, dtype=np.int64) for upper in uppers}

@@ -16,7 +16,7 @@ from nerfcli.errors import UserError
 from nerfcli.kernels import PixelTable, backend_for
 from nerfcli.photos.footprint import pixel_footprint
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photo
-from nerfcli.photos.storage import IN_MEMORY, Room
+from nerfcli.photos.storage import IN_MEMORY, PhotoStorage
 
 # In float64, the bearings of a large photo would take more than the photo.
 PIXELS_AT_A_TIME = 2**18
@@ -37,8 +37,10 @@ class Album:
     fills_frame: bool
 
 
-def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room, masks: str = "ignore") -> Album:
-    """`load_photos` into one array, which stands where there is room.
+def load_album(
+    frames: Sequence[Frame], *, factor: int, threads: int, storage: PhotoStorage, masks: str = "ignore"
+) -> Album:
+    """Load photos with `load_photos` into one array in `storage`.
 
     Raises:
         UserError: a photo cannot be read, or has another size than its camera.
@@ -47,7 +49,7 @@ def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room
     begins = np.cumsum([0, *(camera.width * camera.height for camera in cameras)])
     # Nobody knows before decoding whether a photo has alpha; the first one that has decides anew.
     for channels in (3, 4):
-        colours = room.array((int(begins[-1]), channels), np.uint8)
+        colours = storage.array((int(begins[-1]), channels), np.uint8)
         fills: list[bool] = []
 
         def place(index: int, colours: np.ndarray = colours) -> tuple[LoadedPhoto, bool] | None:
@@ -57,7 +59,7 @@ def load_album(frames: Sequence[Frame], *, factor: int, threads: int, room: Room
                 return None
             part = colours[begins[index] : begins[index + 1]].reshape(*photo.pixels.shape[:2], -1)
             part[...] = photo.pixels if has_alpha or colours.shape[-1] == 3 else _with_alpha(photo.pixels)
-            room.relieve()
+            storage.release_pages()
             return replace(photo, pixels=part), not has_alpha
 
         photos: list[LoadedPhoto] = []
@@ -129,7 +131,7 @@ class PixelPool:
         training_from_scene: the normalisation.
         device: where the pixels are drawn.
         colours: those of all photos, where they stand one after another already.
-        room: where arrays of the size of the photos go.
+        storage: where arrays of the size of the photos go.
     """
 
     def __init__(
@@ -139,7 +141,7 @@ class PixelPool:
         device: torch.device,
         *,
         colours: np.ndarray | None = None,
-        room: Room = IN_MEMORY,
+        storage: PhotoStorage = IN_MEMORY,
     ):
         self.colours = torch.from_numpy(_one_after_another(photos) if colours is None else colours).to(device)
         self._backend = backend_for(device, torch.float32)
@@ -159,10 +161,10 @@ class PixelPool:
         cameras = dict.fromkeys(photo.frame.camera for photo in photos)
         sizes = [camera.width * camera.height for camera in cameras]
         first_bearing = dict(zip(cameras, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
-        bearings = room.array((sum(sizes), 3), np.float32)
+        bearings = storage.array((sum(sizes), 3), np.float32)
         good_rays: dict[Camera, np.ndarray] = {}
         for camera, first in first_bearing.items():
-            good_rays[camera] = _fill_bearings(camera, bearings[first : first + camera.width * camera.height], room)
+            good_rays[camera] = _fill_bearings(camera, bearings[first : first + camera.width * camera.height], storage)
         self.bearings = torch.from_numpy(bearings).to(device)
         self.first_bearing = torch.tensor([first_bearing[photo.frame.camera] for photo in photos], device=device)
         self.without_ray = sum(int((~good_rays[photo.frame.camera]).sum()) for photo in photos)
@@ -179,11 +181,11 @@ class PixelPool:
             )
         self.usable: Tensor | None = None
         if self.usable_count < len(self.colours):  # a list of all pixels would be larger than the photos
-            numbers = room.array((self.usable_count,), np.int64)
+            numbers = storage.array((self.usable_count,), np.int64)
             ends = np.cumsum(usable_counts)
             for photo, first, count, end in zip(photos, self.first_pixel.tolist(), usable_counts, ends, strict=True):
                 numbers[end - count : end] = first + np.flatnonzero(usable(photo))
-                room.relieve()
+                storage.release_pages()
             self.usable = torch.from_numpy(numbers).to(device)
 
     @property
@@ -225,7 +227,7 @@ class PixelPool:
         return name, column, row
 
 
-def _fill_bearings(camera: Camera, bearings: np.ndarray, room: Room) -> np.ndarray:
+def _fill_bearings(camera: Camera, bearings: np.ndarray, storage: PhotoStorage) -> np.ndarray:
     """Write the camera's bearings, a part at a time, and return which pixels (N,) have one."""
     valid = np.empty(len(bearings), dtype=bool)
     for begin in range(0, len(bearings), PIXELS_AT_A_TIME):
@@ -233,7 +235,7 @@ def _fill_bearings(camera: Camera, bearings: np.ndarray, room: Room) -> np.ndarr
         numbers = np.arange(part.start, part.stop)
         centres = np.stack([numbers % camera.width, numbers // camera.width], axis=-1) + 0.5
         bearings[part], valid[part] = camera.bearings(centres)
-        room.relieve()
+        storage.release_pages()
     return valid
 
 

@@ -69,7 +69,7 @@ class InMemory:
         """An array to be filled."""
         return np.empty(shape, dtype)
 
-    def relieve(self) -> None:
+    def release_pages(self) -> None:
         """Give nothing back."""
 
 
@@ -107,7 +107,7 @@ class InFiles:
         self._maps.append(pages)
         return np.frombuffer(pages, dtype=dtype, count=int(np.prod(shape))).reshape(shape)
 
-    def relieve(self) -> None:
+    def release_pages(self) -> None:
         """Give pages back if too much is resident."""
         if resident_bytes(os.getpid()) > self._limit:
             for pages in self._maps:
@@ -115,11 +115,11 @@ class InFiles:
                     pages.madvise(mmap.MADV_DONTNEED)
 
 
-Room = InMemory | InFiles
+PhotoStorage = InMemory | InFiles
 IN_MEMORY = InMemory()
 
 
-def room_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[Room, str]:
+def storage_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[PhotoStorage, str]:
     """Choose the storage of the photos, and a message for the user.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any
 
 from nerfcli import __version__
 from nerfcli.cameras.formats.run_cameras import MEND
-from nerfcli.cameras.orientation import rescaling_told
+from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.errors import UserError
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
@@ -83,7 +83,7 @@ class RunConfig:
             holdout=scene.holdout,
             history=dict(scene.history),
             missing_photos=tuple(scene.missing),
-            warnings=tuple(rescaling_told(scene.rescaled)),
+            warnings=tuple(describe_rescaling(scene.rescaled)),
             selection=selection,
             versions={
                 "nerfcli": __version__,

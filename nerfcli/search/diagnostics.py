@@ -18,7 +18,7 @@ _OF_MEDIAN, _OF_DEVIATION = 1.2533, 1.4826
 
 
 @dataclass(frozen=True)
-class Signs:
+class Diagnostics:
     """Diagnostics of a scene from a short training.
 
     Args:
@@ -37,9 +37,9 @@ class Signs:
     sky_psnr: tuple[float, float]
 
 
-def signs_of(
+def diagnose(
     rendered: Tensor, measured: Tensor, photos: Tensor, *, directions: Tensor, from_beyond: Tensor, count: int
-) -> Signs:
+) -> Diagnostics:
     """Compute the diagnostics from some pixels.
 
     The gain of a photo is the median over its pixels of log(measured / rendered), channel by channel: highlights and
@@ -69,7 +69,7 @@ def signs_of(
             errors[photo] = _OF_MEDIAN * deviation / np.sqrt(good.sum())
     known = np.isfinite(errors)
     if known.sum() < 2:
-        return Signs(torch.zeros(count, 3), 0.0, far_share, sky_psnr)
+        return Diagnostics(torch.zeros(count, 3), 0.0, far_share, sky_psnr)
     gains[known] -= gains[known].mean(0)
     excess = gains[known].mean(-1).var(ddof=1) - np.square(errors[known]).mean()
-    return Signs(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_share, sky_psnr)
+    return Diagnostics(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_share, sky_psnr)

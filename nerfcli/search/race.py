@@ -33,8 +33,8 @@ NO_TIME, ONCE = "not tried, no time left", "not clear with one seed, and no time
 COSTS_MORE = "not tried, the trial would take longer than it could save"
 
 
-class Purse:
-    """What there is to spend: seconds, or steps, all trials together."""
+class SearchBudget:
+    """Budget of all trials together: seconds, or steps."""
 
     def __init__(self, seconds: float | None, steps: int | None):
         self._seconds, self._steps = seconds, steps
@@ -42,42 +42,42 @@ class Purse:
 
     @property
     def is_time(self) -> bool:
-        """Whether seconds are what is spent."""
+        """Whether the budget is in seconds."""
         return self._seconds is not None
 
     @property
     def spent(self) -> float:
-        """Seconds so far."""
+        """Seconds spent so far."""
         return time.perf_counter() - self._began
 
-    def takes(self, trials: int, *, of_steps: int, seconds_each: float, share_of_time: float = 1.0) -> bool:
-        """Whether there is enough left for some trials; of time, within a share of what there was."""
+    def can_afford(self, trials: int, *, of_steps: int, seconds_each: float, share_of_time: float = 1.0) -> bool:
+        """Return whether the rest is enough for some trials; with a time budget, within a fraction of the total."""
         if self._seconds is not None:
             return self.spent + trials * seconds_each <= share_of_time * self._seconds
         return self._gone + trials * of_steps <= (self._steps or 0)
 
-    def is_little(self, trials: int, *, of_steps: int, seconds_each: float) -> bool:
-        """Whether some trials take no more than the share that is for leaving something out."""
+    def is_cheap(self, trials: int, *, of_steps: int, seconds_each: float) -> bool:
+        """Return whether some trials cost no more than the fraction reserved for removals."""
         if self._seconds is not None:
             return trials * seconds_each <= REMOVAL_COST * self._seconds
         return trials * of_steps <= REMOVAL_COST * (self._steps or 0)
 
-    def take(self, steps: int) -> None:
-        """Count steps that were gone."""
+    def charge(self, steps: int) -> None:
+        """Count completed steps."""
         self._gone += steps
 
 
 class Race:
-    """Candidates against one another, all from the same start.
+    """Compare candidates with each other, all from the same start.
 
     Args:
         trials, start: what they go on from.
-        purse: pays for them.
+        budget: what the trials may cost.
         asked: the model that has to be bettered.
     """
 
-    def __init__(self, trials: Trials, start: TrialStart, purse: Purse, asked: Components):
-        self._trials, self._start, self._purse, self._asked = trials, start, purse, asked
+    def __init__(self, trials: Trials, start: TrialStart, budget: SearchBudget, requested: Components):
+        self._trials, self._start, self._budget, self._requested = trials, start, budget, requested
         self._length = max(1, round(STEPS_OF_START * start.steps))
         self._seconds_each = start.seconds * self._length / start.steps
         self.kept: list[Change] = []
@@ -122,7 +122,7 @@ class Race:
             trials = 2 * SEEDS - len(self._base)  # to know for sure
             if not self._can_run(trials, share_of_time=REMOVAL_SHARE):
                 continue
-            if not self._purse.is_little(trials, of_steps=self._length, seconds_each=self._seconds_each):
+            if not self._budget.is_cheap(trials, of_steps=self._length, seconds_each=self._seconds_each):
                 self.decisions[change] = untried(*change, COSTS_MORE)
                 continue
             self._base = self._base or [self._trial([], seed=0)]
@@ -159,7 +159,7 @@ class Race:
         return next(change for change in gains if change[0] == best[0] and gains[change] >= gains[best] - SEED_DB)
 
     def _is_confirmed(self, change: Change, rule: Rule) -> bool:
-        """Whether a change is clear with one seed, or stands the other seeds, too; it then is in the model."""
+        """Decide on a change: keep it if it is clear with one seed or also holds with the other seeds."""
         own = [self._once.pop(change)]
         decision = self._judged(rule, change, own)
         if not decision.kept and (decision.gain_db or 0.0) > -MOST_LOSS_DB:
@@ -180,19 +180,19 @@ class Race:
         self.decisions[change] = replace(self.decisions[change], kept=False, why=why)
 
     def _judged(self, rule: Rule, change: Change, own: Sequence[Trial]) -> Decision:
-        decision = rule(self._base[: len(own)], change, own, by_time=self._purse.is_time)
+        decision = rule(self._base[: len(own)], change, own, by_time=self._budget.is_time)
         others = ", ".join(name for name, _ in self.kept)
         return replace(decision, why=f"{decision.why}, in addition to {others}") if others else decision
 
     def _can_run(self, trials: int, *, share_of_time: float = 1.0) -> bool:
-        return self._purse.takes(
+        return self._budget.can_afford(
             trials, of_steps=self._length, seconds_each=self._seconds_each, share_of_time=share_of_time
         )
 
     def _trial(self, changes: Sequence[Change], *, seed: int) -> Trial:
-        before = self._purse.spent
-        components = replace(self._asked, **dict([*self.kept, *changes]))
+        before = self._budget.spent
+        components = replace(self._requested, **dict([*self.kept, *changes]))
         trial = self._trials.go_on(self._start, components, seed=seed, steps=self._length)
-        self._purse.take(self._length)
-        self._seconds_each = max(self._seconds_each, self._purse.spent - before)
+        self._budget.charge(self._length)
+        self._seconds_each = max(self._seconds_each, self._budget.spent - before)
         return trial

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.runs.components import CHOICES, Change, Components
 from nerfcli.runs.decisions import Decision, Selection, untried
-from nerfcli.search.diagnostics import Signs
+from nerfcli.search.diagnostics import Diagnostics
 from nerfcli.search.judgement import Rule, judge_likely, judge_supported
-from nerfcli.search.race import Purse, Race
+from nerfcli.search.race import Race, SearchBudget
 from nerfcli.search.trials import Trials
 
 # Of the budget, for all trials together; and of those, for the training that they go on from.
@@ -72,7 +72,7 @@ class Facts:
     fixed: tuple[str, ...] = ()
 
 
-def with_known_cameras(asked: Components, facts: Facts) -> tuple[Components, float, list[Decision]]:
+def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components, float, list[Decision]]:
     """The model with what matched features surely tell of the cameras: another focal length than the given one, or
     poses that do not fit; the logarithm of the length's factor, which is 0 elsewhere; and the decisions.
 
@@ -80,9 +80,9 @@ def with_known_cameras(asked: Components, facts: Facts) -> tuple[Components, flo
     For the same reason a model that is asked for with lenses that learn begins with the length that features tell. And
     of poses a trial is too short to show more than that they do no harm, which features have told.
     """
-    check, learns = facts.cameras, asked.cameras in LEARN_FOCAL
+    check, learns = facts.cameras, requested.cameras in LEARN_FOCAL
     if check is None or ("cameras" in facts.fixed and not learns):
-        return asked, 0.0, []
+        return requested, 0.0, []
     given, changed = check.misses_px
     if math.isfinite(check.error):
         per_cent = 100.0 * math.expm1(check.log_focal)
@@ -98,45 +98,45 @@ def with_known_cameras(asked: Components, facts: Facts) -> tuple[Components, flo
     # Wrong poses ask for any length: one that is right leaves nothing to ask for.
     is_sure = is_sure and changed < min(MISS_SHARE * given, LEAST_MISS_PX)
     if is_sure:
-        value = asked.cameras if learns else "focal"
-        return replace(asked, cameras=value), check.log_focal, [untried("cameras", value, reason, kept=True)]
+        value = requested.cameras if learns else "focal"
+        return replace(requested, cameras=value), check.log_focal, [untried("cameras", value, reason, kept=True)]
     if learns:
-        return asked, 0.0, []
+        return requested, 0.0, []
     decisions = [untried("cameras", "focal", f"not tried, {reason}")]
     if min(check.misses_px) < SURELY_MISSED_PX:
-        return asked, 0.0, decisions
+        return requested, 0.0, decisions
     reason = (
         f"the epipolar error of {check.matches} matched features is at least {min(check.misses_px):.2f} px at "
         "any focal length"
     )
-    return replace(asked, cameras="poses"), 0.0, [*decisions, untried("cameras", "poses", reason, kept=True)]
+    return replace(requested, cameras="poses"), 0.0, [*decisions, untried("cameras", "poses", reason, kept=True)]
 
 
-def tells_points(asked: Components, facts: Facts) -> bool:
+def may_use_points(requested: Components, facts: Facts) -> bool:
     """Return whether triangulated points may be used for depth supervision.
 
     The cameras have to fit. And where alpha tells what is empty, points gain at first only: they have cost half a
     decibel on lego, in the time that their rays take.
     """
     if "points" in facts.fixed:
-        return bool(asked.points)
+        return bool(requested.points)
     fit = facts.cameras is None or facts.cameras.misses_px[0] < LEAST_MISS_PX
-    return fit and asked.cameras == "fixed" and not facts.has_alpha
+    return fit and requested.cameras == "fixed" and not facts.has_alpha
 
 
-def with_points(asked: Components, facts: Facts) -> tuple[Components, list[Decision]]:
+def with_points(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
     """The model whose rays end at the points that photos share, where that is not decided; and the decision about it.
 
     It is in the model from the first step on: later, light has ended elsewhere already, and points change little.
     """
-    if facts.points == 0 or "points" in facts.fixed or not tells_points(asked, facts):
-        return asked, []
+    if facts.points == 0 or "points" in facts.fixed or not may_use_points(requested, facts):
+        return requested, []
     value = CHOICES["points"].on
     reason = f"{facts.points} pixels see a 3D point at a known distance"
-    return replace(asked, points=value), [untried("points", value, reason, kept=True)]
+    return replace(requested, points=value), [untried("points", value, reason, kept=True)]
 
 
-def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Change], list[Decision]]:
+def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list[Change], list[Decision]]:
     """Components that may help a scene, and those that nothing speaks for.
 
     Args:
@@ -179,7 +179,7 @@ def proposals(start: Components, signs: Signs, facts: Facts) -> tuple[list[Chang
     )
 
 
-def _against_sky(signs: Signs) -> str | None:
+def _against_sky(signs: Diagnostics) -> str | None:
     """Return why no sky is expected; None if there may be one."""
     far = f"{100.0 * signs.far_share:.1f} % of the pixels see mostly distant surfaces"
     if signs.far_share <= LEAST_FAR_SHARE:
@@ -193,7 +193,7 @@ def _against_sky(signs: Signs) -> str | None:
     return None
 
 
-def rules(candidates: Sequence[Change], signs: Signs, facts: Facts) -> dict[Change, Rule]:
+def rules(candidates: Sequence[Change], signs: Diagnostics, facts: Facts) -> dict[Change, Rule]:
     """Return the rules for candidates that other evidence supports."""
     found: dict[Change, Rule] = {}
     for change in candidates:
@@ -228,7 +228,7 @@ def is_worth_a_search(seconds: float | None, steps: int | None) -> bool:
 
 def select(
     trials: Trials,
-    asked: Components,
+    requested: Components,
     facts: Facts,
     *,
     seconds: float | None,
@@ -241,7 +241,7 @@ def select(
 
     Args:
         trials: of the scene.
-        asked: what is in the model where nothing is found out.
+        requested: what is in the model where nothing is found out.
         facts: of the scene.
         seconds: for all trials together; None to go by `steps`.
         steps: of all trials together, where there is no limit of time.
@@ -249,9 +249,9 @@ def select(
     Returns:
         What needs no trial, where a first training of `FEWEST_STEPS` is too much.
     """
-    purse = Purse(seconds, steps)
+    budget = SearchBudget(seconds, steps)
     first_steps = MOST_START_STEPS if seconds is not None else round(START_SHARE * (steps or 0))
-    model, told = with_points(asked, facts)
+    model, told = with_points(requested, facts)
     start = trials.begin(
         _without_poses(model),
         steps=min(first_steps, MOST_START_STEPS),
@@ -259,19 +259,19 @@ def select(
         fewest=FEWEST_STEPS,
     )
     if start is None:
-        return Selection(model, tuple(told), purse.spent)
-    purse.take(start.steps)
+        return Selection(model, tuple(told), budget.spent)
+    budget.charge(start.steps)
     if told:
-        without = trials.begin(_without_poses(asked), steps=start.steps)
+        without = trials.begin(_without_poses(requested), steps=start.steps)
         assert without is not None  # it has no fewest steps
-        purse.take(without.steps)
+        budget.charge(without.steps)
         change = (told[0].component, told[0].value)
-        told = [judge_supported([without.trial], change, [start.trial], by_time=purse.is_time)]
+        told = [judge_supported([without.trial], change, [start.trial], by_time=budget.is_time)]
         if not told[0].kept:
-            model, start = asked, without
+            model, start = requested, without
     candidates, declined = proposals(model, start.signs, facts)
-    race = Race(trials, start, purse, _without_poses(model))
+    race = Race(trials, start, budget, _without_poses(model))
     race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
     chosen = replace(model, **dict(race.kept))
     gains = race.log_gains if chosen.exposure == "learned" else None
-    return Selection(chosen, (*told, *race.decisions.values(), *declined), purse.spent, gains)
+    return Selection(chosen, (*told, *race.decisions.values(), *declined), budget.spent, gains)

@@ -26,10 +26,10 @@ from nerfcli.fit.point_depth import PointDepths, PointRays
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import PixelPool
 from nerfcli.photos.psnr import psnr_of
-from nerfcli.photos.storage import IN_MEMORY, Room
+from nerfcli.photos.storage import IN_MEMORY, PhotoStorage
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.search.diagnostics import Signs, signs_of
+from nerfcli.search.diagnostics import Diagnostics, diagnose
 from nerfcli.search.sky import paint
 
 # Photos are judged by squares of this side, or of a quarter of a small photo's: single pixels between known neighbours
@@ -87,7 +87,7 @@ class TrialStart:
     description: dict[str, Any]
     seconds: float
     trial: Trial
-    signs: Signs
+    signs: Diagnostics
 
     @property
     def steps(self) -> int:
@@ -105,7 +105,7 @@ class Trials:
         exif: (photos,) logarithms of the exposures that EXIF tells, relative to their mean.
         log_focal: see `Fitting`.
         known: pixels whose distance is known; None where that is not asked for.
-        colours, room: see `PixelPool`.
+        colours, storage: see `PixelPool`.
 
     Raises:
         UserError: masks leave nothing to judge by.
@@ -121,11 +121,11 @@ class Trials:
         log_focal: float = 0.0,
         known: PointDepths | None = None,
         colours: np.ndarray | None = None,
-        room: Room = IN_MEMORY,
+        storage: PhotoStorage = IN_MEMORY,
     ):
         device = torch.device(settings.device)
-        seen, numbers = _split(photos, room)
-        self._pool = PixelPool(seen, extent.training_from_scene, device, colours=colours, room=room)
+        seen, numbers = _split(photos, storage)
+        self._pool = PixelPool(seen, extent.training_from_scene, device, colours=colours, storage=storage)
         if len(numbers) == 0:
             raise UserError(
                 "no training pixels are left to compare components on", "remove the masks, or use --model default"
@@ -140,7 +140,7 @@ class Trials:
         self._log_focal = log_focal
         usable = None if known is None else known.among(self._pool)
         self._points = PointRays(usable, self._pool) if usable is not None and len(usable.numbers) else None
-        self._room = room
+        self._room = storage
 
     def begin(
         self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0
@@ -174,7 +174,7 @@ class Trials:
         with torch.no_grad():
             rendered, measured = fitting.compare(drawn)
         reach = self._extent.reach
-        signs = signs_of(
+        signs = diagnose(
             rendered,
             measured,
             self._pool.photo_of(drawn.numbers),
@@ -249,11 +249,11 @@ class Trials:
         if isinstance(fitting.field, HashField):
             fitting.field.forget_directions(start.description["field"]["view_degree"])
 
-    def _advance(self, fitting: Fitting, share: float) -> float:
+    def _advance(self, fitting: Fitting, fraction: float) -> float:
         """A step, and the seconds it took."""
         began = time.perf_counter()
-        fitting.advance(share)
-        self._room.relieve()
+        fitting.advance(fraction)
+        self._room.release_pages()
         return time.perf_counter() - began
 
     @torch.no_grad()
@@ -273,12 +273,12 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
     return np.kron(chosen, np.ones((block, block), bool))[: shape[0], : shape[1]]
 
 
-def _split(photos: Sequence[LoadedPhoto], room: Room) -> tuple[list[LoadedPhoto], np.ndarray]:
+def _split(photos: Sequence[LoadedPhoto], storage: PhotoStorage) -> tuple[list[LoadedPhoto], np.ndarray]:
     """The photos without the blocks that are judged, and numbers of pixels of those blocks, counted through all photos:
     as many of each photo, as far as it has them."""
     generator = np.random.default_rng(SEED)
     sizes = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
-    masks = room.array((sum(sizes),), bool)
+    masks = storage.array((sum(sizes),), bool)
     seen, numbers = [], []
     for photo, size, end in zip(photos, sizes, np.cumsum(sizes).tolist(), strict=True):
         judged = _blocks(photo.pixels.shape[:2], generator)
@@ -292,5 +292,5 @@ def _split(photos: Sequence[LoadedPhoto], room: Room) -> tuple[list[LoadedPhoto]
         rows, columns = np.divmod(places, judged.shape[1])
         valid = photo.frame.camera.bearings(np.stack([columns, rows], axis=-1) + 0.5)[1]
         numbers.append(end - size + places[valid])
-        room.relieve()
+        storage.release_pages()
     return seen, np.concatenate(numbers)

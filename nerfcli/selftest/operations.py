@@ -187,7 +187,7 @@ def depth_inputs(rays: Sequence[Ray], precision: Precision) -> Inputs:
     density, starts, ends = (precision.tensor([x for values in column for x in values]) for column in columns)
     offsets = _offsets([len(ray.density) for ray in rays], precision)
     off = min(0.5, depth_bound(rays, 1, precision).value)
-    near = [1 - (1 - share) ** (1 + x) for x in (-off, off) for share in SHARES]
+    near = [1 - (1 - fraction) ** (1 + x) for x in (-off, off) for fraction in SHARES]
     spans = map(exact, (density, starts, ends))
     low, high = reference.light_ends(*spans, offsets=offsets.cpu(), shares=tuple(near)).quantiles.split(3, dim=1)
     settled = (low.isnan() & high.isnan()) | ((high - low).abs() <= 8 * off * low)
@@ -249,7 +249,7 @@ def mixture(module: ModuleType, given: Inputs) -> Outcome:
     """Quantiles of the light of two rays together."""
     spans = (given["density"], given["starts"], given["ends"])
     pixels = {"offsets": given["offsets"], "rays_per_pixel": 2}
-    return Outcome(tuple(module.mixture_quantile(*spans, **pixels, share=share) for share in cases.PIXEL_SHARES))
+    return Outcome(tuple(module.mixture_quantile(*spans, **pixels, share=fraction) for fraction in cases.PIXEL_SHARES))
 
 
 def mixture_by_mean(given: Inputs) -> Outcome:

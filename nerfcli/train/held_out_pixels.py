@@ -12,7 +12,7 @@ from nerfcli.fit.losses import over_background
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import PixelPool
 from nerfcli.photos.psnr import psnr_of
-from nerfcli.photos.storage import IN_MEMORY, Room
+from nerfcli.photos.storage import IN_MEMORY, PhotoStorage
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import render_rays
 
@@ -29,7 +29,7 @@ class HeldoutPixels:
         photos: held out.
         training_from_scene: the normalisation.
         device: where to keep them.
-        colours, room: see `PixelPool`.
+        colours, storage: see `PixelPool`.
     """
 
     def __init__(
@@ -39,9 +39,9 @@ class HeldoutPixels:
         device: torch.device,
         *,
         colours: np.ndarray | None = None,
-        room: Room = IN_MEMORY,
+        storage: PhotoStorage = IN_MEMORY,
     ):
-        pool = PixelPool(photos, training_from_scene, device, colours=colours, room=room)
+        pool = PixelPool(photos, training_from_scene, device, colours=colours, storage=storage)
         generator = torch.Generator(device=device).manual_seed(SEED)
         self.origins, self.directions, self.colours, numbers = pool.draw(PIXELS, generator)[:4]
         self.cones = pool.cones[pool.photo_of(numbers)]

@@ -14,7 +14,7 @@ from nerfcli.atomic import cannot_write
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
 from nerfcli.fit.fitting import Fitting
-from nerfcli.interrupts import held_back
+from nerfcli.interrupts import deferred_interrupts
 from nerfcli.runs.config import RunConfig, read_config, write_config
 from nerfcli.runs.files import FIELD, LOG, STATE
 from nerfcli.runs.log import LogEntry, append_log, cut_log
@@ -88,12 +88,12 @@ def train(
     checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
     checkpoints.write_cameras()
     sentinel = Sentinel(fitting, prepared.pool, run=run, notify=notify)
-    with held_back() as interrupts:
+    with deferred_interrupts() as interrupts:
 
         def after_step(progress: Progress) -> None:
             on_progress(progress)
-            prepared.room.relieve()
-            interrupts.answer()
+            prepared.storage.release_pages()
+            interrupts.raise_if_pending()
 
         try:
             _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
@@ -118,11 +118,11 @@ def _clear(run: Path) -> None:
     forget_waypoints(run)
 
 
-def _describe(scene: Scene, run: Path, asked: TrainSettings, prepared: Prepared, *, resume: bool) -> None:
+def _describe(scene: Scene, run: Path, requested: TrainSettings, prepared: Prepared, *, resume: bool) -> None:
     """Write RUN/config.json."""
     described = RunConfig.describing(
         scene,
-        asked,
+        requested,
         factor=prepared.factor,
         contraction=prepared.extent.contraction,
         selection=prepared.selection,
@@ -168,19 +168,19 @@ def _run(
         append_log(run, entry)
         logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
 
-    waypoints = [share for share in SHARES if share > _share(settings, fitting.step, totals)]
+    waypoints = [fraction for fraction in SHARES if fraction > _share(settings, fitting.step, totals)]
     try:
-        while (share := _share(settings, fitting.step, totals)) < 1.0:
+        while (fraction := _share(settings, fitting.step, totals)) < 1.0:
             began = time.perf_counter()
-            result = sentinel.advance(share)
+            result = sentinel.advance(fraction)
             totals.seconds += time.perf_counter() - began
             totals.samples += result.samples
             totals.rays += result.rays
             loss = result.loss
-            share = _share(settings, fitting.step, totals)
-            on_progress(Progress(share, fitting.step, totals.seconds, loss, speeds()[0]))
-            if waypoints and share >= waypoints[0]:
-                waypoints = [later for later in waypoints if later > share]
+            fraction = _share(settings, fitting.step, totals)
+            on_progress(Progress(fraction, fitting.step, totals.seconds, loss, speeds()[0]))
+            if waypoints and fraction >= waypoints[0]:
+                waypoints = [later for later in waypoints if later > fraction]
                 keep_waypoint(run, fitting.step, checkpoints.model())
                 log()
             elif totals.seconds - logged_seconds >= 1.0:

@@ -22,7 +22,7 @@ from nerfcli.multiview.correspondences import Shared
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.pool import Album, PixelPool, load_album
-from nerfcli.photos.storage import Room, needs_of, room_for
+from nerfcli.photos.storage import PhotoStorage, needs_of, storage_for
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
@@ -32,8 +32,8 @@ from nerfcli.search.selection import (
     SEARCH_SHARE,
     Facts,
     is_worth_a_search,
+    may_use_points,
     select,
-    tells_points,
     with_known_cameras,
     with_points,
 )
@@ -60,7 +60,7 @@ class Prepared:
     Args:
         settings: with the components that are taken.
         factor: photos are averaged over squares of this many pixels.
-        room: where arrays of the size of the photos go.
+        storage: where arrays of the size of the photos go.
         extent: of the field.
         pool: the training photos.
         selection: how the scene decided on the components; None where it was not asked.
@@ -73,7 +73,7 @@ class Prepared:
 
     settings: TrainSettings
     factor: int
-    room: Room
+    storage: PhotoStorage
     extent: Extent
     pool: PixelPool
     selection: Selection | None
@@ -126,10 +126,10 @@ def prepare(
     first = scene.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)
     needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
-    room, told = room_for(needs, memory_bytes, folder=run)
+    storage, told = storage_for(needs, memory_bytes, folder=run)
     notify(told)
     masks = settings.components.masks
-    album = load_album(scene.train_frames, factor=factor, threads=settings.threads, room=room, masks=masks)
+    album = load_album(scene.train_frames, factor=factor, threads=settings.threads, storage=storage, masks=masks)
     shared = Shared(scene, album.photos, threads=settings.threads)
     if begun is not None:
         extent = begun.extent
@@ -141,7 +141,7 @@ def prepare(
             notify(f"the scene has no 3D points; estimating its extent from {len(located.points)} triangulated ones")
         extent = choose_extent(located, settings, fills_frame=album.fills_frame)
     device = torch.device(settings.device)
-    pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, room=room)
+    pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
     camera = album.photos[0].frame.camera
     notify(
         f"{len(album.photos)} training photos, {len(scene.test_frames)} held out, "
@@ -156,7 +156,7 @@ def prepare(
         began = time.perf_counter()
         facts, known = _facts(scene, album, extent, settings, pool=pool, shared=shared, notify=notify)
         selection = _search(
-            scene, album, extent, settings, facts=facts, known=known, room=room, began=began, notify=notify
+            scene, album, extent, settings, facts=facts, known=known, storage=storage, began=began, notify=notify
         )
         settings, log_focal = replace(settings, components=selection.components), selection.log_focal
     elif settings.components.cameras in LEARN_FOCAL:
@@ -178,7 +178,7 @@ def prepare(
             )
         notify(f"points: {len(known.numbers)} pixels see a 3D point at a known distance")
         points = PointRays(known, pool)
-    return Prepared(settings, factor, room, extent, pool, selection, reference, gains, log_focal, points)
+    return Prepared(settings, factor, storage, extent, pool, selection, reference, gains, log_focal, points)
 
 
 def _facts(
@@ -205,7 +205,7 @@ def _facts(
         cameras=_camera_check(album, shared, notify=notify) if lacks_points and has_time else None,
         fixed=settings.fixed,
     )
-    if not tells_points(settings.components, facts):
+    if not may_use_points(settings.components, facts):
         return facts, None
     if shared.of_model.count:
         known = point_depths(shared.of_model, pool, extent.training_from_scene)
@@ -233,7 +233,7 @@ def _search(
     *,
     facts: Facts,
     known: PointDepths | None,
-    room: Room,
+    storage: PhotoStorage,
     began: float,
     notify: Callable[[str], None],
 ) -> Selection:
@@ -245,7 +245,7 @@ def _search(
         for decision in decisions:
             notify(decision.in_words())
         return Selection(components, tuple(decisions), time.perf_counter() - began)
-    asked, log_focal, measured = with_known_cameras(settings.components, facts)
+    requested, log_focal, measured = with_known_cameras(settings.components, facts)
     trials = Trials(
         album.photos,
         extent,
@@ -254,13 +254,13 @@ def _search(
         log_focal=log_focal,
         known=known,
         colours=album.colours,
-        room=room,
+        storage=storage,
     )
     took = time.perf_counter() - began
     notify(f"selecting components, for up to {100 * SEARCH_SHARE:.0f} % of the budget")
     selection = select(
         trials,
-        asked,
+        requested,
         facts,
         seconds=None if budget is None else max(LEAST_SECONDS, SEARCH_SHARE * budget - took),
         steps=None if steps is None else round(SEARCH_SHARE * steps),

@@ -66,7 +66,7 @@ class Sentinel:
         except NonFiniteError:
             return self._answer()
 
-    def _take_snapshot(self, share: float) -> None:
+    def _take_snapshot(self, fraction: float) -> None:
         tensors, description = self._fitting.state()
         if not all(map(is_finite, that_must_be_finite(tensors).values())):
             raise NonFiniteError
@@ -76,7 +76,7 @@ class Sentinel:
             self._description = description
         else:  # Adam has no moments before its first step
             self._tensors, self._description = _copied(tensors, description)
-        self._shares = [share]
+        self._shares = [fraction]
 
     def _go_back(self) -> None:
         self._fitting.restore(*_copied(self._tensors, self._description))
@@ -107,8 +107,8 @@ class Sentinel:
             return result
         fitting.restore(*_copied(*before))
         if deterministic:
-            for share in self._shares[: done - 1]:
-                fitting.advance(share)
+            for fraction in self._shares[: done - 1]:
+                fitting.advance(fraction)
         path, told = self._keep(self._shares[done - 1], bad)
         self._go_back()
         if fitting.rollbacks == MOST_ROLLBACKS:
@@ -127,12 +127,12 @@ class Sentinel:
         first, self._shares = self._shares[0], []
         return self.advance(first)
 
-    def _keep(self, share: float, bad: BadTensor) -> tuple[Path, str]:
+    def _keep(self, fraction: float, bad: BadTensor) -> tuple[Path, str]:
         """Write the state before a step with its batch, and say in words what the step will meet."""
         fitting = self._fitting
         tensors, description = fitting.state()
         before = {name: tensor.clone() for name, tensor in tensors.items()}
-        drawn = fitting.draw(share)
+        drawn = fitting.draw(fraction)
         batch = {
             **drawn._asdict(),
             "first_pixel": fitting.pool.first_pixel,
@@ -151,7 +151,7 @@ class Sentinel:
             "format": FAILURE_FORMAT,
             "told": told,
             "tensor": bad.name,
-            "share": share,
+            "share": fraction,
             "pixels": [list(pixel) for pixel in pixels],
             "settings": fitting.settings.to_json(),
             "marching": vars(fitting.marching),
@@ -215,11 +215,11 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
     return description, _watched_step(fitting, description["share"])[1]
 
 
-def _watched_step(fitting: Fitting, share: float) -> tuple[StepResult | None, BadTensor | None]:
+def _watched_step(fitting: Fitting, fraction: float) -> tuple[StepResult | None, BadTensor | None]:
     """A step that looks at every number, and the first tensor that is not finite."""
     watch = FirstBad()
     try:
-        result = fitting.advance(share, watch)
+        result = fitting.advance(fraction, watch)
     except NonFiniteError:
         # Where no number is bad, numbers are so large that their sum is.
         return None, watch.found or BadTensor("sum of the gradients", 1, 1, ())

@@ -58,14 +58,14 @@ def measure_waypoints(
         masks = settings.components.masks
         try:
             album = load_album(
-                held_out, factor=prepared.factor, threads=settings.threads, room=prepared.room, masks=masks
+                held_out, factor=prepared.factor, threads=settings.threads, storage=prepared.storage, masks=masks
             )
             pixels = HeldoutPixels(
                 album.photos,
                 prepared.extent.training_from_scene,
                 torch.device(device),
                 colours=album.colours,
-                room=prepared.room,
+                storage=prepared.storage,
             )
         except UserError as error:
             notify(f"training is complete, but PSNR on held-out photos could not be measured: {error}")

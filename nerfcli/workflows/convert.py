@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from nerfcli.cameras.frame import Capture
-from nerfcli.cameras.orientation import rescaling_told
+from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.convert import detect
 from nerfcli.convert.conversion import Conversion, Doubt, TargetOptions, convert, load
 from nerfcli.convert.formats import Format, Given, recording
@@ -50,7 +50,7 @@ def convert_capture(
     to = wanted.form.name
     form, found, capture = load(source, given, doubt)
     notify(f"{found}: {form.name}, {contents(capture)}")
-    for text in rescaling_told(other_sizes(capture)):
+    for text in describe_rescaling(other_sizes(capture)):
         notify(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
     capture, new_from_old, scale = in_world_frame(capture, world)
     if scale is not None:

@@ -38,7 +38,7 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 def _describe_scene(folder: Path) -> dict[str, Any]:
     from nerfcli import scene as scenes
-    from nerfcli.cameras.orientation import rescaling_told
+    from nerfcli.cameras.orientation import describe_rescaling
 
     scene = scenes.load(folder)
     cameras = {frame.camera for frame in scene.frames}
@@ -49,7 +49,7 @@ def _describe_scene(folder: Path) -> dict[str, Any]:
         "missing": len(scene.missing),
         "cameras": [f"{c.model} {c.width}x{c.height} focal {c.focal_px:.1f} px" for c in list(cameras)[:5]],
         "camera_count": len(cameras),
-        "rescaled": rescaling_told(scene.rescaled),
+        "rescaled": describe_rescaling(scene.rescaled),
         "points": len(scene.points),
         "unit": scene.unit,
         "unit_source": scene.unit_source,

@@ -132,7 +132,7 @@ def _export_page(
         cameras.train,
         cameras.test,
         room_bytes=PAGE_BYTES - text_bytes - 150_000,
-        on_share=lambda share: progress(0.2 + 0.8 * share, "photos"),
+        on_share=lambda fraction: progress(0.2 + 0.8 * fraction, "photos"),
     )
     if photos.missing:
         notify(f"{photos.missing} photos are not where the run looks for them: the page has their cameras alone")

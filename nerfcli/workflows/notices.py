@@ -13,7 +13,7 @@ def silent(text: str) -> None:
     """Drop a line."""
 
 
-def no_progress(share: float, detail: str) -> None:
+def no_progress(fraction: float, detail: str) -> None:
     """Show no progress."""
 
 

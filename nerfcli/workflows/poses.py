@@ -74,9 +74,9 @@ def estimate_poses(
         outlook = Outlook(plan)
 
     def on_stage(stage: str, done: int, total: int) -> None:
-        share, left = (0.0, None) if outlook is None else outlook.update(stage, done, total)
+        fraction, left = (0.0, None) if outlook is None else outlook.update(stage, done, total)
         about = "" if left is None else f", about {duration(left)} left"
-        progress(share, f"({done} of {total} {_STAGES[stage]}{about})")
+        progress(fraction, f"({done} of {total} {_STAGES[stage]}{about})")
 
     report = structure_from_motion.estimate_poses(
         folder,

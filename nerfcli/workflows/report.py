@@ -73,8 +73,8 @@ def report_runs(
     progress(0.0, "")
     for index, (run, told) in enumerate(zip(opened, facts, strict=True)):
 
-        def on_share(share: float, index: int = index, label: str = told.label) -> None:
-            progress((index + share) / len(runs), label)
+        def on_share(fraction: float, index: int = index, label: str = told.label) -> None:
+            progress((index + fraction) / len(runs), label)
 
         model = run.model(device_name(device))
         if model.sha256 != hashes[index]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nerfcli import scene as scenes
 from nerfcli.atomic import clear_leftovers
-from nerfcli.cameras.orientation import rescaling_told
+from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.errors import UserError
 from nerfcli.exclusive import exclusive
 from nerfcli.runs.config import split_hash
@@ -65,7 +65,7 @@ def train_scene(
         listed = ", ".join(loaded.missing[:NAMES_SHOWN])
         more = f" and {len(loaded.missing) - NAMES_SHOWN} more" if len(loaded.missing) > NAMES_SHOWN else ""
         warn(f"{len(loaded.missing)} photos of {folder} are missing and skipped: {listed}{more}")
-    for text in rescaling_told(loaded.rescaled):
+    for text in describe_rescaling(loaded.rescaled):
         notify(text)
 
     def is_kept() -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from nerfcli.cameras.calibration import Calibrated, Calibration, Picture, calibrated
-from nerfcli.cameras.orientation import counted, rescaling, rescaling_told
+from nerfcli.cameras.orientation import counted, describe_rescaling, rescaling
 from nerfcli.errors import UserError
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import Exif
@@ -157,4 +157,4 @@ def _notes(given: GivenIntrinsics, found: Sequence[Calibrated]) -> tuple[str, ..
         f"{len(found)} photos, {' and '.join(ways)}"
     )
     other_sizes = counted(rescaling(calibration.cameras[one.number], one.camera) for one in found)
-    return (first, *rescaling_told(other_sizes))
+    return (first, *describe_rescaling(other_sizes))
