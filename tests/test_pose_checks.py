@@ -260,9 +260,10 @@ def test_a_refused_model_stays_and_can_be_accepted(
     assert len(scenes.load(scene).frames) == len(NAMES)
 
 
-def test_a_component_that_is_not_there_is_bad_input(photos: Path, tmp_path: Path):
-    settings = replace(ONE_THREAD, component=3)
-    with pytest.raises(UserError, match=r"there is no component 3: the photos of .* form 1 \(\d+ photos\)"):
+@pytest.mark.parametrize("component", [2, 3])
+def test_a_component_that_is_not_there_is_bad_input(photos: Path, tmp_path: Path, component: int):
+    settings = replace(ONE_THREAD, component=component)
+    with pytest.raises(UserError, match=rf"there is no component {component}: the photos of .* form 1 \(\d+ photos\)"):
         estimate(photos, tmp_path / "scene", settings)
 
 

@@ -228,6 +228,7 @@ def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
     views = synthetic.panorama(6, WIDE, turn_deg=120)
     still = solve(tmp_path, views, synthetic.room(900, seed=0))
     assert still.kinds[0] == "no baseline (pure rotation)"
+    assert [rung["what"] for rung in still.climbed.attempts] == ["default thresholds"]  # no other attempt can help
     with pycolmap.Database.open(str(still.job.database)) as database:
         pairs = read_verified_pairs(database, min_matches=30)
     turn = best_turn(pairs, dict.fromkeys(still.job.image_ids, (WIDE.width, WIDE.height)))

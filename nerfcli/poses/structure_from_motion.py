@@ -90,7 +90,7 @@ def estimate_poses(
         if Path(settings.holdout).is_file():
             matching["holdout_key"] = file_key(Path(settings.holdout))
         report = make_report(photos, settings, result=result, matching=matching, intrinsics=grouped.given)
-        if settings.component > max(len(report.models), 1):
+        if settings.component > max(len(report.components), 1):
             raise _no_such_component(report, photos_dir)
         if error := refusal(report, photos_dir):
             if not (settings.accept_refused and report.models):

@@ -21,11 +21,13 @@ from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import extraction_seconds, matching_seconds
 from nerfcli.poses.input.settings import FULL_SIZE
+from nerfcli.poses.judge.parallax import best_turn
 from nerfcli.poses.model.intrinsics import field_of_view_deg
 from nerfcli.poses.model.lens_family import as_fisheye
 from nerfcli.poses.model.localise import left_out, localise
 from nerfcli.poses.model.merging import merge_models
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
+from nerfcli.poses.model.two_views import read_verified_pairs
 
 # Registered shares below which the mapper gets another chance; a photo or two missing is often the photo's own fault.
 _GOOD_SHARE = 0.9
@@ -154,12 +156,16 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     one starts from a fisheye, where pairs of photos say that it was one. If photos that match some other one well are
     still left out, the next ones start from a pair with a smaller baseline, from the strongest pair that was left out,
     and with low angles. Then all pairs are compared that were not, and more features are sought in the photos' full
-    size. Last, single photos are placed by the points that they show (see `localise`). If the first attempt is not the
-    last, `tell` is told each attempt and its result.
+    size. Last, single photos are placed by the points that they show (see `localise`). Where the camera only turned,
+    nothing more is tried. If the first attempt is not the last, `tell` is told each attempt and its result.
     """
     ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, MapperOptions())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
+    if ladder.share(featured) < _GOOD_SHARE and _only_turns(job):
+        ladder.tell_results()
+        tell("not trying anything else: the camera turned on the spot")
+        return replace(ladder.best, attempts=ladder.rungs)
     job = _without_exif(ladder, job, report, share=ladder.share(featured))
     job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
     _other_starts(ladder, job)
@@ -175,6 +181,15 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     if len(ladder.rungs) > 1:
         ladder.tell_results()
     return replace(ladder.best, attempts=ladder.rungs)
+
+
+def _only_turns(job: Job) -> bool:
+    """Whether rotations of the camera explain all matches: then no model is accepted, whatever is tried."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
+    sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}
+    turn = best_turn(pairs, sizes)
+    return turn is not None and turn.explains_all
 
 
 def _with_more_features(ladder: _Ladder, job: Job, report: Report, *, missing: float) -> None:
