@@ -202,7 +202,7 @@ def fingerprint(scene: Scene) -> str:
 
 def _load(path: Path) -> Scene:
     if not path.exists():
-        raise UserError(f"{path} does not exist", "give a scene folder")
+        raise UserError(f"{path} does not exist", "give a scene folder, such as one written by nerfcli poses")
     if path.is_file():
         if path.suffix.lower() != ".json":
             raise UserError(f"{path} is a file, not a scene", "give a scene folder, or its transforms.json")

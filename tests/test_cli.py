@@ -167,7 +167,10 @@ def test_all_threads_are_the_processors_of_this_process():
         ("train x --steps 0", "--steps"),
         ("train x --downscale 3", "'3'; choose auto, 1, 2, 4 or 8"),
         ("train x --field gaussians", "'gaussians'; choose hash, voxels or mlp"),
-        ("train x --budget soon", "'soon' is not a time"),
+        ("train x --budget soon", "--budget: 'soon' is not a time"),
+        ("poses x --time-limit soon", "--time-limit: 'soon' is not a time"),
+        ("train x --field-memory lots", "--field-memory: 'lots' is not an amount"),
+        ("convert x y", "--to: missing; choose one of nerfcli, colmap"),
         ("train x --device tpu", "'tpu'"),
         ("poses x --camera-model PERSPECTIVE", "'PERSPECTIVE'; choose auto"),
         ("render x --depth expected", "'expected'; choose conditional, moment"),
@@ -198,6 +201,22 @@ def test_a_missing_path_is_told_in_two_lines(command, tmp_path):
     assert result.exit_code == BAD_INPUT
     assert "nö such" in error_of(result)[0]
     assert listing(tmp_path) == {}
+
+
+@pytest.mark.parametrize("command", ["evaluate", "render", "report"])
+def test_a_scene_where_a_run_is_needed_is_told_with_what_to_do(command, capture, tmp_path):
+    error = error_of(nerfcli(command, capture))
+    assert error == (f"Error: {capture} is a scene, not a run", f"Hint:  train it first: nerfcli train {capture}")
+    assert error_of(nerfcli(command, tmp_path / "nowhere"))[0] == f"Error: {tmp_path / 'nowhere'} does not exist"
+
+
+def test_photos_where_cameras_are_needed_are_told_with_what_to_do(tmp_path):
+    photos = write_photos(tmp_path / "photos", 1)
+    error = error_of(nerfcli("convert", photos, tmp_path / "out.json", "--to", "transforms"))
+    assert error == (
+        f"Error: {photos} contains photos but no cameras",
+        f"Hint:  estimate them with: nerfcli poses {photos}",
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)

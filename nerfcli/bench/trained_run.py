@@ -62,6 +62,8 @@ def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Benched
     Raises:
         UserError: it is neither, or nothing was held out.
     """
+    if not path.exists():
+        raise UserError(f"{path} does not exist", "give a run folder, or a scene folder")
     if (path / CONFIG).exists():
         subject = _run_at(path, device=device, threads=threads, seed=seed)
     else:

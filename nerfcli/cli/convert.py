@@ -179,7 +179,8 @@ def convert(
     else:
         to = PROGRAMS.get(to or "", to)
         if to is None or to not in FORMATS_WRITTEN:
-            raise typer.BadParameter(f"{to!r}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
+            given_text = "missing" if to is None else repr(to)
+            raise typer.BadParameter(f"{given_text}; choose one of {', '.join(FORMATS_WRITTEN)}", param_hint="--to")
         if target is None:
             raise typer.BadParameter("missing; give the file or folder to write", param_hint="OUT")
         one_of(pixels, ("stored", "upright"), "--pixels")

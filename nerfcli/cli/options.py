@@ -95,8 +95,8 @@ def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]
     return chosen
 
 
-def seconds_from_text(text: str) -> float:
-    """Parse 90s, 5m, 1.5h or plain seconds.
+def seconds_from_text(text: str, option: str = "--budget") -> float:
+    """Parse 90s, 5m, 1.5h or plain seconds, the value of an option.
 
     Raises:
         typer.BadParameter: anything else, or zero.
@@ -104,7 +104,7 @@ def seconds_from_text(text: str) -> float:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     seconds = float(match[1]) * _SECONDS_PER_UNIT[match[2] or "s"] if match else 0.0
     if not seconds > 0:
-        raise typer.BadParameter(f"{text!r} is not a time; write 90s, 5m or 1h")
+        raise typer.BadParameter(f"{text!r} is not a time; write 90s, 5m or 1h", param_hint=option)
     return seconds
 
 
@@ -137,8 +137,8 @@ def contraction_name(contraction: str) -> str | None:
     return None if contraction == "auto" else contraction
 
 
-def bytes_from_text(text: str) -> int:
-    """Parse 4GB, 500MB or 1.5GiB; a plain number is bytes.
+def bytes_from_text(text: str, option: str = "--memory") -> int:
+    """Parse 4GB, 500MB or 1.5GiB, the value of an option; a plain number is bytes.
 
     Raises:
         typer.BadParameter: anything else, or zero.
@@ -147,7 +147,7 @@ def bytes_from_text(text: str) -> int:
     if match is None or not (
         size := int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " "))
     ):
-        raise typer.BadParameter(f"{text!r} is not an amount of memory; write 4GB or 500MB")
+        raise typer.BadParameter(f"{text!r} is not an amount of memory; write 4GB or 500MB", param_hint=option)
     return size
 
 

@@ -156,7 +156,7 @@ def poses(
     )
     limits = Limits(
         memory_bytes=memory_limit(memory),
-        seconds=None if time_limit is None else seconds_from_text(time_limit),
+        seconds=None if time_limit is None else seconds_from_text(time_limit, "--time-limit"),
     )
 
     def work(source: Path, one_of_many: bool) -> None:

@@ -139,7 +139,7 @@ def train(
         log2_rows=log2_rows,
         width=width,
         field=field_kind(field),
-        field_memory_bytes=None if field_memory is None else bytes_from_text(field_memory),
+        field_memory_bytes=None if field_memory is None else bytes_from_text(field_memory, "--field-memory"),
     )
     rule = holdout_rule(holdout)
 

@@ -115,6 +115,8 @@ def recognise(path: Path) -> tuple[Format, Path]:
         found = form.find(path)
         if found is not None and form.parse is not None:
             return form, found
+    if path.is_dir() and list_images(path):
+        raise UserError(f"{path} contains photos but no cameras", f"estimate them with: nerfcli poses {path}")
     looked_for = ", ".join(dict.fromkeys(form.looked_for for form in FORMATS if form.parse is not None))
     raise UserError(f"{path} contains no capture in a supported format", f"looked for {looked_for}")
 

@@ -16,7 +16,7 @@ from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.files import CONFIG
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene, fingerprint
+from nerfcli.scene import Scene, fingerprint, is_scene
 from nerfcli.sealed import read_sealed, write_sealed
 
 
@@ -160,13 +160,21 @@ def read_config(run: Path) -> RunConfig:
     try:
         return RunConfig.from_json(read_sealed(run / CONFIG))
     except FileNotFoundError as error:
-        raise UserError(
-            f"{run} is not a run folder: it has no {CONFIG}", "give a run folder written by nerfcli train"
-        ) from error
+        raise no_run(run) from error
     except UserError as error:
         raise UserError(f"{run / CONFIG} cannot be read: {error.message}", MEND) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{run / CONFIG} cannot be read: {error}", MEND) from error
+
+
+def no_run(path: Path) -> UserError:
+    """Return the error for a path that is not a run folder."""
+    hint = "give a run folder written by nerfcli train"
+    if not path.exists():
+        return UserError(f"{path} does not exist", hint)
+    if is_scene(path):
+        return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {path}")
+    return UserError(f"{path} is not a run folder: it has no {CONFIG}", hint)
 
 
 def split_hash(test_names: Iterable[str]) -> str:

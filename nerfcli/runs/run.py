@@ -11,7 +11,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.render.model import Model, load_model
 from nerfcli.runs.components import Components
-from nerfcli.runs.config import RunConfig, read_config, split_hash
+from nerfcli.runs.config import RunConfig, no_run, read_config, split_hash
 from nerfcli.runs.decisions import Decision
 from nerfcli.runs.files import CAMERAS, CONFIG, FIELD, METRICS, STATE
 from nerfcli.runs.log import LogEntry, TrainingSummary, read_log, summary_of
@@ -90,6 +90,8 @@ class Run:
         Raises:
             UserError: it is missing or damaged.
         """
+        if not self.is_trained and not (self.path / CONFIG).exists():
+            raise no_run(self.path)
         return load_model(self.field_path, device)
 
     def checkpoint_sha256(self) -> str:

@@ -6,6 +6,7 @@ Imports stand where they are needed: what a depth file holds is told without tor
 from pathlib import Path
 from typing import Any
 
+from nerfcli.errors import UserError
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
 
 
@@ -16,6 +17,8 @@ def describe(path: str | Path) -> dict[str, Any]:
         UserError: it is none of these, or damaged.
     """
     folder = Path(path)
+    if not folder.exists():
+        raise UserError(f"{folder} does not exist", "give a scene, a run, renders, or one of their files")
     if folder.name == RENDERS:
         folder = folder.parent
     if folder.is_file() and folder.suffix == ".safetensors":
