@@ -401,7 +401,7 @@ def test_a_batch_goes_on_after_a_bad_path(capture, tmp_path):
     assert result.exit_code == BAD_INPUT
     assert result.stdout.splitlines() == [f"{capture}-run", f"{other}-run"]
     error, _ = error_of(result)
-    assert error.startswith(f"Error: {tmp_path / 'missing'}: ")
+    assert error.startswith(f"Error: {tmp_path / 'missing'}")
     assert (capture.with_name("spheres-run") / "field.safetensors").exists()
     # Those results, as they stand on stdout, are the next command's input.
     result = nerfcli("evaluate", "-", "--json", stdin=result.stdout)

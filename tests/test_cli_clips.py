@@ -77,7 +77,7 @@ def test_videos_and_folders_on_standard_input(clip, estimated):
     assert [folder for folder, _, _ in estimated] == ["photos", "my clip-frames"]
     for told in (
         "photos is not a video: using all of its photos",
-        "sound.m4a: contains no video stream",
+        "Error: sound.m4a contains no video stream",
         "cut.mp4 is truncated",
     ):
         assert told in result.stderr
@@ -94,7 +94,7 @@ def test_more_frames_than_there_are(clip, estimated):
     result = nerfcli("poses", clip, "--frames", "21")
     assert result.exit_code == BAD_INPUT
     assert result.stderr.splitlines()[-2:] == [
-        "Error: my clip.MOV has 20 frames, 21 were asked for",
+        "Error: my clip.MOV has only 20 frames, but --frames is 21",
         "Hint:  use --frames 20 or fewer",
     ]
     assert (estimated, Path("my clip-frames").exists()) == ([], False)

@@ -136,8 +136,9 @@ def _stderr(text: str) -> None:
 
 
 def report_error(error: UserError, about: str | None = None) -> None:
-    """The two lines of an error, with what it is about in front where several things are worked on."""
-    _stderr(f"Error: {about + ': ' if about else ''}{error.message}")
+    """Print the two lines of an error, after the input it concerns where there are several."""
+    prefix = "" if about is None or error.message.startswith(about) else f"{about}: "
+    _stderr(f"Error: {prefix}{error.message}")
     _stderr(f"Hint:  {error.hint}")
 
 

@@ -90,7 +90,7 @@ def evaluate_run(
         metrics = _kept(trained.metrics_path, checkpoint, align_poses=align_poses, predictions=predictions)
         made_by = metrics["protocol"].split(":")[0]
         older = "" if made_by == PROTOCOL else f" (by {made_by})"
-        notify(f"{trained.metrics_path} is up to date and kept{older}; add --overwrite to evaluate again")
+        notify(f"{trained.metrics_path} is kept{older}: it is up to date; add --overwrite to evaluate again")
         return Evaluation(trained.metrics_path, metrics, is_kept=True)
 
     summary = trained.summary

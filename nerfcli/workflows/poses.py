@@ -63,7 +63,10 @@ def estimate_poses(
     folder, target = Path(photos), Path(scene)
     if (target / SCENE_FILE).exists() and not overwrite:
         if is_same_scene(target, folder, settings, given=intrinsics):
-            notify(f"{target} is complete and kept: same photos and settings; add --overwrite to estimate poses again")
+            notify(
+                f"{target} is kept: it is complete and has these photos and settings; add --overwrite to estimate "
+                "poses again"
+            )
             return target
         raise UserError(f"{target} exists", "add --overwrite to replace it, or choose another folder with -o")
     outlook: Outlook | None = None

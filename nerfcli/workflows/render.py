@@ -91,7 +91,7 @@ def render_run(
         raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)
     refuse_foreign(folder)
     if not overwrite and order.is_held_by(folder):
-        notify(f"{folder} is complete and kept: same settings; add --overwrite to render again")
+        notify(f"{folder} is kept: it is complete and has these settings; add --overwrite to render again")
         return order.results(folder)
 
     total = sum(frames[index].camera.width * frames[index].camera.height for index in chosen)

@@ -66,7 +66,7 @@ def report_runs(
         facts.append(read_facts(run, label, checkpoint_sha256=hashes[-1]))
     origin = origin_of(facts, hashes, views=views, depth=depth)
     if keep and not overwrite and is_made_from(target, origin):
-        notify(f"{target} is up to date and kept; add --overwrite to write it again")
+        notify(f"{target} is kept: it is up to date; add --overwrite to write it again")
         return target
     names = common_names(facts, views)
     looks, meanings = [], []

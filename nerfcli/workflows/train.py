@@ -71,7 +71,7 @@ def train_scene(
     def is_kept() -> bool:
         if not _keeps(run, loaded, settings, resume=resume, overwrite=overwrite):
             return False
-        notify(f"{run} is complete and kept: same settings; add --overwrite to train again")
+        notify(f"{run} is kept: it is complete and has these settings; add --overwrite to train again")
         return True
 
     if is_kept():

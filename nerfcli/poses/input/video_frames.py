@@ -175,7 +175,7 @@ def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool,
     missing = sum(not (folder / name).is_file() for name in names)
     if same and not (missing and overwrite):
         left = f", {missing} of which are missing" if missing else ""
-        notify(f"{folder} is complete and kept: {len(names)} frames{left}")
+        notify(f"{folder} is kept: {len(names)} frames{left}")
         return True
     if not overwrite:
         raise UserError(
