@@ -1,4 +1,4 @@
-"""What became of each photo: the content of poses_report.json."""
+"""Content of poses_report.json: the result for each photo."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -18,7 +18,7 @@ _MUCH_APART = 0.3
 
 @dataclass(frozen=True)
 class ImageReport:
-    """A photo, whether it was registered, and if not why.
+    """A photo, whether it registered, and the reason if not.
 
     orientation: the EXIF orientation (1...8) that was applied before anything else; the camera is that of the upright
     picture. pose_blur_px: how far a typical point moves in it by one standard deviation of its pose.
@@ -33,7 +33,7 @@ class ImageReport:
 
 @dataclass(frozen=True)
 class PosesReport:
-    """What `poses_report.json` holds, under the same names.
+    """Content of poses_report.json, with the same names.
 
     verdict: whether the result is believed, why not, and all that was measured (see `acceptance`). pose_blur_px:
     median, largest, and the photo that has it. lenses: the lens models that were tried for each camera, with held-out
@@ -165,7 +165,9 @@ def _blur_summary(images: Iterable[ImageReport]) -> dict[str, Any] | None:
 
 
 def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
-    """Why a result is refused, exit code 4: the evidence against it, or the reason that most missing photos share."""
+    """Return why a result is refused, exit code 4: the contradicting evidence, or the most frequent reason of missing
+    photos.
+    """
     failures = report.verdict["failures"]
     # Who asks for a smaller model knows that it has few of the photos.
     least_share = report.settings.min_registered if report.settings.component == 1 else 0.0

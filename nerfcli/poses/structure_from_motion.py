@@ -1,4 +1,4 @@
-"""From a folder of photos to a scene folder: poses, intrinsics and points by structure from motion.
+"""Structure from motion: from a folder of photos to a scene folder with poses, intrinsics and points.
 
 The photos are not copied into the scene and not changed. The cameras refer to upright pictures, as
 `media.images.read_image` gives them: pycolmap 4.2 does not apply the EXIF orientation, so it gets upright copies
@@ -144,7 +144,9 @@ def plan_poses(
 def is_same_scene(
     scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: GivenIntrinsics | None = None
 ) -> bool:
-    """Whether `scene_dir` was made from the photos that are in `photos_dir` now, with these settings, threads aside."""
+    """Return whether `scene_dir` was made from the current photos in `photos_dir` with these settings, except
+    threads.
+    """
     try:
         return _is_same(scene_dir, photos_dir, settings, given=given)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, UserError):  # a file is not there, or damaged

@@ -49,7 +49,7 @@ def workspace(scene_dir: Path) -> Iterator[Workspace]:
 
 
 def is_in_the_making(scene_dir: Path) -> bool:
-    """Whether an earlier call has worked on a scene here, complete or not."""
+    """Return whether an earlier call worked on a scene here, complete or not."""
     return (scene_dir / "work" / _LOCK).is_file()
 
 
@@ -94,7 +94,7 @@ def database_bytes(scene_dir: Path) -> int:
 
 
 def drop_database(scene_dir: Path) -> None:
-    """Remove features, matches and what is known of them. The scene stays; making it again starts from nothing."""
+    """Delete features and matches. The scene stays; estimating it again starts from scratch."""
     for path in scene_dir.glob(database_path(scene_dir / "work").name + "*"):
         path.unlink()
     if is_in_the_making(scene_dir):

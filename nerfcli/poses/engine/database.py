@@ -68,7 +68,7 @@ def register_photos(job: Job) -> None:
 
 
 def camera_of_group(group: CameraGroup) -> pycolmap.Camera:
-    """Camera model of a group, and its intrinsics if they are given, or the focal length if EXIF tells it."""
+    """Return the camera model of a group, with its intrinsics if given, or EXIF's focal length."""
     if group.params is not None:
         camera = pycolmap.Camera.create_from_model_name(1, group.model, 1.0, group.width, group.height)
         camera.params = list(group.params)

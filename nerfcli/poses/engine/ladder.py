@@ -63,7 +63,7 @@ class _Ladder:
         self._announced = ""
 
     def announce(self, what: str, *, takes: float = 0.0) -> None:
-        """Tell what the rungs so far gave, and once what comes next, and how much longer than before that takes."""
+        """Report the results so far, and once what comes next."""
         self.tell_results()
         if what != self._announced:
             longer = f" (takes about {takes:.1f} times as long as the first features and matches)" if takes else ""
@@ -71,7 +71,7 @@ class _Ladder:
         self._announced = what
 
     def tell_results(self) -> None:
-        """Tell what each rung gave that has not been told yet."""
+        """Report the results that have not been reported yet."""
         for rung in self.rungs[self._told :]:
             largest, *others = rung["models"] or ["none"]
             also = f" (and {len(others)} smaller models)" if len(others) > 1 else f" + {others[0]}" if others else ""
@@ -102,7 +102,7 @@ class _Ladder:
             self.best = best
 
     def is_wide(self) -> bool:
-        """Whether a camera of the best model sees so much that it may be a fisheye."""
+        """Return whether a camera of the best model has such a wide field of view that it may be a fisheye."""
         if not self.best.models:
             return False
         model = self.best.models[0]
@@ -120,7 +120,7 @@ class _Ladder:
             self._take(what, [grown[0], *models[1:]], job)
 
     def find_left_out(self, what: str) -> None:
-        """Place, one by one, photos of which no pair is strong enough, by what the best model knows."""
+        """Locate remaining photos one by one from the 3D points they see."""
         models, job = self.best.models, self.best.job
         if not models:
             return
@@ -144,7 +144,7 @@ class _Ladder:
             self.best = Mapped(models, job, self.rungs)
 
     def share(self, candidates: int) -> float:
-        """Of the photos that can be placed, the share that the best model places."""
+        """Return the fraction of the photos that could register which the best model registers."""
         return _placed(self.best.models) / max(candidates, 1)
 
 
@@ -252,7 +252,9 @@ def _without_exif(ladder: _Ladder, job: Job, report: Report, *, share: float) ->
 
 
 def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:
-    """Start from a fisheye, if the result asks for it and pairs of photos say so; the job of the better result."""
+    """Start from a fisheye if the result suggests it and pairs of photos confirm it; return the job of the better
+    result.
+    """
     if share >= _GOOD_SHARE and not ladder.is_wide():
         return job
     fisheye = as_fisheye(job)
@@ -288,7 +290,7 @@ def _strong_pairs(job: Job) -> list[tuple[int, int, int]]:
 
 
 def _can_have_more_features(job: Job) -> bool:
-    """Whether larger pictures or a higher limit would give any photo more features than it has."""
+    """Return whether larger pictures or a higher limit would give any photo more features."""
     larger = any(max(group.width, group.height) > job.max_image_size for group in job.groups)
     limited = job.max_features < _MORE_FEATURES and max(feature_counts(job), default=0) >= job.max_features
     return (larger or limited) and len(job.files) <= _MOST_FULL_SIZE

@@ -1,4 +1,4 @@
-"""From matches to a model: one run of the incremental mapper, and COLMAP files."""
+"""Map matches to a model: one run of the incremental mapper, and COLMAP files."""
 
 import shutil
 from collections.abc import Mapping

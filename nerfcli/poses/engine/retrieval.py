@@ -1,4 +1,4 @@
-"""Which photos look alike, from a few of their features: for large captures, where comparing all in full takes hours.
+"""Image retrieval: find similar photos from a few of their features, for large captures.
 
 Of each photo the features of the largest scale are compared with those of every other one, by the same rule that the
 matcher has (mutual nearest neighbours that are clearly nearer than the second). They are few, seen from farthest, and
@@ -47,7 +47,7 @@ def with_neighbours(job: Job, report: Report) -> Job:
 
 
 def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
-    """How many features two photos share, for all pairs.
+    """Count the common features of all pairs of photos.
 
     Args:
         descriptors: per photo (features, 128) whole numbers up to 255.
@@ -77,7 +77,9 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
 
 
 def alike(likeness: np.ndarray, count: int, *, known: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, sorted: of each photo with the `count` that are most like it and not in `known` with it."""
+    """Return pairs (i, j), i < j, sorted: for each photo the `count` most similar ones that are not in `known` with
+    it.
+    """
     likeness = likeness.astype(np.float64)
     np.fill_diagonal(likeness, -np.inf)
     for i, j in known:

@@ -41,7 +41,7 @@ _MOST_TIME = 1.5
 
 @dataclass(frozen=True)
 class Chance:
-    """What a hypothesis led to."""
+    """Result of an alternative mapping."""
 
     mapped: Mapped
     examined: Examined
@@ -124,7 +124,7 @@ def _job_of(model: pycolmap.Reconstruction, job: Job) -> Job:
 
 
 def is_contradicted(verdict: Verdict) -> bool:
-    """Whether pairs of photos speak against the model, rather than the capture as a whole."""
+    """Return whether pairs of photos contradict the model, rather than the capture as a whole."""
     kinds = [failure.kind for failure in verdict.failures]
     return any("contradict" in kind or "look alike" in kind for kind in kinds)
 

@@ -28,7 +28,7 @@ _LEAST_INLIERS = 0.25
 
 @dataclass(frozen=True)
 class Placed:
-    """Of one held-out photo: its name, how many of the points it sees agree on its pose, of how many, and how well."""
+    """A located held-out photo: its name, the number of inliers of its pose, of how many points, and the error."""
 
     name: str
     inliers: int

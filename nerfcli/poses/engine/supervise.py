@@ -1,4 +1,6 @@
-"""Run the worker: hear its progress, keep it within limits, end it when we end, and tell in words how it died."""
+"""Run the worker process: receive its progress, enforce limits, stop it when the parent ends, and explain how it
+failed.
+"""
 
 import os
 import shutil

@@ -61,7 +61,7 @@ class ComparedPair:
 
 
 def scene_masks(job: Job) -> Path:
-    """Where the masks of a job's object are: in the scene's folder."""
+    """Return the folder of the object masks of a job, in the scene folder."""
     return Path(job.folder).parent / MASKS
 
 
@@ -128,7 +128,7 @@ def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[st
 
 
 def sentence(facts: dict[str, Any]) -> str:
-    """What was found, for the user."""
+    """Describe the result for the user."""
     text = (
         f"an object moves in front of a static background, as on a turntable ({facts['pairs_two_motions']} of "
         f"{facts['pairs']} pairs show both motions)"

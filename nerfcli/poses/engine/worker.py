@@ -54,7 +54,7 @@ def main(job_path: str) -> None:
 
 
 def solve(job: Job, report: Report, tell: Tell) -> None:
-    """Extract, match, map, check; each goes on from what earlier calls left."""
+    """Extract, match, map and check, each continuing from the results of earlier calls."""
     known = recalled(job)
     result, key = Path(job.folder) / RESULT, result_key(job if known is None else known[0])
     if _is_complete(job, key):

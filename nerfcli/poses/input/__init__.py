@@ -1,1 +1,1 @@
-"""What structure from motion starts from: photos, masks, pairs, settings, and the job of the worker."""
+"""Input of structure from motion: photos, masks, pairs, settings, and the job of the worker."""

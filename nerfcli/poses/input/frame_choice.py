@@ -1,4 +1,4 @@
-"""Which frames of a video to use: the sharpest one of each stretch in which the camera moves equally far.
+"""Choose frames of a video: the sharpest one of each stretch of equal camera motion.
 
 Equal stretches of time would spend frames on a camera that stands still. So time counts by how fast the picture moves,
 up to its usual speed: standing still counts nothing, and a fast turn, where frames are blurred, no more than the rest.
@@ -26,7 +26,7 @@ _LOST_SHARE = 0.5
 
 @dataclass(frozen=True)
 class FrameMeasure:
-    """Of one frame: its sharpness (comparable within a video), and how far the picture has moved since the anchor.
+    """Sharpness of a frame (comparable within a video), and its motion since the anchor.
 
     The anchor is the last frame before that had moved by `MOVED_SHARE`. moved is a share of the longer side, infinite
     where the two show different things.
@@ -63,7 +63,9 @@ class MotionPicture:
         self._corners: np.ndarray | None = None
 
     def moved_to(self, other: "MotionPicture") -> float:
-        """How far half of the corners move at least from this frame to the other, as a share of the longer side."""
+        """Return the displacement of at least half of the corners to another frame, as a fraction of the longer
+        side.
+        """
         if self._corners is None:
             found = cv2.goodFeaturesToTrack(self._grey, maxCorners=200, qualityLevel=0.01, minDistance=8)
             self._corners = np.zeros((0, 1, 2), np.float32) if found is None else found
@@ -82,7 +84,7 @@ class MotionPicture:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """How much fine detail a picture has: the variance of the Laplacian of it, slightly smoothed against noise."""
+    """Compute the sharpness of a picture: the variance of its Laplacian, slightly smoothed against noise."""
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     return float(cv2.Laplacian(smooth, cv2.CV_32F).var())
 

@@ -1,4 +1,4 @@
-"""What the parent process asks of the worker, as a file between them."""
+"""Job of the worker process, stored as a file."""
 
 import json
 from collections.abc import Callable
@@ -14,7 +14,7 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """Photos (by number) that share one camera: its COLMAP model and the upright size.
+    """Photos (by index) with a common camera: its COLMAP model and the upright size.
 
     choose: whether the model is only where to start, and a better one may be chosen. params: what is known of the
     intrinsics, in COLMAP's order. fixed: whether they stay as they are. focal_px is where the focal length starts by
@@ -32,7 +32,7 @@ class CameraGroup:
     focal_is_prior: bool = False
 
     def without_exif(self) -> "CameraGroup":
-        """The same group as if EXIF said nothing of its focal length."""
+        """Return the same group without EXIF's focal length."""
         return replace(self, focal_px=None, focal_is_prior=False)
 
 
@@ -43,7 +43,7 @@ def usual_focal_px(width: int, height: int) -> float:
 
 @dataclass(frozen=True)
 class LaidOutMask:
-    """Of one photo: a hash of which pixels are used, "" without a mask, and their share."""
+    """Mask of one photo: a hash of the used pixels, "" without a mask, and their fraction."""
 
     key: str = ""
     used_share: float = 1.0
@@ -98,7 +98,7 @@ class Job:
 
     @property
     def given_cameras(self) -> list[int]:
-        """The ids of the cameras whose intrinsics are known beforehand."""
+        """Ids of the cameras with given intrinsics."""
         return [number for number, group in enumerate(self.groups, start=1) if group.params is not None]
 
     @property
@@ -113,7 +113,7 @@ class Job:
 
 
 def database_path(work: Path, rung: str = "") -> Path:
-    """Where the database of a work folder is: in the scene's folder, above it; those of rungs inside."""
+    """Return the path of the database of a work folder: in the scene folder above it; inside it for later attempts."""
     return work / f"{rung}.db" if rung else work.parent / "database.db"
 
 

@@ -1,4 +1,4 @@
-"""Which photos to compare with which.
+"""Choose which pairs of photos to match.
 
 Matching is quadratic in the photos, and with a hundred of them the longest step.
 """
@@ -46,7 +46,7 @@ class Pairing:
 
 
 def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
-    """Which photos to compare, by one of the rules below.
+    """Choose the pairs of photos to match by one of the rules below.
 
     "auto" compares a small capture exhaustively, and a larger one as its photos allow: by where they were taken, if
     their GPS can tell neighbours apart; in the order in which they were taken, if there is one; else by how alike they

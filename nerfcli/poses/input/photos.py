@@ -1,4 +1,4 @@
-"""The photos of a folder: which can be read, how large they are upright, and which share a camera."""
+"""Photos of a folder: readability, upright size, groups with a common camera."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -75,7 +75,7 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
 
 
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
-    """Names of photos that may share intrinsics: same make, model, lens, focal length, upright size and crop.
+    """Group photos that may share intrinsics: same make, model, lens, focal length, upright size and crop.
 
     Focal lengths within 2 % are the same one: autofocus moves them a little. Photos without EXIF are told apart by
     their size alone. Groups and the names in them are in the order of `photos`.

@@ -1,4 +1,4 @@
-"""What structure from motion is about to do and about how long it will take: said before it starts."""
+"""Plan of structure from motion with an estimate of its time, reported before it starts."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -86,7 +86,7 @@ def matching_seconds(pairs: int, *, max_features: int) -> float:
 
 
 class Outlook:
-    """How much is left, told as the work goes on: measured for the stage at hand, for later ones from the plan.
+    """Estimate of the remaining time: measured for the current stage, from the plan for later ones.
 
     The plan's seconds are stretched by how long the stage at hand has taken so far, after its first twentieth; those of
     later stages by the least that any stage was. The machine slows all of them, whereas what makes one of them slow is
@@ -111,7 +111,7 @@ class Outlook:
         self._share = 0.0
 
     def update(self, stage: str, done: int, total: int) -> tuple[float, float]:
-        """(share of all work that is done, seconds that are left)."""
+        """Return (fraction of all work that is done, remaining seconds)."""
         now = self._clock()
         if stage == "enlarge":
             self._plan_enlarging(total)

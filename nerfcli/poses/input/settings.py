@@ -1,4 +1,4 @@
-"""What may be asked of structure from motion, and what it may take."""
+"""Settings and limits of structure from motion."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ QUALITIES = {"fast": (1000, 2048), "default": (1600, 4096), "best": (FULL_SIZE, 
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """What the result depends on, besides the photos.
+    """Settings that the result depends on.
 
     max_image_size: longer side of the pictures that features are sought in, pixels. max_features: per photo.
     threads: -1 for all; with 1 thread the same seed gives the same poses. camera_model: one of `CAMERA_MODELS`.
@@ -56,7 +56,7 @@ class PoseSettings:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the work may take: resident memory in bytes, and seconds; None for no limit. Results do not depend on it."""
+    """Limits of resident memory in bytes and of time in seconds; None for no limit. Results do not depend on them."""
 
     memory_bytes: int | None = None
     seconds: float | None = None

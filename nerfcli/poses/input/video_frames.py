@@ -1,4 +1,4 @@
-"""From a video to a folder of photos: its chosen frames as JPEG, and frames.json, which says where they come from.
+"""Extract chosen frames of a video to a folder of JPEG photos, with frames.json about their origin.
 
 The frames keep their number in the video as a name, so that pairs are chosen as for any capture that is in order.
 """
@@ -48,7 +48,7 @@ class VideoFrame:
 
 
 def frames_folder(scene_dir: Path) -> Path:
-    """Where the frames of a video go whose scene goes to `scene_dir`: beside it, clip-frames for clip-scene."""
+    """Return the folder of the video frames for a scene: next to it, clip-frames for clip-scene."""
     name = scene_dir.resolve().name if scene_dir.name in ("", "..") else scene_dir.name
     return scene_dir.with_name("frames" if name == "scene" else f"{name.removesuffix('-scene')}-frames")
 

@@ -1,1 +1,1 @@
-"""Whether a model of structure from motion may be believed, and how sharp its poses are."""
+"""Acceptance checks of a model of structure from motion, and the uncertainty of its poses."""

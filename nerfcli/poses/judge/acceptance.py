@@ -1,4 +1,4 @@
-"""Whether a model may be believed: measured on evidence that the mapper did not choose itself.
+"""Acceptance of a model, based on evidence that the mapper did not choose itself.
 
 The number of placed photos and the reprojection error say little: a wrong model has thrown away what contradicts it. So
 the verified matches of all pairs are asked again, and observations that the adjustment did not see.
@@ -51,7 +51,7 @@ _UNKNOWN_HELD_OUT: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a model is refused: the kind in a few words, the numbers, and what to do."""
+    """Reason to refuse a model: its kind in a few words, the numbers, and advice."""
 
     kind: str
     evidence: str
@@ -60,14 +60,14 @@ class Failure:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was measured on a model and what follows from it; `failures` is empty if it is accepted."""
+    """Measurements of a model and the resulting failures; `failures` is empty if it is accepted."""
 
     measures: dict[str, Any]
     failures: tuple[Failure, ...]
 
     @property
     def accepted(self) -> bool:
-        """Whether nothing speaks against the model."""
+        """Whether there are no failures."""
         return not self.failures
 
     def to_json(self) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def judge(
     fixed: Sequence[int] = (),
     checks: Checks | None = None,
 ) -> Verdict:
-    """Measure a model against the evidence and say whether it can be believed.
+    """Measure a model against the evidence and decide whether to accept it.
 
     What cannot be measured is None, and speaks neither for the model nor against it.
 
@@ -141,7 +141,7 @@ def judge(
 
 
 def nothing_placed(turn: Turn | None) -> Verdict:
-    """The verdict on a capture without a model: all that is known is whether the camera moved."""
+    """Return the verdict on a capture without a model: only whether the camera moved."""
     measures = {"parallax_px": None if turn is None else turn.parallax_px}
     return Verdict(measures, tuple(_no_baseline(turn, {"camera_spread_over_distance": None})))
 

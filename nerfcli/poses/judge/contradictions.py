@@ -23,7 +23,7 @@ _FARTHEST = 10.0
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Two photos whose matches cannot be as the model says, and the strongest chain of pairs that can."""
+    """Two photos whose matches contradict the model, and the strongest chain of pairs that agrees with it."""
 
     one: str
     other: str
@@ -32,12 +32,12 @@ class Contradiction:
 
     @property
     def outweighs(self) -> bool:
-        """Whether the pair is stronger than what supports the model; a weak one must be so by half."""
+        """Whether the pair is stronger than the support of the model; a weak one must be so by half."""
         return self.matches > (1.0 if self.matches >= _CERTAIN_MATCHES else 1.5) * self.agreeing_chain
 
     @property
     def is_rival(self) -> bool:
-        """Whether pair and chain are about as strong, and one is as likely to be mistaken as the other."""
+        """Whether pair and chain are about equally strong, so that either may be wrong."""
         return self.matches <= _RIVAL_OF_EQUALS * self.agreeing_chain
 
 

@@ -1,4 +1,4 @@
-"""After mapping: which lens the photos can hold, what contradicts the model, whether to believe it, how sharp it is."""
+"""Examine a model after mapping: lens model, contradictions, acceptance, uncertainty."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ _MOST_PHOTOS_FOR_BLUR = 500
 
 @dataclass(frozen=True)
 class Examined:
-    """A model after examination, and what is to be said of it.
+    """A model after examination, with the results for the report.
 
     left_out: why photos were taken out, by number. blur_px: of each photo's pose, by number. details: for the report.
     uncertainty: of the lenses, by camera id, see `determined.uncertainty`.

@@ -1,4 +1,4 @@
-"""Whether the camera moved at all: how far matches are from what a mere turn of the camera would do.
+"""Parallax: how far matches deviate from a pure rotation of the camera.
 
 Without a baseline there is no depth, and a mapper that is made to find some finds noise. A turn about the lens moves
 every pixel by a homography whatever its depth; the focal length and one distortion term that fit this best are sought,
@@ -41,12 +41,12 @@ class Turn:
 
     @property
     def explains_all(self) -> bool:
-        """Whether there is no parallax to speak of."""
+        """Whether there is no significant parallax."""
         return self.parallax_px < NO_PARALLAX_PX
 
 
 def best_turn(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]]) -> Turn | None:
-    """How well turns of one camera explain the matches; None without a pair.
+    """Find how well rotations of one camera explain the matches; None without a pair.
 
     Args:
         pairs: verified pairs; of many, an even choice is asked.

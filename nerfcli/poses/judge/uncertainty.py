@@ -1,4 +1,4 @@
-"""How well the photos hold their own poses: one standard deviation of each pose, as blur in pixels.
+"""Uncertainty of poses: one standard deviation of each pose, as blur in pixels.
 
 The covariance of the adjustment depends on which points or cameras hold the frame, which nobody asked about. It is
 brought into the frame in which the pictures of a scene that stands still move least in all photos together (an
@@ -26,7 +26,8 @@ _ANGLE_FROM_TANGENT = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 
 
 def pose_blur_px(model: pycolmap.Reconstruction, *, threads: int, fixed: Sequence[int] = ()) -> dict[int, float]:
-    """By image id: how far a typical point moves in the photo, root mean square, by one standard deviation of its pose.
+    """Compute by image id how far a typical point moves in the photo, root mean square, by one standard deviation of
+    its pose.
 
     The noise of an observation is taken from what the adjustment leaves. Points and intrinsics are as uncertain as
     poses; the lens is as it came out. What all photos get wrong together, and what no lens model says, is not in it.

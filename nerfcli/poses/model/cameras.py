@@ -1,4 +1,4 @@
-"""Which photos share a camera, and where its intrinsics start: by EXIF and size, or as they are known beforehand."""
+"""Groups of photos with a common camera, and initial intrinsics: from EXIF and size, or as given."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ _MOST_LISTED = 4
 
 @dataclass(frozen=True)
 class GivenIntrinsics:
-    """Intrinsics that are known beforehand, and how they are used, one of `USES`."""
+    """Given intrinsics and their use, one of `USES`."""
 
     calibration: Calibration
     use: str = "fixed"
@@ -112,7 +112,7 @@ def group_by_given(photos: Photos, given: GivenIntrinsics) -> Grouped:
 
 
 def start_model(exif: Exif) -> str:
-    """The COLMAP camera model that the mapper starts from: one distortion term, or a fisheye if the lens says so."""
+    """Return the initial COLMAP camera model: one distortion term, or a fisheye if the lens suggests it."""
     return START_FISHEYE if "fisheye" in (exif.lens or "").lower() else START_MODEL
 
 

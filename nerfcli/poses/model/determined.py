@@ -65,7 +65,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Determined:
-    """What a capture determines of a lens.
+    """Lens parameters that a capture determines.
 
     Args:
         camera: the camera with the parameters as estimated in one step, from which an adjustment starts.
@@ -90,7 +90,7 @@ def determine(
     named: bool = False,
     exif_focal_px: float | None = None,
 ) -> Determined:
-    """What a converged model determines of a perspective camera's lens.
+    """Find which lens parameters of a perspective camera a converged model determines.
 
     Args:
         mapped: the model before it was adjusted to the end, when a focal length that is left open had not yet strayed.
@@ -129,7 +129,7 @@ def determine(
 def uncertainty(
     model: pycolmap.Reconstruction, camera_id: int, *, principal_point: bool, seed: int, fixed: Sequence[int] = ()
 ) -> dict[str, Any]:
-    """How well an adjusted model knows the lens of a camera, one standard deviation of each, for the report.
+    """Compute the uncertainty of the intrinsics of a camera, one standard deviation each, for the report.
 
     Returns:
         {"focal_percent", "principal_point_px": how uncertain it would be if it were free, "principal_point_free",
@@ -164,7 +164,7 @@ def uncertainty(
 
 
 def is_centred(camera: pycolmap.Camera) -> bool:
-    """Whether the principal point is within a tenth of the size of the centre."""
+    """Return whether the principal point is within a tenth of the size of the centre."""
     x, y = camera.principal_point_x / camera.width, camera.principal_point_y / camera.height
     return abs(x - 0.5) < PRINCIPAL_POINT_RANGE and abs(y - 0.5) < PRINCIPAL_POINT_RANGE
 

@@ -1,4 +1,4 @@
-"""Which lens model a capture can hold, and the adjustment with it.
+"""Choose the lens model that a capture supports, and adjust with it.
 
 Mapping starts from one distortion term. Of a perspective camera the observations then tell which parameters are
 determined (see `determined`). Fisheyes and very wide lenses are adjusted with richer models, each time without a tenth

@@ -1,4 +1,4 @@
-"""What the observations of a model say of a lens when poses and points are free to follow.
+"""Evidence of the observations of a model about a lens, with free poses and points.
 
 A lens parameter is determined as far as no motion of poses and points can imitate it. So the parameters' effect on the
 observations is freed from all that poses and points can explain (a Schur complement); what is left tells their values
@@ -43,7 +43,7 @@ class UndeterminedError(Exception):
 
 @dataclass(frozen=True)
 class LensEvidence:
-    """What observations say of the `NAMES` of one camera.
+    """Evidence about the `NAMES` of one camera.
 
     Args:
         current: (8,) the parameters' values, relative to the centre of the picture and to no distortion.
@@ -125,7 +125,7 @@ class Estimate:
 def lens_evidence(
     model: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int] = ()
 ) -> LensEvidence:
-    """What a converged model's observations say of a perspective camera.
+    """Compute the evidence of a converged model's observations about a perspective camera.
 
     Observations are weighted as the robust adjustment does, see `held_out.adjust`.
 
@@ -170,7 +170,7 @@ def lens_evidence(
 
 
 def parameters_of(camera: pycolmap.Camera) -> tuple[str, ...]:
-    """Which of `NAMES` a camera's model has, the principal point aside; empty if it has others."""
+    """List which of `NAMES` a camera model has, except the principal point; empty if it has others."""
     return {
         "SIMPLE_PINHOLE": ("f",),
         "PINHOLE": ("f", "fa"),

@@ -1,4 +1,4 @@
-"""Whether photos were taken with a fisheye, asked of pairs of photos before there is a model of all.
+"""Detect fisheye lenses from pairs of photos, before there is a model.
 
 A mapper that starts from a perspective lens finds few photos that fit together if the lens was a fisheye, or many that
 fit badly. A pair of photos alone can tell: with the right projection, more of its matches agree on one motion of the

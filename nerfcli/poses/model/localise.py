@@ -1,4 +1,4 @@
-"""Photos that no other photo matches well, placed by what the whole model knows.
+"""Locate photos that match no other photo well, from the 3D points of the whole model.
 
 Two photos far apart may share too few certain matches to hold one of them. The points of a model were seen by many
 photos: a feature that looks more like one point than like any other votes for it, and a pose that many votes agree on
@@ -61,7 +61,7 @@ _ROUNDS = 3
 
 @dataclass(frozen=True)
 class Attempt:
-    """What was tried for a photo.
+    """Result of an attempt to locate a photo.
 
     image_id, votes: features that choose a point. agreeing: of them, those that a pose explains. found: points found
     where the pose expects them. beside: how many are found, at most, where none should be. refused: why the photo was

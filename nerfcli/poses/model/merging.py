@@ -83,7 +83,7 @@ def merge_models(
 def common_points(
     first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, tracks: dict[tuple[int, int], NDArray[np.int64]]
 ) -> CommonPoints:
-    """What two models have both placed: points of photos in both, and points that matches join.
+    """Find common points of two models: points of common photos, and points connected by matches.
 
     tracks: by pair of image ids, (matches, 2) numbers of the features that belong together.
     """

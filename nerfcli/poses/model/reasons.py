@@ -1,4 +1,4 @@
-"""Why a photo has no place in the model: the evidence that the feature database holds, put into words."""
+"""Reasons why a photo did not register, from the evidence in the feature database."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ FEW_MATCHES = 30
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of one photo that was not registered.
+    """Evidence about one photo that did not register.
 
     features: keypoints found in it. best_matches: the most geometrically verified matches with any one photo,
     best_partner: that photo's name. other_model_size: photos in the other model that holds it, 0 if none does.
@@ -48,7 +48,7 @@ _ADVICE = {
 
 
 def dominant(reasons: Iterable[str]) -> tuple[str, str]:
-    """The kind of reason that most photos share, and what to do about it.
+    """Return the most frequent kind of reason, and advice.
 
     Raises:
         ValueError: no reason, or none that this module or `photos` gave.

@@ -1,4 +1,4 @@
-"""What pairs of photos say about each other, against what a model says about them.
+"""Compare verified pairs of photos with the poses of a model.
 
 The verified matches of a pair hold whatever the mapper made of them. A wrong model has small residuals because it has
 thrown away the observations that contradict it; they still stand in the database, and here they are asked.
@@ -34,13 +34,13 @@ class VerifiedPair:
 
     @property
     def matches(self) -> int:
-        """How many."""
+        """Number of matches."""
         return len(self.pixels_one)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well a pair's matches fit the poses that a model gives the two photos.
+    """Agreement of a pair's matches with the poses of a model.
 
     matches: how many can be judged. share: of them within `TOLERANCE_PX` of the epipolar line and before both
     cameras. angle_deg: the median angle between the rays of a match.
@@ -54,7 +54,7 @@ class Agreement:
 
     @property
     def contradicts(self) -> bool:
-        """Whether most of what the two photos have in common cannot be as the model says."""
+        """Whether most of the pair's matches are inconsistent with the model."""
         return self.share < 0.5
 
 
