@@ -99,6 +99,7 @@ CONFINED = {
         "poses.model",
         "cameras",
         "convert",
+        "surface",
     },  # convert: the other reader of a verification
     "typer": {"cli"},
     "rich": {"cli"},

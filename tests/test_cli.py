@@ -33,7 +33,7 @@ from nerfcli.train import loop
 from nerfcli.train.loop import Progress
 from nerfcli.workflows import poses as poses_workflow
 
-COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench")
+COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
 WITHOUT_INPUT = ("selftest",)
 USAGE = 2
 PROJECT = Path(__file__).parent.parent
@@ -66,7 +66,7 @@ def check_that_it_parses(line: str) -> None:
 
 def needed(command: str, folder: Path) -> tuple[Any, ...]:
     """What a command asks for besides its input."""
-    return (folder / "out.npz", "--to", "npz") if command == "convert" else ()
+    return {"convert": (folder / "out.npz", "--to", "npz"), "export": ("--to", "mesh")}.get(command, ())
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, *WITHOUT_INPUT])

@@ -8,10 +8,12 @@ from typing import Any
 
 from nerfcli.errors import UserError
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
+from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
+from nerfcli.media.model_facts import model_facts
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """Return the facts of a file of depth, pictures or video, of renders, or of a run; else of a scene.
+    """Return the facts of a file of depth, pictures, video, mesh or volume, of renders, or of a run; else of a scene.
 
     Raises:
         UserError: it is none of these, or damaged.
@@ -25,6 +27,10 @@ def describe(path: str | Path) -> dict[str, Any]:
         from nerfcli.workflows.describe_run import describe_tensors
 
         return describe_tensors(folder)
+    if folder.suffix.lower() in (*MODEL_SUFFIXES, ".npz") and (folder.is_file() or folder.suffix.lower() != ".npz"):
+        facts = model_facts(folder)
+        if facts is not None:
+            return facts
     if folder.is_file() and folder.suffix.lower() != ".json":
         return file_facts(folder)
     if (folder / RENDERS).exists():

@@ -17,13 +17,27 @@ from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.page import page_html
 from nerfcli.viewer.pictures import page_photos
 from nerfcli.viewer.proof import make_proof
+from nerfcli.workflows.export_geometry import (
+    export_colmap_dense,
+    export_mesh,
+    export_points,
+    export_tsdf,
+    export_volume,
+)
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 
 # What a page may take in all; what the field leaves of it is for photos.
 PAGE_BYTES = 9_700_000
 # By what is exported: the suffixes of its file, the usual one first; "" is a folder.
-TARGETS = {"page": (".html",)}
+TARGETS = {
+    "page": (".html",),
+    "mesh": (".ply", ".glb", ".obj"),
+    "points": (".ply",),
+    "volume": (".npz", ".nrrd"),
+    "tsdf": (".npz", ".nrrd"),
+    "colmap-dense": ("",),
+}
 SURFACE = SurfaceSettings()
 
 
@@ -69,12 +83,14 @@ def export_run(
         check_box(settings.box)
     _ = trained.config
     refuse_existing(path, overwrite=overwrite, folder=not suffix)
-    torch.set_num_threads(thread_count(threads))
+    cores = thread_count(threads)
+    torch.set_num_threads(cores)
     model = trained.model(torch_device)
     progress(0.0, "")
-    match to:
-        case "page":
-            _export_page(trained, model, path, settings=settings, notify=notify, progress=progress)
+    if to == "mesh":
+        export_mesh(trained, model, path, settings=settings, threads=cores, notify=notify, progress=progress)
+    else:
+        _EXPORTS[to](trained, model, path, settings=settings, notify=notify, progress=progress)
     return path
 
 
@@ -139,3 +155,12 @@ def _export_page(
     if text_bytes > PAGE_BYTES:
         notify(f"the field alone takes {text_bytes / 1e6:.0f} MB of text: the page is large, and has no photos")
     write_page(page_html(model, packed, run=run.path, frames=frames, photos=photos, proof=proof, box=box), path)
+
+
+_EXPORTS = {
+    "page": _export_page,
+    "points": export_points,
+    "volume": export_volume,
+    "tsdf": export_tsdf,
+    "colmap-dense": export_colmap_dense,
+}

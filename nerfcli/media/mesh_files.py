@@ -1,0 +1,264 @@
+"""Meshes and points as files: PLY, GLB and OBJ, each with a description of what its numbers are.
+
+The description is plain values, the same for all formats: in PLY and OBJ a comment `nerfcli` with JSON, in GLB
+`asset.extras`. A comment in words beside it says unit and frame.
+"""
+
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+
+KEY = "nerfcli"
+_WORDS = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int", "u2": "ushort"}
+_CODES = {
+    word: code
+    for code, words in {
+        "f4": ("float", "float32"),
+        "f8": ("double", "float64"),
+        "u1": ("uchar", "uint8"),
+        "i1": ("char", "int8"),
+        "u2": ("ushort", "uint16"),
+        "i2": ("short", "int16"),
+        "i4": ("int", "int32"),
+        "u4": ("uint", "uint32"),
+    }.items()
+    for word in words
+}
+# Of glTF 2.0: kinds of components and of chunks.
+_FLOAT, _USHORT, _UINT = 5126, 5123, 5125
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942
+# Positions are stored as floats around the middle where they lie farther from the origin than so many of their size.
+_FAR = 1000.0
+
+
+def comments_of(description: Mapping[str, Any]) -> list[str]:
+    """Lines that say what a file holds: for people, then for programs."""
+    unit, source = description.get("unit"), description.get("unit_source")
+    told = {"metre": "metre", "arbitrary": "arbitrary, the scale of the scene is not known"}.get(str(unit), str(unit))
+    return [
+        "written by nerfcli",
+        f"unit {told}{f' ({source})' if source else ''}",
+        f"frame {description.get('frame')}",
+        f"{KEY} {json.dumps(dict(description), ensure_ascii=True, allow_nan=False)}",
+    ]
+
+
+def write_ply(
+    path: Path,
+    columns: Mapping[str, np.ndarray],
+    *,
+    faces: np.ndarray | None = None,
+    description: Mapping[str, Any] | None = None,
+) -> None:
+    """Write vertices, and triangles if there are any, as a binary PLY, atomically.
+
+    Args:
+        path: the file.
+        columns: (N,) of each property of a vertex, float32, float64, int32, uint16 or uint8.
+        faces: (F, 3).
+        description: plain values.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    table = np.zeros(len(next(iter(columns.values()))), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {line}" for line in (comments_of(description) if description else ())]
+    lines += [f"element vertex {len(table)}"]
+    lines += [f"property {_WORDS[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
+    if faces is not None:
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        file.write("\n".join([*lines, "end_header", ""]).encode("ascii"))
+        file.write(table.tobytes())
+        if faces is not None:
+            file.write(_triangles(faces).tobytes())
+
+
+def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[str], int]:
+    """What a PLY file says it holds.
+
+    Returns:
+        elements and how many there are; properties of a vertex and their NumPy types; comments; where the body begins,
+        0 where it is not binary with the lowest byte first.
+
+    Raises:
+        UserError: it is no PLY file.
+    """
+    with path.open("rb") as file:
+        head = file.read(2**20)
+    end = head.find(b"end_header")
+    stop = head.find(b"\n", end)
+    if head[:3] != b"ply" or end < 0 or stop < 0:
+        raise UserError(f"{path} is no PLY file: its header has no beginning or no end", "copy or export it once more")
+    elements: dict[str, int] = {}
+    properties: dict[str, str] = {}
+    comments, binary = [], False
+    for line in head[:end].decode("utf-8", errors="replace").splitlines():
+        match line.split():
+            case ["comment", *_]:
+                comments.append(line.partition(" ")[2])
+            case ["format", form, _]:
+                binary = form == "binary_little_endian"
+            case ["element", name, count] if count.isdigit():
+                elements[name] = int(count)
+            case ["property", kind, name] if list(elements) == ["vertex"] and kind in _CODES:
+                properties[name] = f"<{_CODES[kind]}"
+    return elements, properties, comments, stop + 1 if binary else 0
+
+
+def read_ply_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices (N, 3) and triangles (F, 3) int64 of a binary PLY whose faces hold nothing else than three vertices.
+
+    Raises:
+        UserError: it is something else, or cut short.
+    """
+    elements, properties, _, start = read_ply_header(path)
+    dtype = np.dtype(list(properties.items()))
+    faces = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
+    count, triangles = elements.get("vertex", 0), elements.get("face", 0)
+    data = path.read_bytes()
+    if not start or len(data) < start + count * dtype.itemsize + triangles * faces.itemsize:
+        raise UserError(f"{path} is no binary PLY file of triangles, or cut short", "export it once more")
+    table = np.frombuffer(data, dtype, count, start)
+    listed = np.frombuffer(data, faces, triangles, start + count * dtype.itemsize)
+    return np.stack([table[axis] for axis in "xyz"], axis=-1), listed["vertices"].astype(np.int64)
+
+
+def write_obj(
+    path: Path, vertices: np.ndarray, faces: np.ndarray, *, colours: np.ndarray, description: Mapping[str, Any]
+) -> None:
+    """Write a mesh as OBJ, atomically: a colour behind each position, as most programs read it.
+
+    Args:
+        path: the file.
+        vertices: (N, 3).
+        faces: (F, 3).
+        colours: (N, 3) uint8 sRGB.
+        description: plain values.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    rows = np.concatenate([vertices, colours / 255.0], axis=1)
+    with atomic_path(path) as partial, partial.open("w", encoding="utf-8") as file:
+        file.writelines(f"# {line}\n" for line in comments_of(description))
+        file.writelines("v %.9g %.9g %.9g %.4f %.4f %.4f\n" % tuple(row) for row in rows.tolist())  # noqa: UP031 - faster
+        file.writelines("f %d %d %d\n" % tuple(row) for row in (faces + 1).tolist())  # noqa: UP031 - faster
+
+
+def write_glb(
+    path: Path,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    normals: np.ndarray,
+    colours: np.ndarray,
+    y_up_from_frame: np.ndarray,
+    description: Mapping[str, Any],
+) -> None:
+    """Write a mesh as binary glTF 2.0, atomically.
+
+    Positions stay in their frame; the turn to glTF's +Y up is the root node's. Colours are in linear light, as glTF has
+    them, and the material is unlit: they hold the light of the scene.
+
+    Args:
+        path: the file.
+        vertices: (N, 3).
+        faces: (F, 3).
+        normals: (N, 3) unit.
+        colours: (N, 3) uint8 sRGB.
+        y_up_from_frame: (3, 3) rotation.
+        description: plain values.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    middle = vertices.mean(axis=0) if len(vertices) else np.zeros(3)
+    size = np.abs(vertices - middle).max(initial=0.0)
+    if np.abs(middle).max() < _FAR * size:
+        middle = np.zeros(3)
+    positions = (vertices - middle).astype("<f4")
+    light = np.full((len(vertices), 4), 65535, "<u2")
+    light[:, :3] = np.rint(65535 * _linear(colours / 255.0))
+    parts = [positions.tobytes(), normals.astype("<f4").tobytes(), light.tobytes(), faces.astype("<u4").tobytes()]
+    starts = np.cumsum([0, *(len(part) for part in parts)])
+    turn = np.eye(4)
+    turn[:3, :3] = y_up_from_frame
+    content = {
+        "asset": {"version": "2.0", "generator": "nerfcli", "extras": dict(description)},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"name": "turn to +Y up", "matrix": turn.T.reshape(-1).tolist(), "children": [1]},
+            {"name": "mesh, in the frame of the scene", "mesh": 0, "translation": middle.tolist()},
+        ],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0}]}
+        ],
+        "materials": [{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}],
+        "buffers": [{"byteLength": int(starts[-1])}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(start), "byteLength": len(part), "target": 34963 if index == 3 else 34962}
+            for index, (start, part) in enumerate(zip(starts[:-1], parts, strict=True))
+        ],
+        "accessors": [
+            {
+                "bufferView": 0,
+                "componentType": _FLOAT,
+                "type": "VEC3",
+                "count": len(vertices),
+                "min": positions.min(axis=0, initial=np.inf).tolist() if len(vertices) else [0, 0, 0],
+                "max": positions.max(axis=0, initial=-np.inf).tolist() if len(vertices) else [0, 0, 0],
+            },
+            {"bufferView": 1, "componentType": _FLOAT, "type": "VEC3", "count": len(vertices)},
+            {"bufferView": 2, "componentType": _USHORT, "normalized": True, "type": "VEC4", "count": len(vertices)},
+            {"bufferView": 3, "componentType": _UINT, "type": "SCALAR", "count": 3 * len(faces)},
+        ],
+    }
+    text = json.dumps(content, ensure_ascii=True, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    binary = b"".join(parts)
+    binary += b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<II", len(text), _JSON) + text + struct.pack("<II", len(binary), _BINARY) + binary
+    with atomic_path(path) as partial:
+        partial.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def read_glb_json(path: Path) -> dict[str, Any]:
+    """The JSON of a binary glTF.
+
+    Raises:
+        UserError: it is none, or cut short.
+    """
+    data = path.read_bytes()
+    try:
+        magic, version, length = struct.unpack_from("<4sII", data)
+        size, kind = struct.unpack_from("<II", data, 12)
+        if magic != b"glTF" or version != 2 or length > len(data) or kind != _JSON:
+            raise ValueError("its header is not that of glTF 2.0")
+        content = json.loads(data[20 : 20 + size])
+    except (struct.error, ValueError) as error:
+        raise UserError(f"{path} is no GLB file, or cut short: {error}", "export it once more") from error
+    return content
+
+
+def _triangles(faces: np.ndarray) -> np.ndarray:
+    table = np.zeros(len(faces), [("count", "u1"), ("vertices", "<i4", 3)])
+    table["count"], table["vertices"] = 3, faces
+    return table
+
+
+def _linear(levels: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB, IEC 61966-2-1."""
+    return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)

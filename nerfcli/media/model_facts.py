@@ -1,0 +1,119 @@
+"""What a file of a mesh, of points or of a volume holds, as plain values."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.errors import UserError
+from nerfcli.media.mesh_files import KEY, read_glb_json, read_ply_header
+from nerfcli.media.volume_files import Volume, read_nrrd, read_volume_npz
+
+# Of files that say nothing about themselves.
+NOT_STATED = "nothing in the file says its unit or its frame"
+SUFFIXES = (".ply", ".glb", ".obj", ".nrrd")
+
+
+def model_facts(path: Path) -> dict[str, Any] | None:
+    """The facts of a file by their names; None where an archive is no volume.
+
+    Keys: kind, format, counts, low and high corner where they are known, and the description: unit, frame, run, ...
+
+    Raises:
+        UserError: missing or damaged.
+    """
+    if not path.is_file():
+        raise UserError(f"there is no {path}", "give a file that exists")
+    match path.suffix.lower():
+        case ".ply":
+            return _ply_facts(path)
+        case ".glb":
+            return _glb_facts(path)
+        case ".obj":
+            return _obj_facts(path)
+        case ".nrrd":
+            values, fields = read_nrrd(path)
+            origin = np.array([float(value) for value in fields["space origin"].strip("()").split(",")])
+            size = float(fields["space directions"].split(",")[0].lstrip("("))
+            described = json.loads(fields.get(KEY, "{}"))
+            name = described.pop("map", "values")
+            return _volume_facts(Volume({name: values}, origin, size, described), "NRRD")
+        case _:
+            volume = read_volume_npz(path)
+            return None if volume is None else _volume_facts(volume, "NPZ")
+
+
+def _ply_facts(path: Path) -> dict[str, Any]:
+    elements, properties, comments, start = read_ply_header(path)
+    count = elements.get("vertex", 0)
+    facts: dict[str, Any] = {
+        "kind": "mesh" if elements.get("face") else "points",
+        "format": "PLY",
+        "vertices": count,
+        "faces": elements.get("face"),
+        "properties": " ".join(properties),
+    }
+    dtype = np.dtype(list(properties.items()))
+    if start and count and next(iter(elements)) == "vertex" and {"x", "y", "z"} <= set(properties):
+        if path.stat().st_size < start + count * dtype.itemsize:
+            raise UserError(f"{path} is cut short: its header says {count} vertices", "copy or export it once more")
+        with path.open("rb") as file:
+            file.seek(start)
+            table = np.frombuffer(file.read(count * dtype.itemsize), dtype)
+        facts |= _corners(np.stack([table[axis] for axis in "xyz"], axis=-1))
+    return facts | _described(comments)
+
+
+def _glb_facts(path: Path) -> dict[str, Any]:
+    content = read_glb_json(path)
+    facts: dict[str, Any] = {"kind": "mesh", "format": "GLB"}
+    try:
+        primitive = content["meshes"][0]["primitives"][0]
+        positions = content["accessors"][primitive["attributes"]["POSITION"]]
+        facts |= {"vertices": positions["count"], "faces": content["accessors"][primitive["indices"]]["count"] // 3}
+        facts |= {"low": positions["min"], "high": positions["max"]}
+        root = content["nodes"][content["scenes"][0]["nodes"][0]]
+        facts["root_node"] = f"{root.get('name', 'unnamed')}, matrix {root.get('matrix')}"
+    except (KeyError, IndexError, TypeError):  # another program's: it may hold anything
+        facts["note"] = "its first mesh has no list of triangles"
+    extras = content.get("asset", {}).get("extras") or {}
+    return facts | (extras if extras else {"note": NOT_STATED})
+
+
+def _obj_facts(path: Path) -> dict[str, Any]:
+    counts, comments = {"v": 0, "f": 0}, []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            word = line.partition(" ")[0]
+            if word in counts:
+                counts[word] += 1
+            elif word == "#":
+                comments.append(line[1:].strip())
+    return {"kind": "mesh", "format": "OBJ", "vertices": counts["v"], "faces": counts["f"]} | _described(comments)
+
+
+def _volume_facts(volume: Volume, form: str) -> dict[str, Any]:
+    facts: dict[str, Any] = {"kind": "volume", "format": form, "voxel_size": volume.voxel_size}
+    shape = next(iter(volume.maps.values())).shape[:3]
+    facts |= {"voxels": "x".join(map(str, shape)), "first_centre": volume.origin.tolist()}
+    facts["last_centre"] = (volume.origin + volume.voxel_size * (np.array(shape) - 1)).tolist()
+    for name, values in volume.maps.items():
+        known = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+        span = f", {known.min():.6g} to {known.max():.6g}" if known.size else ", no numbers"
+        facts[name] = f"{values.dtype}{span}, {100 * known.size / values.size:.1f} % known"
+    return facts | dict(volume.description or {"note": NOT_STATED})
+
+
+def _corners(points: np.ndarray) -> dict[str, Any]:
+    return {"low": points.min(axis=0).tolist(), "high": points.max(axis=0).tolist()}
+
+
+def _described(comments: list[str]) -> dict[str, Any]:
+    for comment in comments:
+        if comment.startswith(f"{KEY} {{"):
+            try:
+                return json.loads(comment.partition(" ")[2])
+            except ValueError:
+                break
+    return {"note": NOT_STATED}

@@ -1,0 +1,124 @@
+"""From signed distances to triangles: marching cubes where all corners of a cube were seen, and pieces that matter."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from nerfcli.surface.fusion import SIDE, Fused
+
+# Voxels along a side of a brick, which is marched through at a time.
+_BRICK = 8 * SIDE
+# What views have to count together for a voxel to have been seen.
+SEEN = 0.5
+# Pieces of a surface that are smaller than this share of it are noise.
+_SMALLEST_PIECE = 0.002
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles.
+
+    Args:
+        vertices: (V, 3) float64, the scene's frame and unit.
+        faces: (F, 3) int64 vertices, anticlockwise as seen from outside.
+        normals: (V, 3) unit, outwards; 0 where a vertex has no face of an area.
+        colours: (V, 3) uint8 sRGB, or None.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    colours: np.ndarray | None = None
+
+
+def surface_of(fused: Fused, *, seen: float = SEEN, on_share: Callable[[float], None] = lambda share: None) -> Mesh:
+    """Return where the signed distance is 0, between voxels that were seen.
+
+    Args:
+        fused: the distances.
+        seen: weight of a voxel at least; cubes with a corner below it hold no surface.
+        on_share: called with how much is done.
+    """
+    keys, vertices, faces, count = [], [], [], 0
+    bricks = np.argwhere(_any_block(fused.index)) * _BRICK
+    for done, first in enumerate(bricks):
+        found = _march(fused, first, seen)
+        on_share((done + 1) / len(bricks))
+        if found is None:
+            continue
+        places, triangles = found
+        # A vertex lies on an edge of the grid: two of its coordinates are whole, to the last bit. That names it.
+        whole = places == np.round(places)
+        keys.append(np.where(whole, 2 * np.round(places), 2 * np.floor(places) + 1).astype(np.int64) + 2 * first)
+        vertices.append(places + first)
+        faces.append(triangles.astype(np.int64) + count)
+        count += len(places)
+    if not faces:
+        return mesh_of(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    _, chosen, inverse = np.unique(np.concatenate(keys), axis=0, return_index=True, return_inverse=True)
+    places = np.concatenate(vertices)[chosen]
+    triangles = inverse.reshape(-1)[np.concatenate(faces)]
+    return mesh_of(fused.grid.centres(places), triangles)
+
+
+def mesh_of(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> Mesh:
+    """Return the mesh of triangles without those of two equal corners, with its normals and no unused vertices."""
+    proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    used, packed = np.unique(faces[proper], return_inverse=True)
+    vertices, faces = vertices[used], packed.reshape(-1, 3)
+    corners = vertices[faces]
+    # Twice the area long: large triangles count more.
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], across)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return Mesh(vertices, faces, normals, None if colours is None else colours[used])
+
+
+def without_small_pieces(mesh: Mesh, share: float = _SMALLEST_PIECE) -> Mesh:
+    """Return the mesh without connected pieces of fewer than this share of all faces."""
+    if not len(mesh.faces):
+        return mesh
+    first, second = mesh.faces[:, 0], mesh.faces[:, 1:]
+    links = coo_matrix(
+        (np.ones(2 * len(first), bool), (np.repeat(first, 2), second.reshape(-1))), shape=(len(mesh.vertices),) * 2
+    )
+    _, piece = connected_components(links, directed=False)
+    of_faces = piece[first]
+    large = np.bincount(of_faces, minlength=piece.max() + 1) >= share * len(first)
+    return mesh_of(mesh.vertices, mesh.faces[large[of_faces]], mesh.colours)
+
+
+def _any_block(index: np.ndarray) -> np.ndarray:
+    """Which bricks of 8^3 blocks hold a block."""
+    size = _BRICK // SIDE
+    padded = np.pad(index >= 0, [(0, -length % size) for length in index.shape])
+    x, y, z = (length // size for length in padded.shape)
+    return np.asarray(padded.reshape(x, size, y, size, z, size).any(axis=(1, 3, 5)))
+
+
+def _march(fused: Fused, first: np.ndarray, seen: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices in voxels from `first` on, and triangles of a brick; None where there is no surface."""
+    shape = tuple(int(min(_BRICK + 1, total - at)) for at, total in zip(first, fused.grid.shape, strict=True))
+    if min(shape) < 2:
+        return None
+    distance, weight = fused.dense((int(first[0]), int(first[1]), int(first[2])), (shape[0], shape[1], shape[2]))
+    known = weight >= seen
+    cubes = known[:-1, :-1, :-1].copy()
+    negative = np.zeros(cubes.shape, np.int8)
+    for corner in np.ndindex(2, 2, 2):
+        part = tuple(slice(at, at + length) for at, length in zip(corner, cubes.shape, strict=True))
+        cubes &= known[part]
+        negative += distance[part] < 0
+    if not (cubes & (negative > 0) & (negative < 8)).any():
+        return None
+    mask = np.zeros(shape, dtype=bool)
+    mask[1:, 1:, 1:] = cubes  # the library looks at a cube's last corner
+    vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=mask, allow_degenerate=False)
+    return vertices.astype(np.float64), faces

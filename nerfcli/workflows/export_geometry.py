@@ -1,0 +1,216 @@
+"""From a run to geometry: surfaces, points, volumes, and COLMAP's dense folder, in the scene's frame and unit."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli import __version__
+from nerfcli.atomic import atomic_folder
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import up_direction
+from nerfcli.cameras.rigid import look_at
+from nerfcli.errors import UserError
+from nerfcli.media.mesh_files import write_glb, write_obj, write_ply
+from nerfcli.media.volume_files import Volume, write_nrrd, write_volume_npz
+from nerfcli.photos.loading import load_photo
+from nerfcli.photos.undistorted import pinhole_frame, pinhole_of, undistorted
+from nerfcli.render.model import Model
+from nerfcli.runs.run import Run
+from nerfcli.surface.colmap_dense import photo_name, write_photo, write_sparse, write_stereo
+from nerfcli.surface.colours import surface_colours
+from nerfcli.surface.extent import automatic_voxel, scene_box
+from nerfcli.surface.fusion import fuse
+from nerfcli.surface.grid import Grid
+from nerfcli.surface.marching import SEEN, Mesh, surface_of, without_small_pieces
+from nerfcli.surface.points import agreed_points
+from nerfcli.surface.settings import MOST_VIEWS, SurfaceSettings
+from nerfcli.surface.simplify import simplified
+from nerfcli.surface.views import DepthView, depth_views, spread_frames
+from nerfcli.surface.volume import automatic_volume_voxel, sample_volume
+from nerfcli.workflows.notices import Notify, Progress
+
+FORMAT = "nerfcli geometry 1"
+FRAME = "of the scene, as its cameras have it"
+# The share of the work that rendering depths takes.
+_DEPTHS = 0.7
+
+
+def export_mesh(
+    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, threads: int, notify: Notify, progress: Progress
+) -> None:
+    """Write the surface as .ply, .glb or .obj."""
+    views, grid = _seen(run, model, settings, progress)
+    fused = fuse(views, grid, on_share=_part(progress, _DEPTHS, 0.9, "fuses"))
+    mesh = without_small_pieces(surface_of(fused, on_share=_part(progress, 0.9, 0.95, "marches")))
+    if not len(mesh.faces):
+        raise UserError("no surface was found in the box", "give another --box, a larger --voxel-size, or train longer")
+    found = len(mesh.faces)
+    mesh = simplified(mesh, settings.faces, threads=threads)
+    progress(0.97, "colours")
+    colours = surface_colours(model, mesh.vertices, mesh.normals, voxel_size=grid.voxel_size)
+    description = _description(run, model, "mesh", grid) | {
+        "faces_before_simplification": found,
+        "made_by": "truncated signed distances of median depths, marching cubes",
+    }
+    _write_mesh(path, mesh, colours, description, y_up=_y_up_from_scene(run))
+    of_found = f" of {found}" if found != len(mesh.faces) else ""
+    notify(f"{len(mesh.faces)} triangles{of_found}, {_grid_in_words(grid, model)}")
+
+
+def export_points(
+    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
+) -> None:
+    """Write points of the surfaces as .ply."""
+    views, grid = _seen(run, model, settings, progress)
+    points = agreed_points(views, grid, on_share=_part(progress, _DEPTHS, 1.0, "compares"))
+    if not len(points.places):
+        raise UserError("no two photos see the same point in the box", "give another --box, or train longer")
+    columns = dict(zip("xyz", points.places.T, strict=True))
+    columns |= dict(zip(("nx", "ny", "nz"), points.normals.T, strict=True))
+    columns |= dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
+    columns |= {"photos": points.photos, "parallax_deg": points.parallax_deg, "spread": points.spread}
+    described = _description(run, model, "points", grid) | {
+        "parallax_deg": "largest angle between the rays of two photos that see the point",
+        "spread": "standard deviation of where the light of the pixel ends, in the unit",
+    }
+    write_ply(path, columns, description=described)
+    notify(f"{len(points.places)} points that two photos or more see, {_grid_in_words(grid, model)}")
+
+
+def export_volume(
+    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
+) -> None:
+    """Write density and colour on a grid as .npz, the density alone as .nrrd."""
+    box = settings.box or scene_box(model, run.cameras.train)
+    grid = Grid.over(box, settings.voxel_size or automatic_volume_voxel(box))
+    maps = sample_volume(model, grid, on_share=_part(progress, 0.05, 1.0, "asks the field"))
+    per_unit = {"metre": "1/m"}.get(model.unit, "1 / unit")
+    described = _description(run, model, "volume", grid) | {
+        "density": f"share of light that ends per length, {per_unit}; 0 where rays pass over cells",
+        "colour": "sRGB, mean over six directions; 0 where a voxel takes less than a thousandth of the light",
+    }
+    _write_volume(path, Volume(maps, grid.centres(np.zeros(3)), grid.voxel_size, described), "density")
+    notify(_grid_in_words(grid, model))
+
+
+def export_tsdf(
+    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
+) -> None:
+    """Write the signed distances that the mesh is made from: with their weights as .npz, alone as .nrrd."""
+    views, grid = _seen(run, model, settings, progress)
+    fused = fuse(views, grid, on_share=_part(progress, _DEPTHS, 1.0, "fuses"))
+    distance, weight = fused.dense((0, 0, 0), grid.shape)
+    described = _description(run, model, "tsdf", grid) | {
+        "distance": "to the surface, positive outside, in the unit; NaN where too few photos see",
+        "truncation": fused.truncation,
+        "weight": f"sum over photos; {SEEN} and more count as seen",
+    }
+    maps = {"distance": np.where(weight >= SEEN, distance, np.float32(np.nan)), "weight": weight}
+    _write_volume(path, Volume(maps, grid.centres(np.zeros(3)), grid.voxel_size, described), "distance")
+    notify(_grid_in_words(grid, model))
+
+
+def export_colmap_dense(
+    run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
+) -> None:
+    """Write a folder that COLMAP's fusion reads."""
+    factor = run.config.downscale
+    there = [frame for frame in run.cameras.train if frame.image is not None]
+    frames = [replace(frame, name=photo_name(frame.name)) for frame in spread_frames(there, MOST_VIEWS)]
+    if not frames:
+        raise UserError(f"{run.path} has no photos", "a run that was trained on photos has them")
+    views, grid = _seen(run, model, settings, progress, frames=frames)
+    points = agreed_points(views, grid)
+    if not len(points.places):
+        raise UserError("no two photos see the same point in the box", "give another --box, or train longer")
+    with atomic_folder(path) as partial:
+        cameras = []
+        for index, frame in enumerate(frames):
+            photo = load_photo(frame, factor, "ignore")
+            pinhole = pinhole_of(photo.frame.camera)
+            pixels, _ = undistorted(photo.pixels, photo.frame.camera, pinhole)
+            write_photo(partial / "images" / frame.name, pixels[..., :3])
+            cameras.append(pinhole_frame(photo.frame))
+            progress(_DEPTHS + (1 - _DEPTHS) * (index + 1) / len(frames), "photos")
+        write_sparse(partial, cameras, points)
+        write_stereo(partial, views)
+    notify(f"{len(frames)} photos share {len(points.places)} points: colmap stereo_fusion --workspace_path {path}")
+
+
+def _seen(
+    run: Run, model: Model, settings: SurfaceSettings, progress: Progress, *, frames: Sequence[Frame] | None = None
+) -> tuple[list[DepthView], Grid]:
+    """Depths of the training cameras, and the grid that they are fused in."""
+    chosen = spread_frames(run.cameras.train, MOST_VIEWS) if frames is None else frames
+    box = settings.box or scene_box(model, run.cameras.train)
+    views = depth_views(
+        model, chosen, max_size=settings.max_size, on_share=_part(progress, 0.02, _DEPTHS, "renders depths")
+    )
+    return views, Grid.over(box, settings.voxel_size or automatic_voxel(views, box))
+
+
+def _part(progress: Progress, start: float, end: float, words: str) -> Callable[[float], None]:
+    return lambda share: progress(start + (end - start) * share, words)
+
+
+def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any]:
+    """What a file says of itself."""
+    return {
+        "format": FORMAT,
+        "holds": kind,
+        "unit": model.unit,
+        "unit_source": model.unit_source,
+        "frame": FRAME,
+        "box": [*grid.low.tolist(), *grid.high.tolist()],
+        "voxel_size": grid.voxel_size,
+        "nerfcli": __version__,
+        "run": run.path.resolve().name,
+        "field_sha256": model.sha256,
+    }
+
+
+def _grid_in_words(grid: Grid, model: Model) -> str:
+    unit = {"metre": "m"}.get(model.unit, "units of the scene")
+    return f"{'x'.join(map(str, grid.shape))} voxels of {grid.voxel_size:.4g} {unit}"
+
+
+def _write_mesh(
+    path: Path, mesh: Mesh, colours: np.ndarray, description: Mapping[str, Any], *, y_up: np.ndarray
+) -> None:
+    match path.suffix.lower():
+        case ".glb":
+            write_glb(
+                path,
+                mesh.vertices,
+                mesh.faces,
+                normals=mesh.normals,
+                colours=colours,
+                y_up_from_frame=y_up,
+                description=description,
+            )
+        case ".obj":
+            write_obj(path, mesh.vertices, mesh.faces, colours=colours, description=description)
+        case _:
+            columns = dict(zip("xyz", mesh.vertices.T, strict=True))
+            columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.astype("<f4").T, strict=True))
+            columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
+            write_ply(path, columns, faces=mesh.faces, description=description)
+
+
+def _write_volume(path: Path, volume: Volume, name: str) -> None:
+    if path.suffix.lower() == ".nrrd":
+        write_nrrd(volume, name, path)
+    else:
+        write_volume_npz(volume, path)
+
+
+def _y_up_from_scene(run: Run) -> np.ndarray:
+    """The rotation after which up, as the cameras have it, is +y."""
+    up = up_direction(run.cameras.train)
+    aside = np.eye(3)[np.argmin(np.abs(up))]
+    # A camera whose picture's down is -up: its axes are right, down, ahead.
+    right, down, ahead = look_at(np.zeros(3), np.cross(up, aside), up)[:3, :3].T
+    return np.stack([right, -down, -ahead])

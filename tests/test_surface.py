@@ -1,0 +1,514 @@
+"""Geometry taken out of fields: where surfaces are, in which frame and unit, and what the files say."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from commands import error_of, nerfcli
+from fog import fog, foggy_cells
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
+from nerfcli.errors import UserError
+from nerfcli.media.mesh_files import read_glb_json, read_ply_header, read_ply_mesh, write_glb, write_ply
+from nerfcli.media.volume_files import Volume, read_nrrd, read_volume_npz, write_nrrd, write_volume_npz
+from nerfcli.photos.undistorted import pinhole_of, undistorted
+from nerfcli.render.model import Model, save_model
+from nerfcli.runs.files import FIELD
+from nerfcli.runs.run import Run
+from nerfcli.surface.colmap_dense import read_map, write_map, write_photo, write_sparse, write_stereo
+from nerfcli.surface.colours import point_colours, surface_colours
+from nerfcli.surface.fusion import Fused, fuse
+from nerfcli.surface.grid import Grid
+from nerfcli.surface.marching import mesh_of, surface_of, without_small_pieces
+from nerfcli.surface.points import agreed_points
+from nerfcli.surface.settings import SurfaceSettings
+from nerfcli.surface.simplify import simplified
+from nerfcli.surface.views import DepthView, normals_of, plane_rays
+from nerfcli.surface.volume import density_at, sample_volume
+from nerfcli.workflows.describe import describe
+from nerfcli.workflows.export import export_run
+
+RADIUS, CENTRE = 0.5, np.array([3.0, -2.0, 1.0])
+CAMERA = Camera("PINHOLE", 120, 90, (130.0, 126.0, 58.3, 46.1))
+
+
+def ball_view(place: np.ndarray, *, camera: Camera = CAMERA, name: str = "a.png") -> DepthView:
+    """What a camera sees of an opaque ball, in closed form, and nothing behind it."""
+    pose = look_at(place, CENTRE, np.array([0.1, 0.2, 1.0]))
+    rays = plane_rays(camera) @ pose[:3, :3].T
+    off = place - CENTRE
+    a, b, c = (rays * rays).sum(-1), (rays * off).sum(-1), off @ off - RADIUS**2
+    root = b * b - a * c
+    depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, np.nan).astype(np.float32)
+    hit = np.isfinite(depth)
+    return DepthView(
+        frame=Frame(name, camera, pose),
+        rgb=np.full((*depth.shape, 3), 0.5, np.float32),
+        opacity=hit.astype(np.float32),
+        depth=depth,
+        spread=np.where(hit, np.float32(1e-4), np.float32(np.nan)),
+        disagreement=np.where(hit, np.float32(0), np.float32(np.nan)),
+        normals=normals_of(depth, camera),
+    )
+
+
+def places_around(count: int, distance: float = 2.0) -> np.ndarray:
+    """Places on a sphere around the ball, evenly spread (Fibonacci)."""
+    z = 1 - 2 * (np.arange(count) + 0.5) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    across = np.sqrt(1 - z * z)
+    return CENTRE + distance * np.stack([across * np.cos(angle), across * np.sin(angle), z], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def ball_views() -> list[DepthView]:
+    return [ball_view(place, name=f"{index}.png") for index, place in enumerate(places_around(14))]
+
+
+@pytest.fixture(scope="module")
+def fused(ball_views) -> Fused:
+    low, high = CENTRE - 0.7, CENTRE + 0.7
+    return fuse(ball_views, Grid.over((*low, *high), 0.025))
+
+
+# Depth maps to surfaces
+
+
+def test_normals_of_a_plane_are_its_own():
+    normal = np.array([0.3, -0.2, -1.0])
+    depth = (2.0 / -(plane_rays(CAMERA) @ normal)).astype(np.float32)
+    np.testing.assert_allclose(
+        normals_of(depth, CAMERA), np.broadcast_to(normal / np.linalg.norm(normal), (90, 120, 3)), atol=2e-4
+    )
+    hole = depth.copy()
+    hole[40:50, 40:50] = np.nan
+    assert np.isnan(normals_of(hole, CAMERA)).all(-1).sum() == 100
+
+
+def test_the_mesh_of_a_ball_is_the_ball(fused):
+    mesh = surface_of(fused)
+    off = np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
+    assert len(mesh.faces) > 5000
+    assert np.sqrt((off**2).mean()) < 0.06 * 0.025
+    assert np.abs(off).max() < 0.5 * 0.025
+    # A picture half a pixel aside would move or swell it by 0.2 voxels.
+    assert np.abs(off.mean()) < 0.03 * 0.025
+    assert np.abs(mesh.vertices.mean(0) - CENTRE).max() < 0.05 * 0.025
+    outwards = (mesh.normals * (mesh.vertices - CENTRE)).sum(1) / RADIUS
+    assert outwards.min() > 0.9
+
+
+def test_pictures_half_a_pixel_aside_make_another_ball(ball_views):
+    """The test above would see it: the same depths, with cameras whose principal point is half a pixel off."""
+    fx, fy, cx, cy = CAMERA.params
+    shifted = Camera("PINHOLE", 120, 90, (fx, fy, cx + 0.5, cy + 0.5))
+    moved = [
+        DepthView(
+            Frame(view.frame.name, shifted, view.frame.world_from_cam),
+            *(view.rgb, view.opacity, view.depth, view.spread, view.disagreement, view.normals),
+        )
+        for view in ball_views
+    ]
+    mesh = surface_of(fuse(moved, Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.025)))
+    off = np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
+    assert np.sqrt((off**2).mean()) > 0.06 * 0.025
+
+
+def test_the_mesh_of_a_ball_has_no_gap_between_blocks_and_bricks(fused):
+    mesh = without_small_pieces(surface_of(fused))
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    _, counts = np.unique(edges, axis=0, return_counts=True)
+    assert (counts == 2).all()  # closed: each edge has a triangle on both sides
+    assert len(mesh.vertices) - len(counts) + len(mesh.faces) == 2  # Euler's number of a sphere
+
+
+def test_what_no_photo_sees_is_not_closed():
+    """One side of the ball is seen: the mesh ends where it does, and nothing joins it to what was not looked at."""
+    views = [ball_view(CENTRE + np.array([2.0, 0.1 * step, 0.05])) for step in range(3)]
+    mesh = surface_of(fuse(views, Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.025)))
+    off = np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS
+    assert np.abs(off).max() < 0.025
+    assert (mesh.vertices[:, 0] - CENTRE[0]).min() > -0.05
+    assert np.abs((mesh.normals * (mesh.vertices - CENTRE)).sum(1)).min() > 0.5 * RADIUS
+
+
+def test_the_order_of_the_photos_changes_the_last_digits_alone(ball_views, fused):
+    again = fuse(ball_views[::-1], fused.grid)
+    np.testing.assert_array_equal(again.index, fused.index)
+    np.testing.assert_allclose(again.distance, fused.distance, atol=1e-6)
+
+
+def test_rays_that_meet_nothing_clear_what_stands_in_them(ball_views):
+    """A floater that one photo sees, in what others see to be free."""
+    wrong = ball_views[0]
+    depth = wrong.depth.copy()
+    depth[:12, :12] = 1.4
+    opacity = wrong.opacity.copy()
+    opacity[:12, :12] = 1.0
+    floating = DepthView(
+        wrong.frame, wrong.rgb, opacity, depth, np.where(np.isfinite(depth), np.float32(1e-4), np.float32(np.nan)),
+        wrong.disagreement, normals_of(depth, CAMERA),
+    )  # fmt: skip
+    mesh = surface_of(fuse([floating, *ball_views[1:]], Grid.over((*(CENTRE - 1.2), *(CENTRE + 1.2)), 0.03)))
+    assert np.linalg.norm(mesh.vertices - CENTRE, axis=1).max() < RADIUS + 0.03
+
+
+def test_points_of_a_ball_are_on_it_and_say_how_well_they_are_seen(ball_views):
+    grid = Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.05)
+    points = agreed_points(ball_views, grid)
+    off = np.linalg.norm(points.places - CENTRE, axis=1) - RADIUS
+    assert np.abs(off).max() < 1e-5
+    outwards = (points.places - CENTRE) / RADIUS
+    assert (points.normals * outwards).sum(1).min() > 0.95
+    cells = np.floor((points.places - grid.low) / 0.05)
+    assert len(np.unique(cells, axis=0)) == len(cells) > 300
+    for index in range(0, len(points.places), 17):
+        point, seen = points.places[index], points.seen[index]
+        # A photo sees a point of the ball if it looks at its tangent plane from outside, not from the side.
+        wanted = np.array([facing(view.frame.centre, point) > 0.1 for view in ball_views])
+        assert (wanted != seen).sum() <= 2  # a pixel of an outline may be another's
+        assert points.photos[index] == seen.sum()
+        rays = [view.frame.centre - point for view, sees in zip(ball_views, seen, strict=True) if sees]
+        cosines = [a @ b / np.linalg.norm(a) / np.linalg.norm(b) for a in rays for b in rays]
+        assert points.parallax_deg[index] == pytest.approx(np.degrees(np.arccos(min(cosines))), abs=1e-2)
+
+
+def facing(centre: np.ndarray, point: np.ndarray) -> float:
+    """The cosine between the ball's normal at a point and the way to a camera."""
+    return float((centre - point) @ (point - CENTRE) / np.linalg.norm(centre - point) / RADIUS)
+
+
+def test_a_point_that_one_photo_alone_sees_is_left_out(ball_views):
+    grid = Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.05)
+    assert len(agreed_points(ball_views[:1], grid).places) == 0
+
+
+def test_fewer_faces_are_about_the_same_ball(fused):
+    mesh = surface_of(fused)
+    small = simplified(mesh, 2000, threads=1)
+    assert 1000 < len(small.faces) <= 2100
+    off = np.linalg.norm(small.vertices - CENTRE, axis=1) - RADIUS
+    assert np.abs(off).max() < 0.4 * 0.025
+    assert simplified(mesh, len(mesh.faces), threads=1) is mesh
+
+
+def test_small_pieces_are_left_out(fused):
+    mesh = surface_of(fused)
+    speck = np.array([[9.0, 9, 9], [9, 9, 9.1], [9, 9.1, 9]])
+    both = mesh_of(
+        np.concatenate([mesh.vertices, speck]),
+        np.concatenate([mesh.faces, [[len(mesh.vertices) + i for i in range(3)]]]),
+    )
+    kept = without_small_pieces(both)
+    assert len(kept.faces) == len(mesh.faces)
+    assert np.abs(kept.vertices).max() < 9
+
+
+# Of fields
+
+SIMILARITY = Similarity(0.4, rotation_from_vector(np.array([0.3, 0.5, -0.2])), np.array([0.2, -0.1, 0.4]))
+
+
+def block(similarity: Similarity = SIMILARITY, *, unit: str = "metre") -> Model:
+    """A dense grey block, [-0.5, 0.5]^3 of the training frame."""
+    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), similarity, unit=unit, step=1 / 64)
+    with torch.no_grad():
+        model.field.weights[1][0, 0] = 7.0  # type: ignore[index]
+    return model
+
+
+def test_the_density_of_a_volume_is_per_scene_unit():
+    model, inverse = block(), SIMILARITY.inverse()
+    points = inverse.apply(np.array([[0.0, 0, 0], [0.4, 0.4, 0.4], [0.6, 0, 0], [3.0, 0, 0]]))
+    np.testing.assert_allclose(density_at(model, points), np.exp(7.0) * 0.4 * np.array([1, 1, 0, 0]), rtol=1e-5)
+
+
+def test_samples_of_a_volume_are_those_of_the_voxels_centres():
+    model = block(Similarity.identity())
+    grid = Grid.over((-1.0, -1.0, -1.0, 1.0, 1.0, 1.0), 0.25)
+    maps = sample_volume(model, grid)
+    inside = np.abs(np.stack(np.meshgrid(*3 * [np.arange(8) * 0.25 - 0.875], indexing="ij"), -1)).max(-1) < 0.5
+    np.testing.assert_array_equal(maps["density"] > 0, inside)
+    np.testing.assert_allclose(maps["colour"][inside], 128, atol=1)
+    assert not maps["colour"][~inside].any()
+
+
+def test_colours_are_those_of_the_field():
+    model, inverse = block(), SIMILARITY.inverse()
+    points = inverse.apply(np.array([[0.5, 0.1, 0.2], [-0.2, -0.5, 0.0]]))
+    normals = np.array([[1.0, 0, 0], [0, -1.0, 0]]) @ SIMILARITY.rotation
+    np.testing.assert_allclose(surface_colours(model, points, normals, voxel_size=0.02), 128, atol=1)
+    colours, density = point_colours(model, inverse.apply(np.zeros((1, 3))))
+    np.testing.assert_allclose(colours, 0.5, atol=1e-3)
+    assert density[0] > 1
+
+
+# Files
+
+
+def ball_mesh() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) + 0.25
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 128, 128]], np.uint8)
+    return vertices, faces, mesh_of(vertices, faces).normals, colours
+
+
+def test_a_ply_comes_back_and_says_what_it_is(tmp_path):
+    vertices, faces, _, _ = ball_mesh()
+    described = {"unit": "metre", "unit_source": "gps", "frame": "of the scene"}
+    write_ply(tmp_path / "a.ply", dict(zip("xyz", vertices.T, strict=True)), faces=faces, description=described)
+    again, triangles = read_ply_mesh(tmp_path / "a.ply")
+    np.testing.assert_array_equal(again, vertices)
+    np.testing.assert_array_equal(triangles, faces)
+    _, _, comments, _ = read_ply_header(tmp_path / "a.ply")
+    assert "unit metre (gps)" in comments
+    assert "frame of the scene" in comments
+    facts = describe(tmp_path / "a.ply")
+    assert (facts["kind"], facts["vertices"], facts["faces"], facts["unit"]) == ("mesh", 4, 4, "metre")
+    assert facts["high"] == [1.25, 1.25, 1.25]
+
+
+@pytest.mark.parametrize("far", [0.0, 1e6])
+def test_a_glb_holds_the_frame_and_turns_it_in_its_root_node(far, tmp_path):
+    vertices, faces, normals, colours = ball_mesh()
+    z_up = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    path = tmp_path / "a.glb"
+    write_glb(
+        path,
+        vertices + far,
+        faces,
+        normals=normals,
+        colours=colours,
+        y_up_from_frame=z_up,
+        description={"unit": "metre"},
+    )
+    content = read_glb_json(path)
+    assert content["asset"]["extras"] == {"unit": "metre"}
+    data = path.read_bytes()
+    assert int.from_bytes(data[8:12], "little") == len(data)
+    start = 20 + int.from_bytes(data[12:16], "little") + 8
+    view, accessor = content["bufferViews"][0], content["accessors"][0]
+    stored = np.frombuffer(data, "<f4", 12, start + view["byteOffset"]).reshape(4, 3)
+    root, child = content["nodes"]
+    in_frame = stored + np.array(child["translation"])
+    np.testing.assert_allclose(in_frame, vertices + far, atol=1e-6)
+    np.testing.assert_allclose(accessor["min"], stored.min(0))
+    turned = (np.array(root["matrix"]).reshape(4, 4).T @ np.append(in_frame[3], 1))[:3]
+    np.testing.assert_allclose(turned, z_up @ (vertices[3] + far), rtol=1e-6)
+    light = np.frombuffer(data, "<u2", 16, start + content["bufferViews"][2]["byteOffset"]).reshape(4, 4)
+    assert light[0].tolist() == [65535, 0, 0, 65535]
+    assert light[3, 0] == round(65535 * ((128 / 255 + 0.055) / 1.055) ** 2.4)  # linear light, as glTF has it
+
+
+def test_volumes_come_back(tmp_path):
+    rng = np.random.default_rng(0)
+    maps = {"density": rng.random((3, 4, 5), np.float32), "colour": rng.integers(0, 9, (3, 4, 5, 3), np.uint8)}
+    volume = Volume(maps, np.array([1.0, 2, 3]), 0.5, {"unit": "metre", "frame": "of the scene"})
+    write_volume_npz(volume, tmp_path / "a.npz")
+    again = read_volume_npz(tmp_path / "a.npz")
+    assert again is not None
+    np.testing.assert_array_equal(again.maps["colour"], maps["colour"])
+    write_nrrd(volume, "density", tmp_path / "a.nrrd")
+    values, fields = read_nrrd(tmp_path / "a.nrrd")
+    np.testing.assert_array_equal(values, maps["density"])
+    assert fields["space directions"] == "(0.5,0,0) (0,0.5,0) (0,0,0.5)"
+    assert fields["space origin"] == "(1,2,3)"
+    assert fields["space units"] == '"m" "m" "m"'
+    for name in ("a.npz", "a.nrrd"):
+        facts = describe(tmp_path / name)
+        assert (facts["kind"], facts["voxels"], facts["unit"]) == ("volume", "3x4x5", "metre")
+        assert facts["last_centre"] == [2.0, 3.5, 5.0]
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.glb", "a.nrrd", "a.npz"])
+def test_damaged_files_are_told(name, tmp_path):
+    (tmp_path / name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\n")
+    with pytest.raises(UserError, match=r"a\."):
+        describe(tmp_path / name)
+
+
+# Photos without distortion
+
+
+def test_undistorted_photos_have_straight_lines_and_half_pixels():
+    """A picture of the bearings themselves: after the resampling each pixel has that of its own centre."""
+    camera = Camera("OPENCV", 160, 120, (150.0, 148.0, 81.0, 58.5, -0.2, 0.05, 1e-3, -1e-3))
+    pinhole = pinhole_of(camera)
+    assert pinhole.params == (camera.focal_px, camera.focal_px, 81.0, 58.5)
+    directions, valid = camera.pixel_bearings()
+    levels = np.rint(128 + 100 * directions[:, :2] / directions[:, 2:]).reshape(120, 160, 2).astype(np.uint8)
+    assert valid.all()
+    pixels, shown = undistorted(levels, camera, pinhole)
+    wanted = 128 + 100 * plane_rays(pinhole)[..., :2]
+    inner = shown & (np.abs(wanted - 128).max(-1) < 45)
+    assert inner.mean() > 0.6
+    off = pixels[inner].astype(float) - wanted[inner]
+    assert np.abs(off).max() < 1.1  # rounding to levels, twice
+    assert np.abs(off.mean()) < 0.02  # half a pixel is 0.33 levels
+
+
+# The command
+
+
+def small(scale: float, voxel: float) -> tuple[str, ...]:
+    """Options for quick work: voxels in units of the training frame, and small pictures."""
+    return "--voxel-size", f"{voxel / scale:.9g}", "--max-size", "48"
+
+
+@pytest.fixture
+def blocked(finished: Path) -> Path:
+    """A run of six views whose field is a block, dense from its surface on."""
+    given = Run(finished).model()
+    model = block(given.training_from_scene, unit="metre")
+    save_model(finished / FIELD, model)
+    return finished
+
+
+def sides_of(run: Path, points: np.ndarray) -> np.ndarray:
+    """The largest coordinate of points in the training frame, where the block ends at 0.5."""
+    return np.abs(Run(run).model().training_from_scene.apply(points)).max(axis=1)
+
+
+def test_a_mesh_is_written_in_the_frame_of_the_scene(blocked, tmp_path):
+    scale = Run(blocked).model().training_from_scene.scale
+    for form in ("ply", "glb", "obj"):
+        result = nerfcli("export", blocked, "--to", "mesh", *small(scale, 0.06), "-o", tmp_path / f"a.{form}")
+        assert result.exit_code == 0, result.stderr
+        assert result.stdout.strip() == str(tmp_path / f"a.{form}")
+    vertices, _ = vertices_of(tmp_path / "a.ply")
+    assert len(vertices) > 200
+    off = sides_of(blocked, vertices) - 0.5
+    # Four photos of 48 pixels, and steps of 1/64 along rays: half a voxel.
+    assert np.quantile(np.abs(off), 0.9) < 0.03
+    facts = json.loads(nerfcli("info", tmp_path / "a.glb", "--json").stdout)
+    assert (facts["kind"], facts["unit"], facts["frame"]) == ("mesh", "metre", "of the scene, as its cameras have it")
+    assert facts["vertices"] == len(vertices)
+    assert "turn to +Y up" in nerfcli("info", tmp_path / "a.glb").stdout
+    lines = (tmp_path / "a.obj").read_text().splitlines()
+    assert "# unit metre" in lines
+    first = next(line for line in lines if line.startswith("v "))
+    np.testing.assert_allclose([float(word) for word in first.split()[1:4]], vertices[0], rtol=1e-6)
+
+
+def vertices_of(path: Path) -> tuple[np.ndarray, int]:
+    elements, properties, _, start = read_ply_header(path)
+    table = np.frombuffer(path.read_bytes(), np.dtype(list(properties.items())), elements["vertex"], start)
+    return np.stack([table[axis] for axis in "xyz"], -1), elements.get("face", 0)
+
+
+def test_points_volume_and_distances_are_written(blocked, tmp_path):
+    scale = Run(blocked).model().training_from_scene.scale
+    options = (*small(scale, 0.05), "-o")
+    for to, name in (("points", "p.ply"), ("volume", "v.npz"), ("tsdf", "t.nrrd")):
+        result = nerfcli("export", blocked, "--to", to, *options, tmp_path / name)
+        assert result.exit_code == 0, result.stderr
+    places, _ = vertices_of(tmp_path / "p.ply")
+    assert np.abs(sides_of(blocked, places) - 0.5).max() < 0.02
+    facts = describe(tmp_path / "p.ply")
+    assert facts["properties"] == "x y z nx ny nz red green blue photos parallax_deg spread"
+    volume = read_volume_npz(tmp_path / "v.npz")
+    assert volume is not None
+    assert volume.maps["density"].max() == pytest.approx(np.exp(7.0) * scale, rel=1e-4)
+    assert "1/m" in volume.description["density"]
+    values, _ = read_nrrd(tmp_path / "t.nrrd")
+    assert np.nanmax(values) == pytest.approx(4 * 0.05 / scale, rel=1e-4)
+    assert np.isnan(values).any()
+
+
+def test_colmap_fuses_the_maps_of_a_ball(ball_views, tmp_path):
+    """COLMAP's own fusion, in its own code, gives points on the ball: depths, normals, pixels and tracks are its."""
+    views = [ball_view(place, name=f"{index:02d}.png") for index, place in enumerate(places_around(24))]
+    points = agreed_points(views, Grid.over((*(CENTRE - 0.7), *(CENTRE + 0.7)), 0.1))
+    frames = [view.frame for view in views]
+    for frame in frames:
+        write_photo(tmp_path / "images" / frame.name, np.full((90, 120, 3), 128, np.uint8))
+    write_sparse(tmp_path, frames, points)
+    write_stereo(tmp_path, views)
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels, options.num_threads = 3, 1
+    model = pycolmap.stereo_fusion(tmp_path / "fused.ply", tmp_path, options=options, output_type="PLY")
+    off = np.linalg.norm([point.xyz - CENTRE for point in model.points3D.values()], axis=1) - RADIUS
+    assert len(off) > 2000
+    assert np.sqrt((off**2).mean()) < 3e-3  # with cameras half a pixel aside it is 5.8e-3
+
+
+def test_the_dense_folder_has_the_photos_and_maps_of_the_run(blocked, tmp_path):
+    folder, scale = tmp_path / "dense", Run(blocked).model().training_from_scene.scale
+    result = nerfcli("export", blocked, "--to", "colmap-dense", *small(scale, 0.05), "-o", folder)
+    assert result.exit_code == 0, result.stderr
+    names = (folder / "stereo" / "fusion.cfg").read_text().split()
+    assert names == [frame.name for frame in Run(blocked).cameras.train]
+    model = pycolmap.Reconstruction(folder / "sparse")
+    assert {image.name for image in model.images.values()} == set(names)
+    assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
+    for name in names:
+        assert (folder / "images" / name).exists()
+        depth = read_map(folder / "stereo" / "depth_maps" / f"{name}.geometric.bin")
+        normals = read_map(folder / "stereo" / "normal_maps" / f"{name}.geometric.bin")
+        assert depth.shape[:2] == normals.shape[:2] == (36, 48)
+        assert ((depth[..., 0] > 0) == (np.linalg.norm(normals, axis=-1) > 0.5)).all()
+
+
+def test_maps_are_those_that_colmap_reads(tmp_path):
+    values = np.random.default_rng(0).random((5, 7, 3)).astype(np.float32)
+    write_map(tmp_path / "n.bin", values)
+    write_map(tmp_path / "d.bin", values[..., 0])
+    np.testing.assert_array_equal(read_map(tmp_path / "n.bin"), values)
+    depths = pycolmap.DepthMap()
+    depths.read(tmp_path / "d.bin")
+    np.testing.assert_array_equal(depths.to_array(), values[..., 0])
+    # As scripts/python/read_write_dense.py of COLMAP reads it; pycolmap's NormalMap mixes its axes up.
+    body = (tmp_path / "n.bin").read_bytes().split(b"&", 3)[3]
+    columns = np.frombuffer(body, np.float32).reshape((7, 5, 3), order="F")
+    np.testing.assert_array_equal(columns.transpose(1, 0, 2), values)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--to", "mesh", "--box", "1,2,3"), "'1,2,3'; write X0,Y0,Z0,X1,Y1,Z1"),
+        (("--to", "mesh", "--box=1,0,0,0,1,1"), "the low corner comes first"),
+        (("--to", "mesh", "--format", "stl"), "'stl'; choose ply, glb or obj"),
+        (("--to", "mesh", "--voxel-size", "nan"), "--voxel-size"),
+        (("--to", "splats"), "'splats'; choose page"),
+        (("--to", "mesh", "-o", "a.stl"), "has no suffix of a mesh"),
+    ],
+)
+def test_wrong_usage_of_export(options, told, finished):
+    result = nerfcli("export", finished, *options)
+    assert result.exit_code == 2
+    assert told in re.sub(r"\s+", " ", result.stderr)
+
+
+def test_what_cannot_be_exported_is_told_in_two_lines(blocked, tmp_path):
+    away = ("--box=90,90,90,91,91,91", "--voxel-size", "0.1", "--max-size", "32")
+    for to in ("mesh", "points"):
+        result = nerfcli("export", blocked, "--to", to, *away, "-o", tmp_path / "a.ply")
+        assert result.exit_code == 3
+        assert error_of(result)[0].startswith("Error: no ")
+    result = nerfcli(
+        "export", blocked, "--to", "mesh", "--voxel-size", "1e-9", "--max-size", "32", "-o", tmp_path / "a.ply"
+    )
+    assert "along a side of the box" in error_of(result)[0]
+    assert not (tmp_path / "a.ply").exists()
+    (tmp_path / "a.ply").write_text("mine")
+    result = nerfcli("export", blocked, "--to", "points", "-o", tmp_path / "a.ply")
+    assert "exists" in error_of(result)[0]
+    assert (tmp_path / "a.ply").read_text() == "mine"
+
+
+def test_exports_stand_beside_the_run_under_its_name(blocked):
+    size = 0.25 / Run(blocked).model().training_from_scene.scale
+    result = nerfcli("export", blocked, "--to", "volume", "--format", "nrrd", "--quiet", "--voxel-size", str(size))
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr == ""
+    assert Path(result.stdout.strip()) == blocked.with_name("spheres-run-volume.nrrd")
+    assert export_run(blocked, to="volume", settings=SurfaceSettings(voxel_size=size)) == blocked.with_name(
+        "spheres-run-volume.npz"
+    )
