@@ -43,8 +43,9 @@ def _apart(photos: set[int], largest: set[int], pairs: Sequence[tuple[int, int, 
     strong = [pair for pair in between if pair[0] >= FEW_MATCHES]
     if strong:
         count, one, other = max(strong)
+        pairs_connect = "1 pair connects" if len(strong) == 1 else f"{len(strong)} pairs connect"
         return (
-            f"{len(strong)} pairs connect it to the largest (strongest: {job.names[one]} and {job.names[other]}, "
+            f"{pairs_connect} it to the largest (strongest: {job.names[one]} and {job.names[other]}, "
             f"{count} matches), but no consistent alignment was found"
         )
     if between:
