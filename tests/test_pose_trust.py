@@ -24,7 +24,6 @@ from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import Mapped
 from nerfcli.poses.engine.second_chance import is_contradicted, second_chance
 from nerfcli.poses.input.job import Job
-from nerfcli.poses.input.settings import FULL_SIZE
 from nerfcli.poses.judge.acceptance import judge
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
@@ -312,9 +311,9 @@ def test_a_focal_length_that_exif_tells_wrong_is_left_out(tmp_path: Path):
 @pytest.mark.parametrize(
     ("placed", "size", "words"),
     [
-        (1, FULL_SIZE, "next: more features from full-size photos (takes about 8.7 times as long"),
-        # 0.3 of the photos are missing: three times the first search, of which the matches take a part.
-        (7, 2891, "next: more features from photos of 2891 pixels (takes about 3.0 times as long"),
+        # A missing share of 0.9 is worth 4.5 times the first search, of which the matches take a part.
+        (1, 3634, "next: more features from photos of 3634 pixels (takes about 4.5 times as long"),
+        (7, 1871, "next: more features from photos of 1871 pixels (takes about 1.5 times as long"),
         (8, None, "default thresholds"),
     ],
 )

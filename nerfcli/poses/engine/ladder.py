@@ -40,7 +40,7 @@ _MOST_PAIRS = 12_000
 _MOST_FULL_SIZE = 150
 _MORE_FEATURES = 8192
 # Searching larger pictures may take so many times as long as the first search, times the share of photos missing.
-_MOST_FOR_MORE = 10.0
+_MOST_FOR_MORE = 5.0
 # A perspective lens from here on may be a fisheye.
 _WIDE_DEG = 100.0
 # Each takes some seconds; where more are missing, it is not single photos that are.
