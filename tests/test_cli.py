@@ -476,7 +476,7 @@ def test_resume_needs_a_run_of_the_same_scene(capture, finished, tmp_path):
     (other / "transforms_train.json").write_text(json.dumps(listed))
     result = nerfcli("train", other, *QUICK, "--resume", "-o", finished)
     assert result.exit_code == BAD_INPUT
-    assert "another scene" in error_of(result)[0]
+    assert "a different scene" in error_of(result)[0]
 
 
 def test_train_does_not_write_into_a_folder_with_other_files(capture, tmp_path):
@@ -528,7 +528,7 @@ def test_predictions_are_what_was_measured(finished):
     assert nerfcli("evaluate", finished).exit_code == 0
     result = nerfcli("evaluate", finished, "--save-predictions", "png")
     assert result.exit_code == BAD_INPUT
-    assert "made without saved predictions" in error_of(result)[0]
+    assert "written without saved predictions" in error_of(result)[0]
     result = nerfcli("evaluate", finished, "--save-predictions", "float", "--overwrite")
     metrics = json.loads((finished / "metrics.json").read_text())
     folder = finished / "predictions"
