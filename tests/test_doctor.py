@@ -174,7 +174,7 @@ def test_exif_of_another_picture_is_named(clean):
     assert focal_length(exif, resized).summary == "0.81 times the longer side, from EXIF (2 photos)"
     found = focal_length(resized, cropped)
     assert (found.verdict, found.names) == (LOOK, ("01.jpg",))
-    assert "EXIF is of 4032x2268 pixels" in found.summary
+    assert "EXIF is for 4032x2268 pixels" in found.summary
     assert "give --intrinsics" in found.advice
 
 
@@ -393,7 +393,7 @@ def test_missing_photos_and_masks_that_only_some_have_are_named():
     found = {finding.check: finding for finding in coverage.belongings(ring(24, span_deg=360))}
     assert found["missing photos"].names == ("gone.jpg",)
     assert found["masks"].names == ("0.jpg",)
-    assert "arbitrary" in found["unit"].summary
+    assert "no metric scale" in found["unit"].summary
 
 
 # Files and the page

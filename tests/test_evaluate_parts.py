@@ -190,7 +190,7 @@ def test_the_ledger_says_what_each_way_to_poses_has_seen():
     assert (foreign["poses"], foreign["training"]) == (None, False)
     assert seen({})["poses"] is None
     assert summary_line(leak_ledger(RunConfig(history={"from": "llff"}))).startswith(
-        "held-out photos were seen by normalisation; perhaps seen by poses, intrinsics, points; not seen by "
+        "held-out photos were used by normalisation; perhaps used by poses, intrinsics, points; not used by "
     )
 
 

@@ -207,7 +207,7 @@ def test_the_page_tells_what_saw_the_photos_what_was_chosen_and_how_new_the_view
         "all photos were matched",
         "19.50 dB (3)",
         "view=0",
-        "+0.50 +- 0.10",
+        "+0.50 ± 0.10",
         "-2%",
     ):
         assert told in text

@@ -224,11 +224,11 @@ def _print_verification(done: "Conversion", console: Console) -> None:
         console.note(f"{done.path}: verified, its {checked.num_points} points equal those of {against}")
         return
     console.note(
-        f"{done.path}: read back and compared with {against}: {checked.num_projections} projections of "
-        f"{checked.num_points} points in {checked.num_views} images; largest residual {checked.max_px:.2g} px "
-        f"(tolerance {checked.tolerance_px:.2g}), rotation {checked.max_deg:.2g} degrees, "
+        f"{done.path}: verified, {checked.num_projections} projections of {checked.num_points} points in "
+        f"{checked.num_views} images compared with {against}; largest residual {checked.max_px:.2g} px "
+        f"(tolerance {checked.tolerance_px:.2g} px), rotation {checked.max_deg:.2g} degrees, "
         f"centre {checked.max_centre_shift:.2g} of the scene's size"
-        + (f"; the same are {', '.join(checked.parts)}" if checked.parts else "")
+        + (f"; also equal: {', '.join(checked.parts)}" if checked.parts else "")
     )
 
 

@@ -146,7 +146,7 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
     console.note(
         f"{run}: PSNR {mean['psnr']:.2f} dB, SSIM {_number(mean['ssim'], 3)} on {len(metrics['images'])} held-out "
         f"photos; trained {metrics['training']['seconds']:.0f} s, "
-        f"{metrics['render']['seconds_per_image']:.2f} s a picture"
+        f"{metrics['render']['seconds_per_image']:.2f} s per picture"
     )
     rows = [
         (name, *(_number(mean.get(f"{measure}{key}"), digits) for measure, digits in _MEASURES))

@@ -51,7 +51,7 @@ def leak_ledger(config: RunConfig) -> list[Entry]:
 def summary_line(ledger: list[Entry]) -> str:
     """Summarize in one line which stages used the held-out photos, and for which it is unknown."""
     parts = []
-    for answer, words in ((True, "seen by"), (None, "perhaps seen by"), (False, "not seen by")):
+    for answer, words in ((True, "used by"), (None, "perhaps used by"), (False, "not used by")):
         stages = [entry.stage for entry in ledger if entry.saw_held_out is answer]
         parts += [f"{words} {', '.join(stages)}"] if stages else []
     return "held-out photos were " + "; ".join(parts)

@@ -86,9 +86,10 @@ def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components,
     given, changed = check.misses_px
     if math.isfinite(check.error):
         per_cent = 100.0 * math.expm1(check.log_focal)
+        direction = "longer" if per_cent > 0 else "shorter"
         reason = (
             f"{check.matches} matched features suggest a focal length {abs(per_cent):.2f} % "
-            f"(± {100.0 * check.error:.2f} %) {'longer' if per_cent > 0 else 'shorter'}; epipolar error {given:.2f} px -> {changed:.2f} px"
+            f"(± {100.0 * check.error:.2f} %) {direction}; epipolar error {given:.2f} px -> {changed:.2f} px"
         )
     else:
         reason = (
