@@ -17,8 +17,8 @@ _SECONDS_PER_PAIR = 0.045
 _FEATURES_PER_PAIR = 4096
 _SECONDS_PER_LOOK = 0.0006
 # Of the mapper: the first for few photos; the second for each other photo, since all are adjusted again and again.
-_MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.3, 0.0025
-_CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.1
+_MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.38, 0.0025
+_CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
 # How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
 _GROWTH = {"map": 1.3}
 # Of a stage, the share after which its speed says something.
