@@ -153,7 +153,7 @@ def table_of(rows: Sequence[ResultRow]) -> list[tuple[str, ...]]:
     def difference(row: ResultRow) -> str:
         if row.difference_db is None:
             return ""
-        return f"{row.difference_db:+.2f}" + ("" if row.interval_db is None else f" +- {row.interval_db:.2f}")
+        return f"{row.difference_db:+.2f}" + ("" if row.interval_db is None else f" ± {row.interval_db:.2f}")
 
     return [
         (

@@ -54,7 +54,7 @@ def convert_capture(
         notify(f"{text.removesuffix(': rescaled')}; written to {to} unchanged")
     capture, new_from_old, scale = in_world_frame(capture, world)
     if scale is not None:
-        error = "" if scale.standard_error is None else f" +- {scale.standard_error:.2g}"
+        error = "" if scale.standard_error is None else f" ± {scale.standard_error:.2g}"
         unit = "%" if scale.residual_unit == "percent" else "m"
         notify(
             f"one scene unit is {scale.metres_per_unit:.6g}{error} metres, from {scale.source}; residual "
