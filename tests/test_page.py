@@ -142,7 +142,7 @@ def test_the_proof_holds_the_pictures_of_nerfcli_render():
 
 def test_a_network_without_a_table_is_refused_with_a_way_out():
     field = FourierField(FourierFieldSettings(contraction="l2", width=16, octaves=4))
-    with pytest.raises(UserError, match="cannot draw a field of the kind") as caught:
+    with pytest.raises(UserError, match="cannot render a field of type") as caught:
         pack_model(rough(field))
     assert "nerfcli render" in caught.value.hint
 
@@ -182,7 +182,7 @@ def test_what_stands_there_is_not_replaced_unasked(spheres_run, tmp_path):
         export_run(spheres_run, target, to="page")
     assert caught.value.exit_code == 3
     assert target.read_text() == "mine"
-    with pytest.raises(UserError, match="no suffix of a page"):
+    with pytest.raises(UserError, match="not have the suffix of a page"):
         export_run(spheres_run, tmp_path / "a.ply", to="page")
 
 

@@ -477,7 +477,7 @@ def test_maps_are_those_that_colmap_reads(tmp_path):
         (("--to", "mesh", "--format", "stl"), "'stl'; choose ply, glb or obj"),
         (("--to", "mesh", "--voxel-size", "nan"), "--voxel-size"),
         (("--to", "splats"), "'splats'; choose page"),
-        (("--to", "mesh", "-o", "a.stl"), "has no suffix of a mesh"),
+        (("--to", "mesh", "-o", "a.stl"), "not have the suffix of a mesh"),
     ],
 )
 def test_wrong_usage_of_export(options, told, finished):

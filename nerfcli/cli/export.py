@@ -1,4 +1,4 @@
-"""nerfcli export: a run as a page, a mesh, points, a volume, or COLMAP's dense folder."""
+"""nerfcli export: export a run as a page, a mesh, points, a volume, or COLMAP's dense folder."""
 
 import math
 from pathlib import Path
@@ -14,23 +14,23 @@ from nerfcli.cli.render_options import finite
 
 @command
 def export(
-    run: Annotated[str, typer.Argument(help="The folder that train wrote, or - for runs on standard input.")],
-    to: Annotated[str, typer.Option("--to", help="page, mesh, points, volume, tsdf or colmap-dense.")],
+    run: Annotated[str, typer.Argument(help="Run folder written by train, or - to read paths from standard input.")],
+    to: Annotated[str, typer.Option("--to", help="What to export: page, mesh, points, volume, tsdf or colmap-dense.")],
     output: Output = None,
     form: Annotated[
         str | None,
-        typer.Option("--format", help="Of the file, where -o does not say: ply, glb or obj; npz or nrrd."),
+        typer.Option("--format", help="File format if -o does not determine it: ply, glb or obj; npz or nrrd."),
     ] = None,
     box: Annotated[
         str | None,
-        typer.Option(help="X0,Y0,Z0,X1,Y1,Z1 in the scene's units.  [default: what the photos are about]"),
+        typer.Option(help="Exported region X0,Y0,Z0,X1,Y1,Z1, in scene units.  [default: the subject of the photos]"),
     ] = None,
     voxel_size: Annotated[
-        float | None, typer.Option(help="In the scene's units.  [default: what the photos resolve]")
+        float | None, typer.Option(help="Voxel size in scene units.  [default: the resolution of the photos]")
     ] = None,
-    faces: Annotated[int, typer.Option(help="Triangles of a mesh at most.", min=4)] = 300_000,
+    faces: Annotated[int, typer.Option(help="Maximum number of triangles of a mesh.", min=4)] = 300_000,
     max_size: Annotated[
-        int, typer.Option(help="Longer side of the pictures whose depths are fused, pixels.", min=16, max=8192)
+        int, typer.Option(help="Longer side of the depth maps that are fused, in pixels.", min=16, max=8192)
     ] = 480,
     device: Device = "auto",
     threads: Threads = 0,
@@ -40,18 +40,19 @@ def export(
 ) -> None:
     """Export a run as a page, a mesh, points, a volume, or for COLMAP.
 
-    Everything is in the scene's frame and unit, and says so: nerfcli info reads it back.
+    All results are in the frame and unit of the scene and state both; nerfcli info shows them.
 
     \b
-    page          one .html that renders the field itself in a browser (WebGL2), opened from the disk, without a server
-    mesh          .ply, .glb or .obj: where truncated signed distances of median depths are 0, with colours of the field
-    points        .ply: where median and mean agree and two photos see the same, with normals, photos, parallax, spread
+    page          one .html that renders the field in a browser (WebGL2), from the disk, without a server
+    mesh          .ply, .glb or .obj: zero level of truncated signed distances from median depths, with colours
+    points        .ply: where median and mean depth agree and two photos see the same point, with normals, photos,
+                  parallax and spread
     volume        .npz (density, colour) or .nrrd (density, 1 / unit)
-    tsdf          .npz (signed distance, weight) or .nrrd (signed distance): what the mesh is made from
-    colmap-dense  a folder with undistorted photos, depth and normal maps that COLMAP's fusion reads
+    tsdf          .npz (signed distance, weight) or .nrrd (signed distance): the input of the mesh
+    colmap-dense  folder with undistorted photos, depth and normal maps for COLMAP's stereo fusion
 
-    Writes beside the run, RUN.html or RUN-mesh.ply. What no photo sees is never closed by a surface. In a .glb the turn
-    to +Y up is the root node's; positions stay in the scene's frame.
+    Writes RUN.html, RUN-mesh.ply, ... next to the run. Regions that no photo sees stay open. In a .glb, the rotation to
+    +Y up is in the root node; positions stay in the scene's frame.
 
     \b
     Examples:
@@ -71,7 +72,7 @@ def export(
         one_of(suffix[1:], [kind[1:] for kind in TARGETS[to] if kind] or ["none"], "--format")
     finite(voxel_size, "--voxel-size")
     if voxel_size is not None and voxel_size <= 0:
-        raise typer.BadParameter(f"{voxel_size:g} is no size", param_hint="--voxel-size")
+        raise typer.BadParameter(f"{voxel_size:g} is not a positive size", param_hint="--voxel-size")
     settings = SurfaceSettings(
         box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces, max_size=max_size
     )

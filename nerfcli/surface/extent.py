@@ -35,8 +35,8 @@ def scene_box(model: Model, frames: Sequence[Frame]) -> tuple[float, ...]:
     points = points[near] if near.sum() >= 0.05 * len(points) else points
     if not len(points):
         raise UserError(
-            "no camera of the run sees a surface: less than half of the light of each pixel ends",
-            "train longer, or look at the run first: nerfcli report RUN",
+            "no camera of the run sees a surface: the opacity is below 0.5 everywhere",
+            "train longer, or check the run with nerfcli report RUN",
         )
     low, high = np.quantile(points, _OUTSIDE, axis=0), np.quantile(points, 1 - _OUTSIDE, axis=0)
     margin = _MARGIN * float((high - low).max()) or _MARGIN / model.training_from_scene.scale

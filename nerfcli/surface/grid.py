@@ -36,8 +36,9 @@ class Grid:
         shape = tuple(max(1, math.ceil(round(length / voxel_size, 6))) for length in high - low)
         if max(shape) > MOST_CELLS:
             raise UserError(
-                f"voxels of {voxel_size:.4g} make {max(shape)} along a side of the box, expected {MOST_CELLS} at most",
-                f"give a smaller --box, or a --voxel-size of {(high - low).max() / MOST_CELLS:.4g} or more",
+                f"a voxel size of {voxel_size:.4g} gives {max(shape)} voxels along a side of the box; at most "
+                f"{MOST_CELLS} are supported",
+                f"use a smaller --box, or a --voxel-size of at least {(high - low).max() / MOST_CELLS:.4g}",
             )
         return Grid(low, voxel_size, (shape[0], shape[1], shape[2]))
 
@@ -60,7 +61,7 @@ def check_box(box: tuple[float, ...]) -> tuple[float, ...]:
     values = np.array(box, dtype=np.float64)
     if values.shape != (6,) or not np.isfinite(values).all() or not (values[:3] < values[3:]).all():
         raise UserError(
-            f"--box {','.join(f'{value:g}' for value in box)} is no box",
+            f"invalid --box {','.join(f'{value:g}' for value in box)}",
             "expected X0,Y0,Z0,X1,Y1,Z1 in the scene's units, the low corner first",
             exit_code=2,
         )

@@ -105,7 +105,7 @@ def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[st
         networks = np.zeros((0, FOUR, FOUR), np.float32)
         return (sizes.resolution,) * sizes.layers, field.table.detach().cpu(), networks, more
     raise UserError(
-        f"the page cannot draw a field of the kind {field.settings.kind}: its network is too large for a shader",
+        f"the page cannot render a field of type {field.settings.kind}: its network is too large for a shader",
         "train with --field hash or --field voxels, or render pictures and videos: nerfcli render RUN",
     )
 
@@ -122,4 +122,6 @@ def _refuse_sizes(features: int, width: int) -> None:
 
 
 def _too_large(what: str) -> UserError:
-    return UserError(f"the page cannot draw this field: {what}", "train one of the usual size: nerfcli train SCENE")
+    return UserError(
+        f"the page cannot render this field: {what}", "train a field of the default size: nerfcli train SCENE"
+    )

@@ -111,7 +111,7 @@ def suffix_of(path: Path, to: str) -> str:
     if "" in suffixes:
         return ""
     if path.suffix.lower() not in suffixes:
-        raise UserError(f"{path} has no suffix of a {to}", f"give it one of these: {', '.join(suffixes)}", exit_code=2)
+        raise UserError(f"{path} does not have the suffix of a {to}", f"use one of {', '.join(suffixes)}", exit_code=2)
     return path.suffix.lower()
 
 
@@ -122,9 +122,9 @@ def refuse_existing(path: Path, *, overwrite: bool, folder: bool) -> None:
         UserError: something stands there that is not to be replaced.
     """
     if path.is_dir() and not folder:
-        raise UserError(f"{path} is a folder", "give the file's name with -o")
+        raise UserError(f"{path} is a folder", "give a file name with -o")
     if path.exists() and not overwrite:
-        raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another place with -o")
+        raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another path with -o")
     if not path.resolve().parent.is_dir():
         try:
             path.resolve().parent.mkdir(parents=True, exist_ok=True)
@@ -151,9 +151,11 @@ def _export_page(
         on_share=lambda fraction: progress(0.2 + 0.8 * fraction, "photos"),
     )
     if photos.missing:
-        notify(f"{photos.missing} photos are not where the run looks for them: the page has their cameras alone")
+        notify(f"{photos.missing} photos are missing: the page shows only their cameras")
     if text_bytes > PAGE_BYTES:
-        notify(f"the field alone takes {text_bytes / 1e6:.0f} MB of text: the page is large, and has no photos")
+        notify(
+            f"the field alone needs {text_bytes / 1000000.0:.0f} MB of text: the page is large and contains no photos"
+        )
     write_page(page_html(model, packed, run=run.path, frames=frames, photos=photos, proof=proof, box=box), path)
 
 

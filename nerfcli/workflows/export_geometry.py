@@ -46,7 +46,7 @@ def export_mesh(
     fused = fuse(views, grid, on_share=_part(progress, _DEPTHS, 0.9, "fuses"))
     mesh = without_small_pieces(surface_of(fused, on_share=_part(progress, 0.9, 0.95, "marches")))
     if not len(mesh.faces):
-        raise UserError("no surface was found in the box", "give another --box, a larger --voxel-size, or train longer")
+        raise UserError("no surface found in the box", "use another --box, a larger --voxel-size, or train longer")
     found = len(mesh.faces)
     mesh = simplified(mesh, settings.faces, threads=threads)
     progress(0.97, "colours")
@@ -67,7 +67,7 @@ def export_points(
     views, grid = _seen(run, model, settings, progress)
     points = agreed_points(views, grid, on_share=_part(progress, _DEPTHS, 1.0, "compares"))
     if not len(points.places):
-        raise UserError("no two photos see the same point in the box", "give another --box, or train longer")
+        raise UserError("no two photos see the same point in the box", "use another --box, or train longer")
     columns = dict(zip("xyz", points.places.T, strict=True))
     columns |= dict(zip(("nx", "ny", "nz"), points.normals.T, strict=True))
     columns |= dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
@@ -86,7 +86,7 @@ def export_volume(
     """Write density and colour on a grid as .npz, the density alone as .nrrd."""
     box = settings.box or scene_box(model, run.cameras.train)
     grid = Grid.over(box, settings.voxel_size or automatic_volume_voxel(box))
-    maps = sample_volume(model, grid, on_share=_part(progress, 0.05, 1.0, "asks the field"))
+    maps = sample_volume(model, grid, on_share=_part(progress, 0.05, 1.0, "evaluating the field"))
     per_unit = {"metre": "1/m"}.get(model.unit, "1 / unit")
     described = _description(run, model, "volume", grid) | {
         "density": f"share of light that ends per length, {per_unit}; 0 where rays pass over cells",
@@ -121,11 +121,11 @@ def export_colmap_dense(
     there = [frame for frame in run.cameras.train if frame.image is not None]
     frames = [replace(frame, name=photo_name(frame.name)) for frame in spread_frames(there, MOST_VIEWS)]
     if not frames:
-        raise UserError(f"{run.path} has no photos", "a run that was trained on photos has them")
+        raise UserError(f"{run.path} has no photos", "use a run that was trained on photos")
     views, grid = _seen(run, model, settings, progress, frames=frames)
     points = agreed_points(views, grid)
     if not len(points.places):
-        raise UserError("no two photos see the same point in the box", "give another --box, or train longer")
+        raise UserError("no two photos see the same point in the box", "use another --box, or train longer")
     with atomic_folder(path) as partial:
         cameras = []
         for index, frame in enumerate(frames):
