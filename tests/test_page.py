@@ -230,6 +230,25 @@ def test_the_browser_draws_what_nerfcli_renders(opened):
         assert differences["undefined_here"] + differences["undefined_there"] <= 3, name
 
 
+@pytest.mark.parametrize(
+    ("field", "sky"),
+    [
+        (HashField(hash_settings("linf", antialias=True, view_degree=1)), True),
+        (VoxelField(VoxelFieldSettings(contraction="none", view_degree=2, log2_vertices=11)), False),
+    ],
+    ids=["linf, antialiased, a sky", "voxels, no contraction"],
+)
+def test_the_browser_draws_other_fields(field, sky, browser, tmp_path):
+    page = tmp_path / "other.html"
+    page.write_text(page_of(rough(field, sky=sky), [at((1.6, -0.4, 0.8)), at((0.2, 1.5, 0.1))]), encoding="utf-8")
+    browser.open(page, "#check")
+    assert browser.run("document.getElementById('trouble').textContent") == ""
+    found = json.loads(browser.wait("document.getElementById('checked').dataset.found"))
+    assert found["colour"]["percentile_99"] <= COLOUR_BOUND
+    assert found["median"]["median"] <= 1e-3
+    assert found["colour"]["numbers"] == 2 * 3 * WIDTH * HEIGHT
+
+
 def test_keys_move_turn_and_choose_what_is_shown(opened):
     place = opened.run("nerfcliPage.walk.place")
     ahead = opened.run("nerfcliPage.walk.ahead()")

@@ -196,7 +196,6 @@ class Page {
     if (!photo) return;
     const stage = $("stage"), scale = Math.min(stage.clientWidth / photo.width, stage.clientHeight / photo.height);
     state.photo = index;
-    this.walk.stand = this.walk.stand.bind(this.walk);
     Object.assign(this.walk, { place: [...photo.place], turn: photo.turn.map(row => [...row]),
       fov: 2 * Math.atan(stage.clientHeight / 2 / (photo.lens[1] * scale)) });
     $("photo-name").textContent = `${photo.name}${photo.split === "test" ? " (held out)" : ""}`;

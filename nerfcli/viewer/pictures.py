@@ -1,6 +1,7 @@
 """The photos of a run for its page: cameras of all, pictures of as many and as large as there is room for."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -46,6 +47,7 @@ def page_photos(
     test: Sequence[Frame],
     *,
     room_bytes: int,
+    threads: int = 1,
     on_share: Callable[[float], None] = lambda share: None,
 ) -> PagePhotos:
     """Return the photos of a run, as pinhole cameras took them, in the order of their names.
@@ -54,6 +56,7 @@ def page_photos(
         model: whose exposures of photos are given.
         train, test: the frames.
         room_bytes: for the pictures in all, as text of the page.
+        threads: to read photos with.
         on_share: called with how much is done.
     """
     frames = sorted([*((frame, "train") for frame in train), *((frame, "test") for frame in test)], key=_name)
@@ -62,10 +65,12 @@ def page_photos(
     shown = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST_PICTURES)).astype(int))]
     longest = _longest(frames, shown, room_bytes)
     pictures = {}
-    if longest:
-        for count, index in enumerate(shown):
-            pictures[index] = data_uri(_jpeg(frames[index][0], longest), "jpeg")
-            on_share((count + 1) / len(shown))
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        of = shown if longest else []
+        encoded = pool.map(lambda index: jpeg_bytes(_small_photo(frames[index][0], longest), quality=QUALITY), of)
+        for count, (index, jpeg) in enumerate(zip(of, encoded, strict=True)):
+            pictures[index] = data_uri(jpeg, "jpeg")
+            on_share((count + 1) / len(of))
     entries = [
         {**_entry(frame), "split": split, "log_gains": gains[index].tolist(), "picture": pictures.get(index)}
         for index, (frame, split) in enumerate(frames)
@@ -104,14 +109,17 @@ def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_byt
     if not shown:
         return 0
     sample = shown[:: max(1, len(shown) // _SAMPLE)][:_SAMPLE]
+    # Read once at the largest size; the smaller ones are made of that.
+    largest = [_small_photo(frames[index][0], LONGEST_PX[0]) for index in sample]
     for longest in LONGEST_PX:
-        mean = np.mean([4 * len(_jpeg(frames[index][0], longest)) / 3 for index in sample])
+        mean = np.mean([4 * len(jpeg_bytes(photo, longest_px=longest, quality=QUALITY)) / 3 for photo in largest])
         if 1.1 * mean * len(shown) <= room_bytes:
             return longest
     return 0
 
 
-def _jpeg(frame: Frame, longest_px: int) -> bytes:
+def _small_photo(frame: Frame, longest_px: int) -> np.ndarray:
+    """A photo as its pinhole camera took it, its longer side at most so many pixels; white where it is clear."""
     factor = max(1.0, max(frame.camera.width, frame.camera.height) / longest_px)
     photo = load_photo(frame, factor, "ignore")
     small = photo.frame.camera
@@ -119,4 +127,4 @@ def _jpeg(frame: Frame, longest_px: int) -> bytes:
     if pixels.shape[-1] == 4:
         alpha = pixels[..., 3:] / _WHITE
         pixels = np.rint(pixels[..., :3] * alpha + _WHITE * (1 - alpha)).astype(np.uint8)
-    return jpeg_bytes(pixels, quality=QUALITY)
+    return pixels

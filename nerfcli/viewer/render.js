@@ -97,9 +97,10 @@ class Renderer {
   bindNetworks() {
     const { gl } = this, buffer = gl.createBuffer();
     const place = gl.getUniformBlockIndex(this.trace.program, "Networks");
-    if (place === gl.INVALID_INDEX) return;  // a dense grid has none
+    if (place === gl.INVALID_INDEX) return;
     gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, buffer);
-    gl.bufferData(gl.UNIFORM_BUFFER, this.scene.networks, gl.STATIC_DRAW);
+    const { networks } = this.scene;  // a dense grid has none, but the block of the shader wants its 64 bytes
+    gl.bufferData(gl.UNIFORM_BUFFER, networks.length ? networks : new Float32Array(16), gl.STATIC_DRAW);
     gl.uniformBlockBinding(this.trace.program, place, 0);
   }
 

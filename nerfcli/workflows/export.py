@@ -148,6 +148,7 @@ def _export_page(
         cameras.train,
         cameras.test,
         room_bytes=PAGE_BYTES - text_bytes - 150_000,
+        threads=torch.get_num_threads(),
         on_share=lambda fraction: progress(0.2 + 0.8 * fraction, "photos"),
     )
     if photos.missing:

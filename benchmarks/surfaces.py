@@ -1,0 +1,148 @@
+"""Meshes of the desk against its true surface: accuracy, completeness and F-score at 1 and 2 cm.
+
+    python benchmarks/surfaces.py desk-run
+
+RUN was trained on the desk with its true cameras in metres (`sample_scenes/desk/truth`). The truth is what the six
+true depth maps show inside the box. Of a mesh only what one of these views could see counts: up to 5 cm behind its
+depth. Three surfaces with the same voxels: signed distances of median depths, as `nerfcli export --to mesh` has them;
+the same of conditional depths; and a threshold on the density, the one of several with the best F-score at 1 cm.
+"""
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from scipy.spatial import KDTree
+from skimage.measure import marching_cubes
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.media.float_tiff import read_any_tiff
+from nerfcli.render.depth import DepthRequest
+from nerfcli.runs.run import load_run
+from nerfcli.surface.extent import scene_box
+from nerfcli.surface.fusion import fuse
+from nerfcli.surface.grid import Grid
+from nerfcli.surface.marching import Mesh, mesh_of, surface_of, without_small_pieces
+from nerfcli.surface.simplify import simplified
+from nerfcli.surface.views import depth_views
+from nerfcli.surface.volume import sample_volume
+
+DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "truth"
+THRESHOLDS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
+SAMPLES, THINNED = 200_000, 0.0025
+BEHIND, LEVELS = 0.05, (0.01, 0.02)
+
+
+class Truth:
+    """The true surface of the desk inside a box.
+
+    Args:
+        box: low and high corner, metres.
+    """
+
+    def __init__(self, box: tuple[float, ...]):
+        known = json.loads((DESK / "cameras.json").read_text(encoding="utf-8"))
+        self.camera = Camera.from_json(known["camera"])
+        self.low, self.high = np.array(box[:3]), np.array(box[3:])
+        self.views, parts = [], []
+        directions, valid = self.camera.pixel_bearings()
+        for image in known["images"]:
+            path = DESK / "depth" / f"{Path(image['name']).stem}.tiff"
+            if not path.exists():
+                continue
+            pose, depth = np.array(image["world_from_cam"]), read_any_tiff(path)[0]
+            self.views.append((pose, depth))
+            kept = valid & np.isfinite(depth.ravel())
+            points = directions[kept] * (depth.ravel()[kept] / directions[kept, 2])[:, None]
+            parts.append(points @ pose[:3, :3].T + pose[:3, 3])
+        points = np.concatenate(parts)
+        points = points[self._inside(points)]
+        cells = np.floor(points / THINNED).astype(np.int64)
+        self.points = points[np.unique(cells, axis=0, return_index=True)[1]]
+        self.tree = KDTree(self.points)
+
+    def _inside(self, points: np.ndarray) -> np.ndarray:
+        return np.asarray(((points >= self.low) & (points <= self.high)).all(axis=1))
+
+    def could_see(self, points: np.ndarray) -> np.ndarray:
+        """(N,) whether a view shows a point, or would if it stood 5 cm nearer."""
+        seen = np.zeros(len(points), dtype=bool)
+        for pose, depth in self.views:
+            local = (points - pose[:3, 3]) @ pose[:3, :3]
+            pixels, valid = self.camera.project(local)
+            column, row = np.floor(pixels).astype(int).T
+            valid &= (column >= 0) & (row >= 0) & (column < self.camera.width) & (row < self.camera.height)
+            seen[valid] |= local[valid, 2] <= depth[row[valid], column[valid]] + BEHIND
+        return seen
+
+    def compare(self, mesh: Mesh) -> dict[str, float]:
+        """Accuracy and completeness (mean distances, mm) and F-scores."""
+        points = samples_of(mesh)
+        points = points[self._inside(points)]
+        points = points[self.could_see(points)]
+        accuracy = self.tree.query(points)[0]
+        completeness = KDTree(points).query(self.points)[0]
+        found = {"accuracy_mm": 1e3 * accuracy.mean(), "completeness_mm": 1e3 * completeness.mean()}
+        found |= {"median_accuracy_mm": 1e3 * float(np.median(accuracy))}
+        for level in LEVELS:
+            precision, recall = (accuracy < level).mean(), (completeness < level).mean()
+            name = f"{100 * level:g}cm"
+            found |= {f"precision_{name}": precision, f"recall_{name}": recall}
+            found |= {f"F_{name}": 2 * precision * recall / max(precision + recall, 1e-9)}
+        return {key: round(float(value), 4) for key, value in found.items()}
+
+
+def samples_of(mesh: Mesh) -> np.ndarray:
+    """Points (N, 3) evenly spread over the area of a mesh."""
+    rng = np.random.default_rng(0)
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    chosen = rng.choice(len(area), SAMPLES, p=area / area.sum())
+    a, b = rng.random((2, SAMPLES, 1))
+    a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
+    first, second, third = corners[chosen].transpose(1, 0, 2)
+    return first + a * (second - first) + b * (third - first)
+
+
+def main(
+    run: Path,
+    voxel_size: Annotated[float, typer.Option(help="Metres.")] = 0.005,
+    max_size: Annotated[int, typer.Option(help="Longer side of the pictures that are fused, pixels.")] = 480,
+) -> None:
+    """Print a line of JSON for each surface."""
+    opened = load_run(run)
+    model = opened.model()
+    box = scene_box(model, opened.cameras.train)
+    grid, truth = Grid.over(box, voxel_size), Truth(box)
+    for name in ("median", "conditional"):
+        began = time.perf_counter()
+        views = depth_views(model, opened.cameras.train, max_size=max_size, depth=DepthRequest(name, "z"))
+        rendered = time.perf_counter()
+        mesh = without_small_pieces(surface_of(fuse(views, grid)))
+        seconds = {"render_s": round(rendered - began, 1), "fuse_s": round(time.perf_counter() - rendered, 1)}
+        _tell(f"signed distances of {name} depths", mesh, truth, seconds)
+        if name == "median":
+            began = time.perf_counter()
+            small = simplified(mesh, 100_000, threads=1)
+            seconds = {"simplify_s": round(time.perf_counter() - began, 1)}
+            _tell("the same, at most 100,000 faces", small, truth, seconds)
+    began = time.perf_counter()
+    density = sample_volume(model, grid)["density"]
+    meshes = []
+    for threshold in THRESHOLDS:
+        vertices, faces, _, _ = marching_cubes(density, threshold, gradient_direction="ascent")
+        meshes.append((threshold, without_small_pieces(mesh_of(grid.centres(vertices.astype(float)), faces))))
+    seconds = {"seconds": round(time.perf_counter() - began, 1)}
+    best = max(meshes, key=lambda entry: truth.compare(entry[1])["F_1cm"])
+    _tell(f"density above {best[0]:g} per metre", best[1], truth, seconds)
+
+
+def _tell(name: str, mesh: Mesh, truth: Truth, seconds: dict[str, float]) -> None:
+    print(json.dumps({"surface": name, "faces": len(mesh.faces), **truth.compare(mesh), **seconds}), flush=True)
+
+
+if __name__ == "__main__":
+    typer.run(main)
