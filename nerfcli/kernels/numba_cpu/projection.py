@@ -1,0 +1,166 @@
+"""Line integrals through a grid of voxels and their transpose, on CPU threads.
+
+Same operations as `reference.project` and `reference.back_project`. Lines are worked on in parallel forwards;
+backwards each thread owns some planes of the axis that lines are most aligned with, as a line touches a plane only
+in its own four voxels: no two threads write to one voxel, and the order of sums does not depend on threads.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.numba_cpu.threads import use_threads
+
+# Planes of one piece of work backwards: small enough to share out, large enough to cut each line seldom.
+SLAB = 16
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _enter(start: Any, slope: Any, count: Any, low: Any, high: Any) -> tuple[Any, Any]:
+    """The planes between `low` and `high` at which start + plane * slope is above -1 and below count, or all but so."""
+    if slope == 0.0:
+        if start <= -1.0 or start >= count:
+            return 0, 0
+        return low, high
+    one, two = (-1.0 - start) / slope, (count - start) / slope
+    if one > two:
+        one, two = two, one
+    # Bounds are compared before they become integers: a line may pass very far away.
+    if one >= high or two < low:
+        return 0, 0
+    if one >= low:
+        low = int(np.ceil(one))
+    if two < high:
+        high = int(np.ceil(two))
+    return low, high
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _line(origin: Any, direction: Any, first: Any, size: Any, counts: Any, low: Any, high: Any) -> tuple:
+    """Axis, planes and the two other coordinates of a line as functions of the plane, in voxels."""
+    axis = 0
+    for j in range(1, 3):
+        if abs(direction[j]) > abs(direction[axis]):
+            axis = j
+    b = 1 if axis == 0 else 0
+    c = 1 if axis == 2 else 2
+    at = (origin[axis] - first[axis]) / size
+    slope_b, slope_c = direction[b] / direction[axis], direction[c] / direction[axis]
+    start_b = (origin[b] - first[b]) / size - at * slope_b
+    start_c = (origin[c] - first[c]) / size - at * slope_c
+    if high > counts[axis]:
+        high = counts[axis]
+    low, high = _enter(start_b, slope_b, counts[b], low, high)
+    low, high = _enter(start_c, slope_c, counts[c], low, high)
+    length = size * np.sqrt(1.0 + slope_b * slope_b + slope_c * slope_c)
+    return axis, b, c, low, high, start_b, slope_b, start_c, slope_c, length
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _project(volume: Any, origins: Any, directions: Any, first: Any, size: Any, counts: Any, out: Any) -> None:
+    strides = np.array([1, counts[0], counts[0] * counts[1]])
+    for r in numba.prange(len(origins)):
+        axis, b, c, low, high, start_b, slope_b, start_c, slope_c, length = _line(
+            origins[r], directions[r], first, size, counts, 0, np.int64(1) << 40
+        )
+        step_a, step_b, step_c = strides[axis], strides[b], strides[c]
+        total = 0.0
+        for k in range(low, high):
+            place_b, place_c = start_b + k * slope_b, start_c + k * slope_c
+            floor_b, floor_c = np.floor(place_b), np.floor(place_c)
+            i, j = int(floor_b), int(floor_c)
+            share_b, share_c = place_b - floor_b, place_c - floor_c
+            at = k * step_a + i * step_b + j * step_c
+            if i >= 0 and i < counts[b]:
+                if j >= 0 and j < counts[c]:
+                    total += (1.0 - share_b) * (1.0 - share_c) * volume[at]
+                if j >= -1 and j + 1 < counts[c]:
+                    total += (1.0 - share_b) * share_c * volume[at + step_c]
+            if i >= -1 and i + 1 < counts[b]:
+                if j >= 0 and j < counts[c]:
+                    total += share_b * (1.0 - share_c) * volume[at + step_b]
+                if j >= -1 and j + 1 < counts[c]:
+                    total += share_b * share_c * volume[at + step_b + step_c]
+        out[r] = total * length
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _back_project(values: Any, origins: Any, directions: Any, first: Any, size: Any, counts: Any, out: Any) -> None:
+    strides = np.array([1, counts[0], counts[0] * counts[1]])
+    for wanted in range(3):
+        for slab in numba.prange((counts[wanted] + SLAB - 1) // SLAB):
+            for r in range(len(origins)):
+                axis, b, c, low, high, start_b, slope_b, start_c, slope_c, length = _line(
+                    origins[r], directions[r], first, size, counts, slab * SLAB, (slab + 1) * SLAB
+                )
+                if axis != wanted:
+                    continue
+                step_a, step_b, step_c = strides[axis], strides[b], strides[c]
+                value = values[r] * length
+                for k in range(low, high):
+                    place_b, place_c = start_b + k * slope_b, start_c + k * slope_c
+                    floor_b, floor_c = np.floor(place_b), np.floor(place_c)
+                    i, j = int(floor_b), int(floor_c)
+                    share_b, share_c = place_b - floor_b, place_c - floor_c
+                    at = k * step_a + i * step_b + j * step_c
+                    if i >= 0 and i < counts[b]:
+                        if j >= 0 and j < counts[c]:
+                            out[at] += value * (1.0 - share_b) * (1.0 - share_c)
+                        if j >= -1 and j + 1 < counts[c]:
+                            out[at + step_c] += value * (1.0 - share_b) * share_c
+                    if i >= -1 and i + 1 < counts[b]:
+                        if j >= 0 and j < counts[c]:
+                            out[at + step_b] += value * share_b * (1.0 - share_c)
+                        if j >= -1 and j + 1 < counts[c]:
+                            out[at + step_b + step_c] += value * share_b * share_c
+
+
+def project(
+    volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
+) -> Tensor:
+    """See `reference.project`; a float32 volume, lines in float64. Differentiable in the volume alone."""
+    return _Project.apply(volume, origins, directions, first, size)  # type: ignore[no-any-return]
+
+
+def back_project(
+    values: Tensor,
+    origins: Tensor,
+    directions: Tensor,
+    *,
+    shape: tuple[int, int, int],
+    first: tuple[float, float, float],
+    size: float,
+) -> Tensor:
+    """See `reference.back_project`; float32 values, lines in float64."""
+    use_threads()
+    out = np.zeros(shape[0] * shape[1] * shape[2], dtype=np.float32)
+    rays = (values.detach().contiguous().numpy(), *(x.detach().contiguous().numpy() for x in (origins, directions)))
+    _back_project(*rays, np.array(first, dtype=np.float64), float(size), np.array(shape[::-1]), out)
+    return torch.from_numpy(out).view(shape)
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, volume: Tensor, origins: Tensor, directions: Tensor, first: Any, size: float) -> Tensor:
+        use_threads()
+        ctx.save_for_backward(origins, directions)
+        ctx.grid = {"shape": tuple(volume.shape), "first": first, "size": size}
+        out = np.empty(len(origins), dtype=np.float32)
+        _project(
+            volume.detach().contiguous().view(-1).numpy(),
+            origins.contiguous().numpy(),
+            directions.contiguous().numpy(),
+            np.array(first, dtype=np.float64),
+            float(size),
+            np.array(volume.shape[::-1]),
+            out,
+        )
+        return torch.from_numpy(out)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:  # type: ignore[override]
+        origins, directions = ctx.saved_tensors
+        return back_project(gradient, origins, directions, **ctx.grid), None, None, None, None

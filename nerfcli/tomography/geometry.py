@@ -1,0 +1,247 @@
+"""Where the source and the detector of a scan stand: one description for parallel, fan and cone beams.
+
+Per view: where rays come from, the detector's centre, and the two vectors from a pixel to its neighbours. These are
+the vectors of ASTRA (`parallel3d_vec`, `cone_vec`); every other description of a scan converts into them. The object
+stands still, and its frame is the one of the volume: lengths in the unit of the scan, z along the usual rotation axis.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+Beam = Literal["cone", "parallel"]
+
+
+@dataclass(frozen=True)
+class ScanGeometry:
+    """The rays of a scan. A fan beam is a cone beam whose detector has one row.
+
+    Args:
+        beam: whether rays meet in a point ("cone") or are parallel.
+        emitter: (V, 3) float64, where the source stands ("cone"), or the unit direction of the rays ("parallel").
+        centre: (V, 3) centre of the detector.
+        column_step: (V, 3) from a pixel to the next one of its row.
+        row_step: (V, 3) from a pixel to the one below it.
+        rows, columns: number of pixels of the detector.
+
+    Raises:
+        ValueError: the shapes disagree, or a number is not finite.
+    """
+
+    beam: Beam
+    emitter: np.ndarray
+    centre: np.ndarray
+    column_step: np.ndarray
+    row_step: np.ndarray
+    rows: int
+    columns: int
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.emitter)
+        for name in ("emitter", "centre", "column_step", "row_step"):
+            value = getattr(self, name)
+            if value.shape != shape or value.ndim != 2 or value.shape[1] != 3:
+                raise ValueError(f"{name} has shape {value.shape}, emitter {shape}: expected (views, 3)")
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} has numbers that are not finite")
+        if self.rows < 1 or self.columns < 1:
+            raise ValueError(f"a detector of {self.columns} x {self.rows} pixels")
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return len(self.emitter)
+
+    def select(self, views: ArrayLike) -> "ScanGeometry":
+        """The same scan with some of its views, given by their indices."""
+        index = np.asarray(views)
+        return replace(
+            self,
+            emitter=self.emitter[index],
+            centre=self.centre[index],
+            column_step=self.column_step[index],
+            row_step=self.row_step[index],
+        )
+
+    def binned(self, factor: int) -> "ScanGeometry":
+        """The detector with pixels `factor` times as large; pixels that fill no larger one are cut off at the end."""
+        rows, columns = self.rows // factor, self.columns // factor
+        rows, columns = max(rows, 1), max(columns, 1)
+        row_factor = factor if self.rows >= factor else 1
+        # The centre moves when the last rows and columns are cut off.
+        moved_rows = (rows * row_factor - self.rows) / 2
+        moved_columns = (columns * factor - self.columns) / 2
+        return replace(
+            self,
+            centre=self.centre + moved_columns * self.column_step + moved_rows * self.row_step,
+            column_step=self.column_step * factor,
+            row_step=self.row_step * row_factor,
+            rows=rows,
+            columns=columns,
+        )
+
+    def shifted(self, columns: float, rows: float = 0.0) -> "ScanGeometry":
+        """The detector moved by some pixels along its rows and columns, as a wrong centre of rotation moves it."""
+        return replace(self, centre=self.centre + columns * self.column_step + rows * self.row_step)
+
+    def tilted(self, angle: float) -> "ScanGeometry":
+        """The detector turned in its plane about its centre, from its columns towards its rows, in radians."""
+        width = np.linalg.norm(self.column_step, axis=1, keepdims=True)
+        height = np.linalg.norm(self.row_step, axis=1, keepdims=True)
+        along, down = self.column_step / width, self.row_step / height
+        cos, sin = np.cos(angle), np.sin(angle)
+        return replace(self, column_step=width * (cos * along + sin * down), row_step=height * (cos * down - sin * along))
+
+    def mirrored(self) -> "ScanGeometry":
+        """The detector whose columns are numbered from the other side."""
+        return replace(self, column_step=-self.column_step)
+
+    def rays(self, views: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and unit directions of the rays through the centres of all pixels.
+
+        Args:
+            views: indices of the views; all if not given.
+
+        Returns:
+            Two arrays (views, rows, columns, 3), float64. A ray of a parallel beam begins at its pixel's foot on the
+            plane through the frame's origin.
+        """
+        index = np.arange(self.views) if views is None else np.asarray(views)
+        along = np.arange(self.columns) - (self.columns - 1) / 2
+        down = np.arange(self.rows) - (self.rows - 1) / 2
+        pixels = (
+            self.centre[index][:, None, None]
+            + down[:, None, None] * self.row_step[index][:, None, None]
+            + along[:, None] * self.column_step[index][:, None, None]
+        )  # (views, rows, columns, 3)
+        emitter = np.broadcast_to(self.emitter[index][:, None, None], pixels.shape)
+        if self.beam == "parallel":
+            foot = pixels - (pixels * emitter).sum(-1, keepdims=True) * emitter
+            return foot, emitter.copy()
+        along_ray = pixels - emitter
+        return emitter.copy(), along_ray / np.linalg.norm(along_ray, axis=-1, keepdims=True)
+
+    def pixel_of(self, view: int, points: np.ndarray) -> np.ndarray:
+        """Where points are seen in a view: (N, 2) column and row, 0 at the centre of the first pixel.
+
+        Formula: the point where the ray through the point meets the detector's plane, in units of its steps. The unit
+        is pixels; points in the plane of the source give numbers that are not finite.
+
+        Args:
+            view: its index.
+            points: (N, 3).
+        """
+        normal = np.cross(self.column_step[view], self.row_step[view])
+        centre, emitter = self.centre[view], self.emitter[view]
+        if self.beam == "parallel":
+            direction = np.broadcast_to(emitter, points.shape)
+        else:
+            direction = points - emitter
+        with np.errstate(divide="ignore", invalid="ignore"):
+            length = ((centre - points) @ normal) / (direction @ normal)
+            hit = points + length[:, None] * direction - centre
+        steps = np.stack([self.column_step[view], self.row_step[view]], axis=1)  # (3, 2)
+        pixel = hit @ np.linalg.pinv(steps).T
+        return pixel + [(self.columns - 1) / 2, (self.rows - 1) / 2]
+
+    @property
+    def magnification(self) -> np.ndarray:
+        """(V,) how many times larger the detector shows what stands at the frame's origin."""
+        if self.beam == "parallel":
+            return np.ones(self.views)
+        normal = np.cross(self.column_step, self.row_step)
+        to_detector = ((self.centre - self.emitter) * normal).sum(1)
+        to_origin = -(self.emitter * normal).sum(1)
+        return to_detector / to_origin
+
+    @property
+    def pixel_at_origin(self) -> tuple[float, float]:
+        """Height and width of a pixel where the object stands, in the scan's unit: medians over views."""
+        height = np.linalg.norm(self.row_step, axis=1) / self.magnification
+        width = np.linalg.norm(self.column_step, axis=1) / self.magnification
+        return float(np.median(height)), float(np.median(width))
+
+    def vectors(self) -> np.ndarray:
+        """(V, 12) as ASTRA has them: source or direction, detector's centre, column step, row step."""
+        return np.concatenate([self.emitter, self.centre, self.column_step, self.row_step], axis=1)
+
+
+def from_vectors(beam: Beam, vectors: ArrayLike, *, rows: int, columns: int) -> ScanGeometry:
+    """The geometry of ASTRA's (V, 12) vectors; directions of a parallel beam may have any length.
+
+    Raises:
+        ValueError: the vectors are not (V, 12) or not finite, or a direction is 0.
+    """
+    array = np.asarray(vectors, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 12:
+        raise ValueError(f"vectors have shape {array.shape}: expected (views, 12)")
+    emitter, centre, column_step, row_step = (array[:, i : i + 3].copy() for i in (0, 3, 6, 9))
+    if beam == "parallel":
+        length = np.linalg.norm(emitter, axis=1, keepdims=True)
+        if not (length > 0).all():
+            raise ValueError("a direction of the parallel beam is 0")
+        emitter = emitter / length
+    return ScanGeometry(beam, emitter, centre, column_step, row_step, rows, columns)
+
+
+def circular_cone(
+    angles: ArrayLike,
+    *,
+    source_origin: float,
+    source_detector: float,
+    pixel_width: float,
+    pixel_height: float,
+    rows: int,
+    columns: int,
+) -> ScanGeometry:
+    """A source and a flat detector on a circle around z, on opposite sides of the origin.
+
+    The source of a view with angle a stands at (cos a, sin a, 0) * source_origin. Seen from there, columns run to the
+    right and rows down, with +z up.
+
+    Args:
+        angles: (V,) radians, counter-clockwise seen from +z.
+        source_origin, source_detector: distances.
+        pixel_width, pixel_height: of the detector's pixels.
+        rows, columns: number of pixels.
+
+    Raises:
+        ValueError: source_detector is not larger than 0, or source_origin is not.
+    """
+    if not (source_origin > 0 and source_detector > 0):
+        raise ValueError(f"source_origin {source_origin} and source_detector {source_detector} must be above 0")
+    outward, right, down = _circle(angles)
+    return ScanGeometry(
+        "cone",
+        source_origin * outward,
+        (source_origin - source_detector) * outward,
+        pixel_width * right,
+        pixel_height * down,
+        rows,
+        columns,
+    )
+
+
+def circular_parallel(
+    angles: ArrayLike, *, pixel_width: float, pixel_height: float, rows: int, columns: int
+) -> ScanGeometry:
+    """A parallel beam around z: `circular_cone` with a source infinitely far away.
+
+    Args:
+        angles: (V,) radians, counter-clockwise seen from +z: rays of a view come from (cos a, sin a, 0).
+        pixel_width, pixel_height: of the detector's pixels.
+        rows, columns: number of pixels.
+    """
+    outward, right, down = _circle(angles)
+    return ScanGeometry(
+        "parallel", -outward, np.zeros_like(outward), pixel_width * right, pixel_height * down, rows, columns
+    )
+
+
+def _circle(angles: ArrayLike) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    angle = np.asarray(angles, dtype=np.float64)
+    cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    down = np.stack([zero, zero, zero - 1], axis=1)
+    return np.stack([cos, sin, zero], axis=1), np.stack([-sin, cos, zero], axis=1), down

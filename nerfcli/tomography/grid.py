@@ -1,0 +1,73 @@
+"""The grid of voxels a volume is stored on, and where its voxels stand."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.tomography.geometry import ScanGeometry
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """Cubic voxels along the axes of the scan's frame.
+
+    Args:
+        shape: number of voxels (z, y, x).
+        first: (x, y, z) centre of the first voxel, in the scan's unit.
+        size: side of a voxel, > 0.
+    """
+
+    shape: tuple[int, int, int]
+    first: tuple[float, float, float]
+    size: float
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 1 or not self.size > 0 or not np.isfinite([*self.first, self.size]).all():
+            raise ValueError(f"no grid: shape {self.shape}, first voxel {self.first}, size {self.size}")
+
+    @property
+    def voxels(self) -> int:
+        """Number of voxels."""
+        return int(np.prod(self.shape))
+
+    def axis(self, name: str) -> np.ndarray:
+        """Centres of the voxels along "x", "y" or "z"."""
+        index = "xyz".index(name)
+        return self.first[index] + self.size * np.arange(self.shape[2 - index])
+
+    def coarser(self, factor: int) -> "VoxelGrid":
+        """A grid over the same box with voxels `factor` times as large, rounded up."""
+        shape = tuple(-(-count // factor) for count in self.shape)
+        half = self.size * (factor - 1) / 2
+        first = (self.first[0] + half, self.first[1] + half, self.first[2] + half)
+        return VoxelGrid((shape[0], shape[1], shape[2]), first, self.size * factor)
+
+
+def centred_grid(extent: tuple[float, float, float], size: float) -> VoxelGrid:
+    """A grid around the frame's origin that covers a box of these lengths (x, y, z) with whole voxels."""
+    counts = [max(1, int(np.ceil(length / size - 1e-9))) for length in extent]
+    first = tuple(-(count - 1) / 2 * size for count in counts)
+    return VoxelGrid((counts[2], counts[1], counts[0]), (first[0], first[1], first[2]), size)
+
+
+def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid:
+    """The box that the detector sees in some view, in voxels of a pixel's size at the object.
+
+    Across the axis it is the square around the circle that the widest ray of any view touches; along z it is what the
+    detector's first and last row see at the axis. A detector of one row gets one layer.
+
+    Args:
+        geometry: of the scan.
+        size: of a voxel; the smaller side of a pixel where the object stands if not given.
+    """
+    height, width = geometry.pixel_at_origin
+    size = min(height, width) if size is None and geometry.rows > 1 else (width if size is None else size)
+    origins, directions = geometry.rays()
+    origins, directions = origins[..., :2], directions[..., :2]
+    across = np.abs(origins[..., 0] * directions[..., 1] - origins[..., 1] * directions[..., 0])
+    radius = float((across / np.linalg.norm(directions, axis=-1)).max())
+    if geometry.rows == 1:
+        z = 0.0 if geometry.beam == "cone" else float(np.median(geometry.centre[:, 2]))
+        grid = centred_grid((2 * radius, 2 * radius, size), size)
+        return VoxelGrid(grid.shape, (grid.first[0], grid.first[1], z), size)
+    return centred_grid((2 * radius, 2 * radius, geometry.rows * height), size)
