@@ -289,3 +289,34 @@ class Backend(Protocol):
     ) -> None:
         """One step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero."""
         ...
+
+    def project(
+        self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
+    ) -> Tensor:
+        """Line integrals (R,) of a volume (Z, Y, X) along lines in float64; see `reference.project`.
+
+        Differentiable in the volume.
+        """
+        ...
+
+    def back_project(
+        self,
+        values: Tensor,
+        origins: Tensor,
+        directions: Tensor,
+        *,
+        shape: tuple[int, int, int],
+        first: tuple[float, float, float],
+        size: float,
+    ) -> Tensor:
+        """The transpose of `project`: (Z, Y, X) from (R,), without gradients."""
+        ...
+
+    def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
+        """A volume (Z, Y, X) >= 0 near `target` whose total variation is smaller, without gradients.
+
+        Args:
+            threshold: (Z, Y, X) > 0.
+            dual: (3, Z, Y, X), overwritten; see `reference.denoise_total_variation`.
+        """
+        ...

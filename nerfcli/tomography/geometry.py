@@ -92,7 +92,9 @@ class ScanGeometry:
         height = np.linalg.norm(self.row_step, axis=1, keepdims=True)
         along, down = self.column_step / width, self.row_step / height
         cos, sin = np.cos(angle), np.sin(angle)
-        return replace(self, column_step=width * (cos * along + sin * down), row_step=height * (cos * down - sin * along))
+        return replace(
+            self, column_step=width * (cos * along + sin * down), row_step=height * (cos * down - sin * along)
+        )
 
     def mirrored(self) -> "ScanGeometry":
         """The detector whose columns are numbered from the other side."""

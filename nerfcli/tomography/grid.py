@@ -71,3 +71,18 @@ def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid
         grid = centred_grid((2 * radius, 2 * radius, size), size)
         return VoxelGrid(grid.shape, (grid.first[0], grid.first[1], z), size)
     return centred_grid((2 * radius, 2 * radius, geometry.rows * height), size)
+
+
+def layers_of_rays(grid: VoxelGrid, geometry: ScanGeometry) -> VoxelGrid:
+    """The layers of a grid that the rays of a scan pass, for a detector of fewer rows than the grid was made for."""
+    origins, directions = geometry.rays()
+    across = np.linalg.norm(directions[..., :2], axis=-1)
+    nearest = -(origins[..., :2] * directions[..., :2]).sum(-1) / across**2
+    radius = max(abs(end) for name in "xy" for end in grid.axis(name)[[0, -1]])
+    heights = [origins[..., 2] + (nearest + side * radius / across) * directions[..., 2] for side in (-1, 1)]
+    low = int(np.floor((min(h.min() for h in heights) - grid.first[2]) / grid.size))
+    high = int(np.ceil((max(h.max() for h in heights) - grid.first[2]) / grid.size)) + 1
+    low, high = max(low, 0), min(high, grid.shape[0])
+    low = min(low, grid.shape[0] - 1)
+    first = (grid.first[0], grid.first[1], grid.first[2] + low * grid.size)
+    return VoxelGrid((max(high - low, 1), *grid.shape[1:]), first, grid.size)

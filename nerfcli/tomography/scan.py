@@ -6,7 +6,7 @@ memory when they are read. `nerfcli convert` writes such folders from the format
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -76,10 +76,37 @@ class Scan:
         """Indices of the views to reconstruct from."""
         return np.setdiff1d(np.arange(self.geometry.views), np.array(self.held_out, dtype=int))
 
+    @property
+    def digest(self) -> str:
+        """A hash of geometry and measurements: another scan has another one."""
+        hasher = hashlib.blake2b(digest_size=16)
+        hasher.update(self.geometry.vectors().tobytes())
+        for name in _ARRAYS:
+            array = getattr(self, name)
+            hasher.update(b"-" if array is None else array_digest(array).encode())
+        hasher.update(f"{self.kind} {self.photons_per_value} {self.held_out} {self.unit}".encode())
+        return hasher.hexdigest()
+
     def of_views(self, name: str, views: np.ndarray) -> np.ndarray | None:
         """One of the arrays `open_beam`, `dark` and `usable` for some views, in its own broadcast shape."""
         array = getattr(self, name)
         return array if array is None or len(array) == 1 else array[views]
+
+    def only_rows(self, first: int, end: int) -> "Scan":
+        """The scan by some rows of its detector, `first` up to `end`."""
+        middle = (first + end - 1) / 2 - (self.geometry.rows - 1) / 2
+
+        def cut(array: np.ndarray | None) -> np.ndarray | None:
+            return array if array is None or array.shape[1] == 1 else array[:, first:end]
+
+        return replace(
+            self,
+            geometry=replace(self.geometry.shifted(0, middle), rows=end - first),
+            values=self.values[:, first:end],
+            open_beam=cut(self.open_beam),
+            dark=cut(self.dark),
+            usable=cut(self.usable),
+        )
 
     def line_integrals(self, views: np.ndarray) -> np.ndarray:
         """-log of the transmission of some views, (len(views), rows, columns) float32: for pictures and baselines.
@@ -124,7 +151,7 @@ def save_scan(folder: Path, scan: Scan) -> None:
                 continue
             stored = np.ascontiguousarray(array, dtype=bool if name == "usable" else np.float32)
             np.save(partial / f"{name}.npy", stored, allow_pickle=False)
-            digests[name] = _digest(stored)
+            digests[name] = array_digest(stored)
         geometry = scan.geometry
         write_sealed(
             partial / SCENE_FILE,
@@ -158,7 +185,7 @@ def load_scan(folder: Path) -> Scan:
             raise ValueError(f"its format is {content.get('format')!r}, expected {FORMAT!r}")
         beam: Beam = content["beam"]
         geometry = from_vectors(beam, content["vectors"], rows=content["rows"], columns=content["columns"])
-        arrays = {name: _read_array(folder / f"{name}.npy", digest) for name, digest in content["arrays"].items()}
+        arrays = {name: read_array(folder / f"{name}.npy", digest) for name, digest in content["arrays"].items()}
         return Scan(
             geometry,
             content["kind"],
@@ -180,14 +207,16 @@ def held_out_views(views: int, every: int = HELD_OUT_EVERY) -> tuple[int, ...]:
     return tuple(range(0, views, every)) if views > every else ()
 
 
-def _read_array(path: Path, digest: str) -> np.ndarray:
+def read_array(path: Path, digest: str) -> np.ndarray:
+    """Map an array of a .npy file into memory; ValueError where it is not the one of this digest."""
     array = np.load(path, mmap_mode="r", allow_pickle=False)
-    if _digest(array) != digest:
+    if array_digest(array) != digest:
         raise ValueError(f"{path.name} is not what was written")
     return array
 
 
-def _digest(array: np.ndarray) -> str:
+def array_digest(array: np.ndarray) -> str:
+    """Hash an array: shape, type and bytes."""
     hasher = hashlib.blake2b(digest_size=16)
     hasher.update(f"{array.shape} {array.dtype}".encode())
     for part in array:

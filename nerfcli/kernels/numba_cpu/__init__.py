@@ -12,15 +12,19 @@ from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
 from nerfcli.kernels.numba_cpu.marching import occupied_samples
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
 from nerfcli.kernels.numba_cpu.pixels import pixel_rays
+from nerfcli.kernels.numba_cpu.projection import back_project, project
 from nerfcli.kernels.numba_cpu.rays import ray_indices
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows
+from nerfcli.kernels.numba_cpu.total_variation import denoise_total_variation
 from nerfcli.kernels.numba_cpu.visible import visible_samples
 
 __all__ = [
     "adam_rows",
+    "back_project",
     "can_hash_encode",
     "can_radiance",
     "composite",
+    "denoise_total_variation",
     "density",
     "distortion",
     "hash_encode",
@@ -31,6 +35,7 @@ __all__ = [
     "occupied_samples",
     "optical_depth_before",
     "pixel_rays",
+    "project",
     "radiance",
     "ray_indices",
     "sample_coordinates",

@@ -49,6 +49,26 @@ class NumbaBackend(ComposedBackend):
         module = numba_cpu if table.shape[-1] == FEATURES else reference
         module.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
 
+    def project(
+        self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
+    ) -> Tensor:
+        return numba_cpu.project(volume, origins, directions, first=first, size=size)
+
+    def back_project(
+        self,
+        values: Tensor,
+        origins: Tensor,
+        directions: Tensor,
+        *,
+        shape: tuple[int, int, int],
+        first: tuple[float, float, float],
+        size: float,
+    ) -> Tensor:
+        return numba_cpu.back_project(values, origins, directions, shape=shape, first=first, size=size)
+
+    def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
+        return numba_cpu.denoise_total_variation(target, threshold, dual, iterations=iterations)
+
     def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
         module = numba_cpu if _fits(grid) else reference
         return module.visible_samples(rays, march, grid)

@@ -20,13 +20,17 @@ from nerfcli.kernels.reference.encoding import corner_rows, hash_encode
 from nerfcli.kernels.reference.marching import march, occupied_samples, sample_coordinates, visible_samples
 from nerfcli.kernels.reference.networks import density, geometry, radiance
 from nerfcli.kernels.reference.pixels import pixel_rays
+from nerfcli.kernels.reference.projection import back_project, project
 from nerfcli.kernels.reference.row_adam import adam_rows
+from nerfcli.kernels.reference.total_variation import denoise_total_variation, total_variation
 
 __all__ = [
     "adam_rows",
+    "back_project",
     "composite",
     "contracted_distance",
     "corner_rows",
+    "denoise_total_variation",
     "density",
     "distortion",
     "geometry",
@@ -39,10 +43,12 @@ __all__ = [
     "off_target",
     "optical_depth_before",
     "pixel_rays",
+    "project",
     "radiance",
     "ray_indices",
     "sample_coordinates",
     "scale_gradients",
     "sum_along_rays",
+    "total_variation",
     "visible_samples",
 ]

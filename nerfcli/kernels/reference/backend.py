@@ -46,6 +46,26 @@ class ReferenceBackend(ComposedBackend):
     ) -> None:
         reference.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
 
+    def project(
+        self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float
+    ) -> Tensor:
+        return reference.project(volume, origins, directions, first=first, size=size)
+
+    def back_project(
+        self,
+        values: Tensor,
+        origins: Tensor,
+        directions: Tensor,
+        *,
+        shape: tuple[int, int, int],
+        first: tuple[float, float, float],
+        size: float,
+    ) -> Tensor:
+        return reference.back_project(values, origins, directions, shape=shape, first=first, size=size)
+
+    def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
+        return reference.denoise_total_variation(target, threshold, dual, iterations=iterations)
+
     def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
         return reference.visible_samples(rays, march, grid)
 

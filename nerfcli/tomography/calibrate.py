@@ -1,0 +1,144 @@
+"""What of a scan's geometry and open beam the measurements themselves correct: the centre of rotation, the detector's
+tilt, and the brightness of each view.
+
+Geometry is judged by prediction: a volume fitted to every second view has to explain the others.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import minimize_scalar
+
+from nerfcli.tomography.geometry import ScanGeometry
+from nerfcli.tomography.grid import grid_of_scan
+from nerfcli.tomography.likelihood import Poisson, likelihood_of
+from nerfcli.tomography.reconstruct import Problem, Projector, reconstruct, start
+from nerfcli.tomography.scan import Scan
+
+# Passes of the trial reconstructions, and the weight of their total variation.
+TRIAL_PASSES = 6
+TRIAL_STRENGTH = 0.3
+# Most views and columns of a trial: more cost time and tell the centre no better than to a tenth of a pixel.
+TRIAL_VIEWS = 120
+TRIAL_COLUMNS = 320
+# The centre is looked for within this share of the detector's width on either side, in so many steps.
+CENTRE_RANGE = 0.08
+CENTRE_STEPS = 17
+TILT_RANGE = np.deg2rad(2.0)
+# Standard errors by which the views that were not fitted have to be explained better for a correction to be taken.
+SIGNIFICANT = 3.0
+# Photons of air that weigh as much as the belief that a view's open beam is the scan's: it drifts by some 1 %.
+PRIOR_PHOTONS = 1e4
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A corrected number of the geometry.
+
+    Args:
+        value: in pixels, or radians.
+        gain: mean drop of the deviance per pixel of the views that were not fitted, against 0.
+        error: standard error of the gain, over views.
+    """
+
+    value: float
+    gain: float
+    error: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the views that were not fitted speak for it."""
+        return self.gain > SIGNIFICANT * self.error
+
+
+def centre_of_rotation(scan: Scan) -> Correction:
+    """By how many columns the detector stands off from where the geometry says, see `ScanGeometry.shifted`.
+
+    The row next to the plane of the source is fitted as a fan or parallel beam.
+    """
+    row = _middle_row(scan.geometry)
+    one_row = scan.only_rows(row, row + 1)
+    width = scan.geometry.columns
+    binning = max(1, width // TRIAL_COLUMNS)
+
+    def misfit(shift: float) -> np.ndarray:
+        return _prediction(one_row, one_row.geometry.shifted(shift), binning=binning)
+
+    return _search(misfit, bound=CENTRE_RANGE * width, steps=CENTRE_STEPS, precise=0.05)
+
+
+def detector_tilt(scan: Scan) -> Correction:
+    """By how many radians the detector is turned in its plane, see `ScanGeometry.tilted`; 0 for a single row."""
+    if scan.geometry.rows < 8:
+        return Correction(0.0, 0.0, 0.0)
+    binning = max(1, scan.geometry.columns // 64)
+
+    def misfit(angle: float) -> np.ndarray:
+        return _prediction(scan, scan.geometry.tilted(angle), binning=binning)
+
+    return _search(misfit, bound=TILT_RANGE, steps=5, precise=float(np.deg2rad(0.02)))
+
+
+def air_factors(likelihood: Poisson, integrals: torch.Tensor, *, margin: float = 0.01) -> torch.Tensor:
+    """How bright the open beam of each view is against the scan's own, from pixels that look past the object.
+
+    Formula: sum of counts over sum of expected counts, of pixels whose line integral is below `margin`, with
+    `PRIOR_PHOTONS` added to both. Views without such pixels get 1.
+
+    Args:
+        likelihood: of (views, pixels).
+        integrals: (views, pixels) of a first reconstruction.
+        margin: the largest line integral that counts as air.
+    """
+    air = (integrals < margin) & (likelihood.open_beam > 0)
+    expected = torch.where(air, likelihood.open_beam * torch.exp(-integrals) + likelihood.background, 0).double().sum(1)
+    counted = torch.where(air, likelihood.counts, 0).double().sum(1)
+    return ((counted + PRIOR_PHOTONS) / (expected + PRIOR_PHOTONS)).float()
+
+
+def _search(misfit: Callable[[float], np.ndarray], *, bound: float, steps: int, precise: float) -> Correction:
+    """The value whose misfit is smallest: by steps over the whole range, then between the neighbours of the best."""
+    grid = np.linspace(-bound, bound, steps)
+    means = [float(np.nanmean(misfit(float(value)))) for value in grid]
+    best = int(np.argmin(means))
+    low, high = grid[max(best - 1, 0)], grid[min(best + 1, steps - 1)]
+    found = minimize_scalar(
+        lambda value: float(np.nanmean(misfit(float(value)))),
+        bounds=(float(low), float(high)),
+        method="bounded",
+        options={"xatol": precise},
+    )
+    value = float(found.x)
+    better = misfit(0.0) - misfit(value)
+    error = float(np.nanstd(better) / np.sqrt(max(np.isfinite(better).sum(), 1)))
+    return Correction(value, float(np.nanmean(better)), error)
+
+
+def _prediction(scan: Scan, geometry: ScanGeometry, *, binning: int) -> np.ndarray:
+    """Mean deviance of each view that a volume fitted to the views between them leaves, (views,)."""
+    views = scan.training_views
+    views = views[:: max(1, len(views) // TRIAL_VIEWS)]
+    coarse = geometry.binned(binning)
+    grid = grid_of_scan(coarse)
+    fitted, left = views[::2], views[1::2]
+    problem = Problem(coarse.select(fitted), likelihood_of(scan, fitted, binning=binning), grid)
+    fit = reconstruct(problem, start(problem), strength=TRIAL_STRENGTH, passes=TRIAL_PASSES)
+    projector = Projector(coarse.select(left), grid)
+    every = np.arange(len(left))
+    deviance = likelihood_of(scan, left, binning=binning).deviance(
+        projector.forward(fit.volume, every), torch.from_numpy(every)
+    )
+    return np.nanmean(deviance.numpy(), axis=1)
+
+
+def _middle_row(geometry: ScanGeometry) -> int:
+    """The row in the plane of the source across the axis; the middle one of a parallel beam."""
+    if geometry.beam == "parallel":
+        return geometry.rows // 2
+    straight = -geometry.centre[:, 2] + geometry.emitter[:, 2]
+    row = (geometry.rows - 1) / 2 + np.median(
+        straight / np.where(geometry.row_step[:, 2] == 0, 1, geometry.row_step[:, 2])
+    )
+    return int(np.clip(np.round(row), 0, geometry.rows - 1))

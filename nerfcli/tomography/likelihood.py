@@ -1,0 +1,182 @@
+"""How well line integrals explain what a detector measured: Poisson for counts, least squares for line integrals.
+
+No logarithm of data is taken where there are counts: with few photons it is biased, and of none it does not exist.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.tomography.scan import Scan
+
+# Median of |x| of a normal variable of variance 1.
+_MEDIAN_DEVIATION = 0.6745
+
+
+class Likelihood(Protocol):
+    """Negative log likelihood of line integrals, view by view: tensors are (views, pixels), in the order of pixels."""
+
+    def slope(self, integrals: Tensor, views: Tensor) -> Tensor:
+        """Derivative of the negative log likelihood by each line integral; 0 where nothing usable was measured."""
+        ...
+
+    def curvature(self, views: Tensor) -> Tensor:
+        """Second derivative at the line integrals that the data themselves suggest, >= 0."""
+        ...
+
+    def deviance(self, integrals: Tensor, views: Tensor) -> Tensor:
+        """Squared misfit in units of the noise: 1 is expected of each pixel. NaN where nothing usable was measured."""
+        ...
+
+    def suggested(self, views: Tensor) -> Tensor:
+        """Line integrals that the data suggest, for a start; NaN where nothing usable was measured."""
+        ...
+
+
+@dataclass(frozen=True)
+class Poisson:
+    """Counts of photons: N ~ Poisson(O exp(-p) + B).
+
+    Args:
+        counts, open_beam, background: (views, pixels) photons N, O and B; O is 0 for pixels that are not usable.
+    """
+
+    counts: Tensor
+    open_beam: Tensor
+    background: Tensor
+
+    def slope(self, integrals: Tensor, views: Tensor) -> Tensor:
+        """-O exp(-p) (1 - N / (O exp(-p) + B)). Source: Erdogan and Fessler 1999, equation 5, with its sign changed."""
+        signal = self.open_beam[views] * torch.exp(-integrals)
+        if not self.background.any():
+            return self.counts[views] - signal
+        expected = signal + self.background[views]
+        return torch.where(expected > 0, signal * (self.counts[views] / expected - 1), 0)
+
+    def curvature(self, views: Tensor) -> Tensor:
+        """(N - B)^2 / N, at least of one photon. Source: as for `slope`, equation 17, precomputed curvatures."""
+        signal = (self.counts[views] - self.background[views]).clamp_min(1)
+        curvature = signal.square() / self.counts[views].clamp_min(1)
+        return torch.where(self.open_beam[views] > 0, torch.minimum(curvature, signal), 0)
+
+    def deviance(self, integrals: Tensor, views: Tensor) -> Tensor:
+        """Pearson's: (N - E)^2 / E with the expected count E, whose mean is 1 whatever the count."""
+        expected = self.open_beam[views] * torch.exp(-integrals) + self.background[views]
+        usable = self.open_beam[views] > 0
+        return torch.where(usable, (self.counts[views] - expected).square() / expected, torch.nan)
+
+    def suggested(self, views: Tensor) -> Tensor:
+        signal = (self.counts[views] - self.background[views]).clamp_min(0.5)
+        return torch.where(self.open_beam[views] > 0, torch.log(self.open_beam[views] / signal), torch.nan)
+
+    def scaled(self, factors: Tensor) -> "Poisson":
+        """The same counts behind an open beam that is multiplied by a factor per view (views,)."""
+        return Poisson(self.counts, self.open_beam * factors[:, None], self.background)
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """Line integrals with noise of one size: y ~ Normal(p, 1 / weight).
+
+    Args:
+        measured: (views, pixels) y.
+        weight: (views, pixels) 1 / variance; 0 for pixels that are not usable.
+    """
+
+    measured: Tensor
+    weight: Tensor
+
+    def slope(self, integrals: Tensor, views: Tensor) -> Tensor:
+        return self.weight[views] * (integrals - self.measured[views])
+
+    def curvature(self, views: Tensor) -> Tensor:
+        return self.weight[views]
+
+    def deviance(self, integrals: Tensor, views: Tensor) -> Tensor:
+        weight = self.weight[views]
+        return torch.where(weight > 0, weight * (integrals - self.measured[views]).square(), torch.nan)
+
+    def suggested(self, views: Tensor) -> Tensor:
+        return torch.where(self.weight[views] > 0, self.measured[views], torch.nan)
+
+
+def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson | Gaussian:
+    """The likelihood of some views of a scan, by what it measured.
+
+    Transmissions are counts of an open beam of 1 in photons. Where nobody knows how many photons a value stands for,
+    it is told from the noise between neighbouring pixels, see `photons_per_value`.
+
+    Args:
+        scan: the scan.
+        views: indices of its views.
+        binning: so many rows and columns are put together, as in `ScanGeometry.binned`: photons are added, line
+            integrals averaged.
+
+    Returns:
+        Of float32 tensors.
+    """
+    values = np.asarray(scan.values[views], dtype=np.float32)
+    usable = scan.of_views("usable", views)
+    good = np.isfinite(values) if usable is None else np.isfinite(values) & usable
+    if scan.kind == "line_integral":
+        weight = good.astype(np.float32) / np.float32(noise(np.where(good, values, np.nan)) ** 2)
+        total = _binned(weight, binning)
+        mean = _binned(np.where(good, values, 0) * weight, binning) / np.maximum(total, np.float32(1e-30))
+        return Gaussian(_flat(mean), _flat(total))
+    dark, open_beam = scan.of_views("dark", views), scan.of_views("open_beam", views)
+    background = np.zeros_like(values) if dark is None else np.broadcast_to(dark, values.shape)
+    beam = np.ones_like(values) if open_beam is None else np.broadcast_to(open_beam, values.shape)
+    photons = scan.photons_per_value
+    if photons is None:
+        photons = photons_per_value(np.where(good, values - background, np.nan))
+    good = good & (beam > 0)
+    # Detector values below the dark ones are noise of the electronics; a Poisson likelihood has no negative counts.
+    parts = (np.maximum(values, 0), beam, np.maximum(background, 0))
+    counts, beam, background = (
+        _flat(_binned(np.where(good, part, 0) * np.float32(photons), binning)) for part in parts
+    )
+    return Poisson(counts, beam, background)
+
+
+def photons_per_value(values: np.ndarray) -> float:
+    """How many photons a detector value stands for, by its noise: mean / variance.
+
+    Args:
+        values: (views, rows, columns) above the dark ones; NaN where not usable.
+    """
+    spread = noise(values)
+    mean = float(np.nanmean(values))
+    return mean / spread**2 if spread > 0 and mean > 0 else 1.0
+
+
+def noise(values: np.ndarray) -> float:
+    """Standard deviation of the noise of pixels, by the second differences along rows, which smooth pictures lack.
+
+    Args:
+        values: (views, rows, columns); NaN where not usable.
+
+    Returns:
+        > 0; 1 where there are too few pixels to tell, or no noise at all.
+    """
+    if values.shape[-1] < 3:
+        return 1.0
+    second = values[..., 2:] - 2 * values[..., 1:-1] + values[..., :-2]
+    found = np.abs(second[np.isfinite(second)])
+    deviation = float(np.median(found)) if len(found) else 0.0
+    return deviation / _MEDIAN_DEVIATION / np.sqrt(6) or 1.0
+
+
+def _binned(values: np.ndarray, factor: int) -> np.ndarray:
+    """Sums over factor x factor pixels; what fills no larger pixel is left out at the end."""
+    views, rows, columns = values.shape
+    row_factor = factor if rows >= factor else 1
+    rows, columns = rows // row_factor, max(columns // factor, 1)
+    cut = values[:, : rows * row_factor, : columns * factor]
+    return cut.reshape(views, rows, row_factor, columns, -1).sum((2, 4))
+
+
+def _flat(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values.reshape(len(values), -1), dtype=np.float32))

@@ -1,0 +1,221 @@
+"""Fit a volume to a scan: penalised likelihood by ordered subsets with momentum, and total variation.
+
+    minimise over volumes mu >= 0:   sum over rays of -log likelihood(line integral of mu)  +  beta * TV(mu)
+
+A step looks at a subset of the views. It moves each voxel by its gradient over a bound on the curvature, denoises the
+result in the metric of that bound (`denoise_total_variation`), and goes on in the direction of the last move.
+
+Source: Erdogan and Fessler 1999, Ordered subsets algorithms for transmission tomography, Phys. Med. Biol. 44; Kim,
+Ramani and Fessler 2015, Combining ordered subsets and momentum, IEEE TMI 34(1); the proximal step as in Beck and
+Teboulle 2009.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.kernels import Backend
+from nerfcli.tomography.geometry import ScanGeometry
+from nerfcli.tomography.grid import VoxelGrid
+from nerfcli.tomography.likelihood import Likelihood
+
+# About how many views a subset has: fewer make more steps of a pass, and each of them a worse likeness of all views.
+VIEWS_OF_SUBSET = 5
+# Steps of the dual of total variation per step: it goes on from where the last step left it.
+DENOISING_STEPS = 3
+# Voxels that few rays meet would move far at once; their curvature counts as this share of the median at least.
+LEAST_CURVATURE = 0.1
+# The last part of a time budget goes on without momentum, which settles what subsets disagree about.
+SETTLING = 0.25
+# A volume has settled when a pass changes it by less than this share of its own length.
+SETTLED = 3e-4
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a volume is fitted to.
+
+    Args:
+        geometry: of the views that are fitted.
+        likelihood: of their pixels.
+        grid: of the volume.
+    """
+
+    geometry: ScanGeometry
+    likelihood: Likelihood
+    grid: VoxelGrid
+
+
+@dataclass
+class Fit:
+    """A volume on its way.
+
+    Args:
+        volume: (Z, Y, X) attenuation, float32.
+        dual: (3, Z, Y, X) of its total variation.
+        passes: how many times all views have been looked at.
+        seconds: spent on it.
+        settled: whether the last pass changed it by less than `SETTLED`.
+    """
+
+    volume: Tensor
+    dual: Tensor
+    passes: int = 0
+    seconds: float = 0.0
+    settled: bool = False
+
+
+class Projector:
+    """Rays of a scan through a grid, view by view.
+
+    Args:
+        geometry: of the views.
+        grid: of the volumes.
+    """
+
+    def __init__(self, geometry: ScanGeometry, grid: VoxelGrid, backend: Backend | None = None):
+        self._geometry, self._grid = geometry, grid
+        self._backend = backend or kernels.backend_for(torch.device("cpu"), torch.float32)
+
+    def forward(self, volume: Tensor, views: np.ndarray) -> Tensor:
+        """Line integrals (len(views), pixels)."""
+        origins, directions = self._rays(views)
+        integrals = self._backend.project(volume, origins, directions, first=self._grid.first, size=self._grid.size)
+        return integrals.view(len(views), -1)
+
+    def backward(self, values: Tensor, views: np.ndarray) -> Tensor:
+        """The transpose: a volume from values (len(views), pixels)."""
+        origins, directions = self._rays(views)
+        return self._backend.back_project(
+            values.reshape(-1),
+            origins,
+            directions,
+            shape=self._grid.shape,
+            first=self._grid.first,
+            size=self._grid.size,
+        )
+
+    def _rays(self, views: np.ndarray) -> tuple[Tensor, Tensor]:
+        origins, directions = self._geometry.rays(views)
+        return torch.from_numpy(origins.reshape(-1, 3)), torch.from_numpy(directions.reshape(-1, 3))
+
+
+def start(problem: Problem) -> Fit:
+    """A volume of one value, with which line integrals have the mean that the data suggest."""
+    views = torch.arange(problem.geometry.views)
+    projector = Projector(problem.geometry, problem.grid)
+    ones = torch.ones(problem.grid.shape)
+    total, length = 0.0, 0.0
+    for view in views:
+        suggested = problem.likelihood.suggested(view[None])
+        chord = projector.forward(ones, view[None].numpy())
+        met = torch.isfinite(suggested) & (chord > 0)
+        total, length = total + float(suggested[met].sum()), length + float(chord[met].sum())
+    value = max(total / length, 0.0) if length > 0 else 0.0
+    return Fit(ones * value, torch.zeros(3, *problem.grid.shape))
+
+
+def finer(fit: Fit, grid: VoxelGrid) -> Fit:
+    """The same volume on a grid with voxels half as large, or any other over the same box, to go on there."""
+    volume = F.interpolate(fit.volume[None, None], grid.shape, mode="trilinear")[0, 0]
+    return Fit(volume, torch.zeros(3, *grid.shape), fit.passes, fit.seconds)
+
+
+def reconstruct(
+    problem: Problem,
+    fit: Fit,
+    *,
+    strength: float,
+    passes: int | None = None,
+    seconds: float | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> Fit:
+    """Go on fitting until the passes are done, the time is over, or nothing changes any more.
+
+    Args:
+        problem: what to fit to.
+        fit: where to begin.
+        strength: of total variation: beta = strength * sqrt(median over voxels of sum over rays of curvature *
+            length), so that 1 is about the noise of a voxel that no neighbour helps, whatever the scan's dose and unit.
+        passes: how many times to look at all views.
+        seconds: how long to work; at least one pass is done.
+        progress: takes the share done and a few words after every step.
+
+    Returns:
+        The fit; the one given is not changed. An interrupt is passed on as `KeyboardInterrupt`.
+    """
+    begun = time.perf_counter()
+    projector = Projector(problem.geometry, problem.grid)
+    count = problem.geometry.views
+    subsets = _subsets(count)
+    curvature, beta = _metric(problem, projector, strength)
+    threshold = beta / curvature
+    backend = kernels.backend_for(torch.device("cpu"), torch.float32)
+    volume, dual = fit.volume.clone(), fit.dual.clone()
+    ahead, inertia = volume, 1.0
+    done, settled = 0, False
+    while True:
+        before = volume
+        spent = time.perf_counter() - begun
+        settling = seconds is not None and spent > (1 - SETTLING) * seconds
+        for number, views in enumerate(subsets):
+            index = torch.from_numpy(views)
+            slope = problem.likelihood.slope(projector.forward(ahead, views), index)
+            gradient = projector.backward(slope, views) * (count / len(views))
+            target = ahead - gradient / curvature
+            if strength > 0:
+                moved = backend.denoise_total_variation(target, threshold, dual, iterations=DENOISING_STEPS)
+            else:
+                moved = target.clamp_min(0)
+            if settling:
+                ahead = moved
+            else:
+                following = (1 + (1 + 4 * inertia**2) ** 0.5) / 2
+                ahead = moved + (inertia - 1) / following * (moved - volume)
+                inertia = following
+            volume = moved
+            if progress is not None:
+                progress(
+                    _share(done + (number + 1) / len(subsets), passes, time.perf_counter() - begun, seconds),
+                    f"pass {fit.passes + done + 1}",
+                )
+        done += 1
+        settled = float((volume - before).norm()) <= SETTLED * max(float(volume.norm()), 1e-30)
+        spent = time.perf_counter() - begun
+        over = (passes is not None and done >= passes) or (seconds is not None and spent * (done + 1) / done > seconds)
+        if over or (settled and done > 1):
+            break
+    return Fit(volume, dual, fit.passes + done, fit.seconds + time.perf_counter() - begun, settled)
+
+
+def _metric(problem: Problem, projector: Projector, strength: float) -> tuple[Tensor, float]:
+    """A bound on the curvature along each voxel (Z, Y, X), and beta."""
+    ones = torch.ones(problem.grid.shape)
+    bound, diagonal = torch.zeros(problem.grid.shape), torch.zeros(problem.grid.shape)
+    for views in _subsets(problem.geometry.views):
+        curvature = problem.likelihood.curvature(torch.from_numpy(views))
+        bound += projector.backward(curvature * projector.forward(ones, views), views)
+        diagonal += projector.backward(curvature, views)
+    met = bound > 0
+    if not met.any():
+        return torch.ones_like(bound), 0.0
+    beta = strength * float((diagonal[met].median() * problem.grid.size) ** 0.5)
+    return bound.clamp_min(LEAST_CURVATURE * float(bound[met].median())), beta
+
+
+def _subsets(count: int) -> list[np.ndarray]:
+    """Views in subsets that each go all around, in an order in which neighbours are far apart."""
+    number = max(1, count // VIEWS_OF_SUBSET)
+    order = sorted(range(number), key=lambda s: int(format(s, "016b")[::-1], 2))
+    return [np.arange(s, count, number) for s in order]
+
+
+def _share(done: float, passes: int | None, spent: float, seconds: float | None) -> float:
+    shares = [done / passes if passes else 0.0, spent / seconds if seconds else 0.0]
+    return min(1.0, max(shares))

@@ -1,0 +1,177 @@
+"""A reconstruction: the volume that was fitted to a scan, and the run folder it is kept in.
+
+RUN/config.json says what was fitted, how, and what was decided; RUN/volume.npy holds the attenuation and
+RUN/marks.npy what the views cannot determine, see `marks`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+from nerfcli.sealed import read_sealed, write_sealed
+from nerfcli.tomography.grid import VoxelGrid
+from nerfcli.tomography.scan import MEASUREMENT
+
+CONFIG = "config.json"
+VOLUME = "volume.npy"
+MARKS = "marks.npy"
+
+FIELDS = ("voxels", "hash")
+
+
+@dataclass(frozen=True)
+class ReconstructionSettings:
+    """How to fit a volume to a scan.
+
+    Args:
+        budget_seconds: for everything, trials included; None for none.
+        passes: how many times to look at all views; None for no limit.
+        field: "voxels" with total variation, or "hash".
+        voxel_size: in the scan's unit; None for the size of a pixel at the object.
+        strength: of total variation; None to choose it on training views that are left out.
+        centre: columns by which the detector stands off; None to find out.
+        tilt: radians by which the detector is turned in its plane; None to find out.
+        air: whether the open beam of each view is measured in its pixels beside the object; None to find out.
+        seed: of random numbers, which only a hash field draws.
+        threads: of the CPU; 0 for all.
+
+    Raises:
+        UserError: there is neither a budget nor a number of passes, or a number makes no sense.
+    """
+
+    budget_seconds: float | None = None
+    passes: int | None = None
+    field: str = "voxels"
+    voxel_size: float | None = None
+    strength: float | None = None
+    centre: float | None = None
+    tilt: float | None = None
+    air: bool | None = None
+    seed: int = 0
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        if self.budget_seconds is None and self.passes is None:
+            raise UserError("no end of the reconstruction is given", "give --budget 2m or --steps 30")
+        if self.voxel_size is not None and not self.voxel_size > 0:
+            raise UserError(f"voxels of {self.voxel_size:g} cannot be", "give --voxel-size a length above 0")
+        if self.strength is not None and not 0 <= self.strength < float("inf"):
+            raise UserError(
+                f"total variation cannot weigh {self.strength:g}", "give a number of 0 or more, or leave it out"
+            )
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A volume and how it was made.
+
+    Args:
+        volume: (Z, Y, X) attenuation in 1 / unit, float32.
+        marks: (Z, Y, X) uint8, see `marks`.
+        grid: where its voxels stand.
+        unit: of lengths.
+        scan: the folder of the scan, as it was named.
+        scan_digest: of what was measured, see `Scan.digest`.
+        settings: as given.
+        used: strength, centre, tilt and the factors of the open beam that were used.
+        decisions: a sentence for each thing that the scan decided.
+        passes, seconds: of the fit and of everything.
+        settled: whether the last pass changed next to nothing.
+        missing_wedge_deg: directions that no ray has, see `missing_wedge_deg`.
+        versions: of programs.
+    """
+
+    volume: np.ndarray
+    marks: np.ndarray
+    grid: VoxelGrid
+    unit: str
+    scan: Path
+    scan_digest: str
+    settings: ReconstructionSettings
+    used: Mapping[str, Any] = field(default_factory=dict)
+    decisions: tuple[str, ...] = ()
+    passes: int = 0
+    seconds: float = 0.0
+    settled: bool = False
+    missing_wedge_deg: float = 0.0
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+def is_reconstruction(run: Path) -> bool:
+    """Whether a folder is a run that `save_reconstruction` wrote."""
+    try:
+        return (run / CONFIG).is_file() and read_sealed(run / CONFIG).get("measurement") == MEASUREMENT
+    except (OSError, ValueError):
+        return False
+
+
+def save_reconstruction(run: Path, result: Reconstruction) -> None:
+    """Write a run's folder; config.json comes last, and names the arrays by their digests.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    from nerfcli.tomography.scan import array_digest
+
+    digests = {}
+    for name, array in ((VOLUME, result.volume), (MARKS, result.marks)):
+        with atomic_path(run / name) as partial:
+            np.save(partial, array, allow_pickle=False)
+        digests[name] = array_digest(array)
+    write_sealed(
+        run / CONFIG,
+        {
+            "measurement": MEASUREMENT,
+            "scan": str(result.scan),
+            "scan_digest": result.scan_digest,
+            "unit": result.unit,
+            "grid": {"shape": list(result.grid.shape), "first": list(result.grid.first), "size": result.grid.size},
+            "settings": asdict(result.settings),
+            "used": dict(result.used),
+            "decisions": list(result.decisions),
+            "passes": result.passes,
+            "seconds": result.seconds,
+            "settled": result.settled,
+            "missing_wedge_deg": result.missing_wedge_deg,
+            "arrays": digests,
+            "versions": dict(result.versions),
+        },
+    )
+
+
+def load_reconstruction(run: Path) -> Reconstruction:
+    """Read what `save_reconstruction` wrote.
+
+    Raises:
+        UserError: there is none, or its files are damaged.
+    """
+    from nerfcli.tomography.scan import read_array
+
+    try:
+        content = read_sealed(run / CONFIG)
+        arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}
+        grid = content["grid"]
+        shape, first = grid["shape"], grid["first"]
+        return Reconstruction(
+            arrays[VOLUME],
+            arrays[MARKS],
+            VoxelGrid((shape[0], shape[1], shape[2]), (first[0], first[1], first[2]), grid["size"]),
+            content["unit"],
+            Path(content["scan"]),
+            content["scan_digest"],
+            ReconstructionSettings(**content["settings"]),
+            content["used"],
+            tuple(content["decisions"]),
+            content["passes"],
+            content["seconds"],
+            content["settled"],
+            content["missing_wedge_deg"],
+            content["versions"],
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{run} is no reconstruction that can be read: {error}", "train the scan again") from error

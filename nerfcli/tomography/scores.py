@@ -1,0 +1,140 @@
+"""How good a reconstruction is: held-out projections against their noise, and a true volume where there is one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.ndimage import map_coordinates
+from skimage.metrics import structural_similarity
+
+from nerfcli.errors import UserError
+from nerfcli.tomography.geometry import ScanGeometry
+from nerfcli.tomography.grid import VoxelGrid
+from nerfcli.tomography.likelihood import likelihood_of
+from nerfcli.tomography.reconstruct import Projector
+from nerfcli.tomography.scan import Scan
+
+# Layers through which SSIM is averaged along each axis.
+SSIM_LAYERS = 24
+
+
+@dataclass(frozen=True)
+class ProjectionScores:
+    """Held-out views against their predictions.
+
+    Args:
+        rms: root mean square difference of line integrals, all views as one.
+        psnr: 20 log10(peak / rms) in dB.
+        peak: the line integral that the dB refer to: the largest of the fitted views, a hundred-thousandth left out.
+        chi_square: mean squared misfit in units of the counting noise: 1 is all that can be had; below 1, noise was
+            seen that should not have been.
+        chi_square_of_view: the same for each held-out view.
+    """
+
+    rms: float
+    psnr: float
+    peak: float
+    chi_square: float
+    chi_square_of_view: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class VolumeScores:
+    """A volume against the true one, on the true one's voxels.
+
+    Args:
+        psnr: 20 log10(largest true value / rms difference) in dB.
+        ssim: mean over layers across all three axes.
+        bias: mean difference, in 1 / unit.
+    """
+
+    psnr: float
+    ssim: float
+    bias: float
+
+
+def score_projections(
+    scan: Scan, geometry: ScanGeometry, volume: torch.Tensor, grid: VoxelGrid, *, air: np.ndarray | None = None
+) -> ProjectionScores | None:
+    """Compare the projections of a volume with the held-out views; None where no view is held out.
+
+    Args:
+        scan: the measurements.
+        geometry: of all its views, corrected.
+        volume, grid: the reconstruction.
+        air: factor on the open beam of each held-out view; 1 if not given.
+    """
+    views = np.array(scan.held_out, dtype=int)
+    if len(views) == 0:
+        return None
+    every = np.arange(len(views))
+    predicted = Projector(geometry.select(views), grid).forward(volume, every)
+    likelihood = likelihood_of(scan, views)
+    measured = scan.line_integrals(views).reshape(len(views), -1)
+    if air is not None:
+        from nerfcli.tomography.likelihood import Poisson
+
+        assert isinstance(likelihood, Poisson)
+        likelihood = likelihood.scaled(torch.from_numpy(air.astype(np.float32)))
+        measured = measured + np.log(air)[:, None].astype(np.float32)
+    deviance = likelihood.deviance(predicted, torch.from_numpy(every)).numpy()
+    usable = np.isfinite(deviance) & np.isfinite(measured)
+    rms = float(np.sqrt(np.mean((predicted.numpy() - measured)[usable] ** 2)))
+    peak = float(np.nanquantile(scan.line_integrals(scan.training_views), 1 - 1e-5))
+    return ProjectionScores(
+        rms,
+        float(20 * np.log10(peak / max(rms, 1e-30))),
+        peak,
+        float(np.mean(deviance[usable])),
+        tuple(float(np.nanmean(row)) for row in deviance),
+    )
+
+
+def score_volume(volume: np.ndarray, grid: VoxelGrid, true: np.ndarray, true_grid: VoxelGrid) -> VolumeScores:
+    """Compare a volume with the true one, interpolated at the true one's voxel centres; 0 outside its grid."""
+    seen = volume if grid == true_grid else resampled(volume, grid, true_grid)
+    difference = seen.astype(np.float64) - true
+    peak = float(true.max())
+    values = [
+        structural_similarity(np.take(seen, k, axis), np.take(true, k, axis), data_range=peak)
+        for axis in range(3)
+        if min(np.take(true, 0, axis).shape) >= 7
+        for k in np.unique(np.linspace(0, true.shape[axis] - 1, SSIM_LAYERS).astype(int))
+    ]
+    psnr = 20 * np.log10(peak / max(float(np.sqrt(np.mean(difference**2))), 1e-30))
+    return VolumeScores(float(psnr), float(np.mean(values)) if values else float("nan"), float(difference.mean()))
+
+
+def resampled(volume: np.ndarray, grid: VoxelGrid, other: VoxelGrid) -> np.ndarray:
+    """A volume at the voxel centres of another grid, by trilinear interpolation; 0 outside."""
+    place = [(other.axis(name) - grid.first["xyz".index(name)]) / grid.size for name in "zyx"]
+    coordinates = np.meshgrid(*place, indexing="ij")
+    return map_coordinates(volume, coordinates, order=1, mode="constant", cval=0.0, prefilter=False)
+
+
+def read_truth(description: dict, folder: Path) -> tuple[np.ndarray, VoxelGrid]:
+    """The true volume that a scan's history names.
+
+    Args:
+        description: "file" (raw values or .npy), "shape" (z, y, x), "type" of a raw file, "scale" to 1 / unit, "first"
+            (x, y, z) and "size" of its voxels.
+        folder: that the file's name is relative to.
+
+    Raises:
+        UserError: it is not there, or has another size.
+    """
+    path = folder / description["file"]
+    try:
+        if path.suffix == ".npy":
+            values = np.load(path, allow_pickle=False)
+        else:
+            values = np.fromfile(path, dtype=np.dtype(description["type"]))
+        shape = tuple(description["shape"])
+        volume = values.reshape(shape).astype(np.float32) * np.float32(description["scale"])
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"the true volume {path} cannot be read: {error}", "put it back, or take it out of scene.json"
+        ) from error
+    first = description["first"]
+    return volume, VoxelGrid((shape[0], shape[1], shape[2]), (first[0], first[1], first[2]), description["size"])

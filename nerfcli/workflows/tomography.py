@@ -1,0 +1,425 @@
+"""From a scan to a reconstruction and its numbers: what `train`, `evaluate`, `render` and `export` do with scans."""
+
+import platform
+import time
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerfcli import __version__
+from nerfcli.atomic import clear_leftovers, read_json, write_json
+from nerfcli.errors import UserError
+from nerfcli.exclusive import exclusive
+from nerfcli.memory import default_memory_limit
+from nerfcli.runs.files import LOCK, METRICS
+from nerfcli.tomography.baselines import filtered_back_projection, sart_total_variation
+from nerfcli.tomography.calibrate import air_factors, centre_of_rotation, detector_tilt
+from nerfcli.tomography.geometry import ScanGeometry
+from nerfcli.tomography.grid import VoxelGrid, grid_of_scan
+from nerfcli.tomography.likelihood import Poisson, likelihood_of
+from nerfcli.tomography.marks import TRUNCATED, UNSEEN, marks, missing_wedge_deg
+from nerfcli.tomography.reconstruct import Fit, Problem, Projector, finer, reconstruct, start
+from nerfcli.tomography.result import (
+    Reconstruction,
+    ReconstructionSettings,
+    is_reconstruction,
+    load_reconstruction,
+    save_reconstruction,
+)
+from nerfcli.tomography.scan import Scan, load_scan
+from nerfcli.tomography.scores import read_truth, score_projections, score_volume
+from nerfcli.tomography.strength import choose_strength
+from nerfcli.workflows.machine import thread_count
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+
+# Shares of a time budget for the choice of total variation, and for the coarse start.
+STRENGTH_SHARE = 0.15
+COARSE_SHARE = 0.1
+COARSE_PASSES = 6
+# Passes where only a number of seconds ends the fit, and the other way round.
+MOST_PASSES = 200
+# Of a fit: volume, momentum, gradient, curvature, threshold and the three duals, with copies on the way.
+BYTES_OF_VOXEL = 48
+# Scatter of the open beam between views, in standard errors, from which it counts as drift.
+DRIFT = 3.0
+
+
+@dataclass(frozen=True)
+class ScanEvaluation:
+    """Numbers of a reconstruction.
+
+    Args:
+        path: RUN/metrics.json.
+        metrics: its content.
+        is_kept: whether the file was there already.
+    """
+
+    path: Path
+    metrics: dict[str, Any]
+    is_kept: bool
+
+
+def train_scan(
+    scan: str | Path,
+    run: str | Path,
+    settings: ReconstructionSettings,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    warn: Notify = warn_python,
+    progress: Progress = no_progress,
+) -> Reconstruction:
+    """Fit a volume to a scan, keep one that is there already, or refuse to touch another one.
+
+    Args:
+        scan: a folder that `nerfcli convert` wrote.
+        run: the folder to write.
+        settings: budget, field, and what is not to be left to the scan.
+        resume: go on from the volume in `run`.
+        overwrite: replace another run at `run`.
+        notify, warn: take lines for the user.
+        progress: takes the share of the budget and a few words.
+
+    Raises:
+        UserError: the scan cannot be read, or something else stands at `run`.
+        KeyboardInterrupt: passed on; the volume fitted so far has been written.
+    """
+    folder, run = Path(scan), Path(run)
+    loaded = load_scan(folder)
+    earlier = load_reconstruction(run) if is_reconstruction(run) else None
+    if earlier is not None and not overwrite:
+        same = earlier.scan_digest == loaded.digest and _wanted(earlier.settings) == _wanted(settings)
+        if same and not resume:
+            notify(f"{run} is kept: it was fitted with these settings; --overwrite fits again")
+            return earlier
+        if not (same or (resume and earlier.scan_digest == loaded.digest)):
+            raise UserError(
+                f"{run} holds another reconstruction", "name another folder with --output, or replace it by --overwrite"
+            )
+    elif run.exists() and any(run.iterdir()) and not overwrite:
+        raise UserError(f"{run} is there and holds no reconstruction", "name another folder with --output")
+    with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
+        clear_leftovers(run)
+        (run / METRICS).unlink(missing_ok=True)
+        _warn_of(loaded, warn)
+        threads = thread_count(settings.threads)
+        torch.set_num_threads(threads)
+        result = _fit(
+            loaded, folder, settings, earlier=earlier if resume else None, notify=notify, progress=progress, run=run
+        )
+        save_reconstruction(run, result)
+    for sentence in result.decisions:
+        notify(sentence)
+    return result
+
+
+def evaluate_scan(
+    run: str | Path,
+    *,
+    threads: int = 0,
+    overwrite: bool = False,
+    baselines: bool = True,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> ScanEvaluation:
+    """Write RUN/metrics.json: held-out projections, a true volume if the scan names one, and other methods beside it.
+
+    Args:
+        run: the folder that `train_scan` wrote.
+        threads: of the CPU; 0 for all.
+        overwrite: measure again.
+        baselines: whether filtered back-projection and SART with total variation are computed from the same views.
+        notify: takes lines for the user.
+        progress: takes the share done and a few words.
+
+    Raises:
+        UserError: there is no reconstruction, or its scan is no longer what it was.
+    """
+    run = Path(run)
+    torch.set_num_threads(thread_count(threads))
+    result = load_reconstruction(run)
+    path = run / METRICS
+    if path.exists() and not overwrite:
+        kept = read_json(path)
+        if kept.get("scan_digest") == result.scan_digest and kept.get("passes") == result.passes:
+            notify(f"{path} is kept; --overwrite measures again")
+            return ScanEvaluation(path, kept, True)
+    scan = scan_of(result, run)
+    geometry = corrected(scan.geometry, result)
+    truth = _truth(scan, result, run)
+    methods: dict[str, Any] = {}
+
+    def measure(name: str, volume: np.ndarray) -> None:
+        projections = score_projections(
+            scan, geometry, torch.from_numpy(np.ascontiguousarray(volume)), result.grid, air=_held_out_air(scan, result)
+        )
+        methods[name] = {
+            "projections": None if projections is None else asdict(projections),
+            "volume": None if truth is None else asdict(score_volume(volume, result.grid, *truth)),
+        }
+
+    progress(0.0, "held-out views")
+    measure("nerfcli", np.asarray(result.volume))
+    if baselines:
+        views = scan.training_views
+        integrals = scan.line_integrals(views)
+        if (factors := result.used.get("air")) is not None:
+            integrals = integrals + np.log(np.asarray(factors, dtype=np.float32))[:, None, None]
+        progress(0.3, "filtered back-projection")
+        try:
+            filtered = filtered_back_projection(geometry.select(views), integrals, result.grid)
+            measure("filtered back-projection", filtered.clamp_min(0).numpy())
+        except UserError as error:
+            notify(f"no filtered back-projection: {error.message}")
+        progress(0.5, "SART with total variation")
+        measure(
+            "SART with total variation", sart_total_variation(geometry.select(views), integrals, result.grid).numpy()
+        )
+    metrics = {
+        "measurement": "transmission",
+        "scan_digest": result.scan_digest,
+        "passes": result.passes,
+        "unit": result.unit,
+        "held_out_views": len(scan.held_out),
+        "fitted_views": len(scan.training_views),
+        "missing_wedge_deg": result.missing_wedge_deg,
+        "methods": methods,
+    }
+    write_json(path, metrics)
+    return ScanEvaluation(path, metrics, False)
+
+
+def scan_of(result: Reconstruction, run: Path) -> Scan:
+    """The scan that a reconstruction was fitted to.
+
+    Raises:
+        UserError: it is no longer there, or was changed.
+    """
+    if not result.scan.exists():
+        raise UserError(
+            f"the scan of {run} should be in {result.scan}, which is not there",
+            "call it from the folder that the run was trained from, or train again",
+        )
+    scan = load_scan(result.scan)
+    if scan.digest != result.scan_digest:
+        raise UserError(f"{result.scan} has changed since {run} was trained", "train again with --overwrite")
+    return scan
+
+
+def corrected(geometry: ScanGeometry, result: Reconstruction) -> ScanGeometry:
+    """The geometry with the centre and the tilt that a reconstruction used."""
+    return _corrected(geometry, result.used["centre"], result.used["tilt"])
+
+
+def _corrected(geometry: ScanGeometry, centre: float, tilt: float) -> ScanGeometry:
+    shifted = geometry.shifted(centre) if centre else geometry
+    return shifted.tilted(tilt) if tilt else shifted
+
+
+def _wanted(settings: ReconstructionSettings) -> ReconstructionSettings:
+    """What of settings makes another result."""
+    return replace(settings, threads=0)
+
+
+def _fit(
+    scan: Scan,
+    folder: Path,
+    settings: ReconstructionSettings,
+    *,
+    earlier: Reconstruction | None,
+    notify: Notify,
+    progress: Progress,
+    run: Path,
+) -> Reconstruction:
+    begun = time.perf_counter()
+    decisions: list[str] = []
+    views = scan.training_views
+    centre, tilt = _geometry(scan, settings, earlier, decisions, progress)
+    geometry = _corrected(scan.geometry, centre, tilt)
+    grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
+    _fits_memory(grid)
+    strength = settings.strength
+    if strength is None and earlier is not None:
+        strength = float(earlier.used["strength"])
+    if strength is None:
+        most = STRENGTH_SHARE * (settings.budget_seconds or float("inf"))
+        trial = choose_strength(scan, geometry, grid, most_seconds=most, progress=progress)
+        strength = trial.strength
+        tried = ", ".join(f"{value:g}: {deviance:.3f}" for value, deviance in trial.tried)
+        decisions.append(f"total variation {strength:g}: chi-square of left-out views {tried}")
+    likelihood = likelihood_of(scan, views)
+    factors = None
+    if earlier is not None:
+        factors = earlier.used.get("air")
+    elif settings.air is not False and isinstance(likelihood, Poisson):
+        factors = _air(scan, geometry, grid, likelihood, strength, forced=settings.air is True, decisions=decisions)
+    if factors is not None and isinstance(likelihood, Poisson):
+        likelihood = likelihood.scaled(torch.tensor(factors))
+    problem = Problem(geometry.select(views), likelihood, grid)
+
+    def left() -> float | None:
+        if settings.budget_seconds is None:
+            return None
+        return max(settings.budget_seconds - (time.perf_counter() - begun), 0.0)
+
+    if earlier is not None:
+        fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
+    else:
+        fit = _coarse_start(scan, geometry, grid, factors, strength, left())
+    passes = settings.passes if settings.passes is not None else MOST_PASSES
+    if earlier is not None and settings.passes is not None:
+        passes = max(settings.passes - earlier.passes, 1)
+    fit = reconstruct(problem, fit, strength=strength, passes=passes, seconds=left(), progress=progress)
+    found = marks(problem.geometry, grid)
+    for sentence in _told_marks(found, missing_wedge_deg(problem.geometry)):
+        decisions.append(sentence)
+    return Reconstruction(
+        fit.volume.numpy(),
+        found,
+        grid,
+        scan.unit,
+        folder,
+        scan.digest,
+        settings,
+        {"strength": strength, "centre": centre, "tilt": tilt, "air": factors},
+        tuple(decisions),
+        fit.passes,
+        time.perf_counter() - begun,
+        fit.settled,
+        missing_wedge_deg(problem.geometry),
+        {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
+    )
+
+
+def _geometry(
+    scan: Scan,
+    settings: ReconstructionSettings,
+    earlier: Reconstruction | None,
+    decisions: list[str],
+    progress: Progress,
+) -> tuple[float, float]:
+    if earlier is not None:
+        return float(earlier.used["centre"]), float(earlier.used["tilt"])
+    centre, tilt = settings.centre, settings.tilt
+    if centre is None:
+        progress(0.0, "centre of rotation")
+        found = centre_of_rotation(scan)
+        centre = found.value if found.holds else 0.0
+        if found.holds:
+            decisions.append(
+                f"centre of rotation {found.value:+.2f} columns from where the scan says: chi-square of views that were "
+                f"not fitted falls by {found.gain:.3g} ± {found.error:.2g}"
+            )
+    if tilt is None:
+        found = detector_tilt(replace(scan, geometry=scan.geometry.shifted(centre)))
+        tilt = found.value if found.holds else 0.0
+        if found.holds:
+            decisions.append(
+                f"detector turned by {np.rad2deg(found.value):+.2f} degrees in its plane: chi-square of views that were "
+                f"not fitted falls by {found.gain:.3g} ± {found.error:.2g}"
+            )
+    return centre, tilt
+
+
+def _air(
+    scan: Scan,
+    geometry: ScanGeometry,
+    grid: VoxelGrid,
+    likelihood: Poisson,
+    strength: float,
+    *,
+    forced: bool,
+    decisions: list[str],
+) -> list[float] | None:
+    """Factors on the open beam of each training view; None where they do not differ by more than their noise."""
+    views = scan.training_views
+    binning = max(1, geometry.columns // 96)
+    coarse, small = geometry.binned(binning).select(views), grid.coarser(binning)
+    binned = likelihood_of(scan, views, binning=binning)
+    assert isinstance(binned, Poisson)
+    problem = Problem(coarse, binned, small)
+    fit = reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES)
+    integrals = Projector(coarse, small).forward(fit.volume, np.arange(len(views)))
+    factors = air_factors(binned, integrals)
+    air = (integrals < 0.01) & (binned.open_beam > 0)
+    photons = torch.where(air, binned.counts, 0).sum(1)
+    error = float((1 / photons.clamp_min(1)).sqrt().median())
+    spread = float(factors.std()) if len(factors) > 1 else 0.0
+    if not forced and spread <= DRIFT * error:
+        return None
+    decisions.append(
+        f"open beam of each view from the pixels beside the object: it varies by {100 * spread:.2f} % between views, "
+        f"where noise would give {100 * error:.2f} %"
+    )
+    return [float(f) for f in factors]
+
+
+def _coarse_start(
+    scan: Scan,
+    geometry: ScanGeometry,
+    grid: VoxelGrid,
+    factors: list[float] | None,
+    strength: float,
+    seconds: float | None,
+) -> Fit:
+    """A start for the fine grid from one with voxels and pixels twice as large."""
+    views = scan.training_views
+    small = grid.coarser(2)
+    likelihood = likelihood_of(scan, views, binning=2)
+    if factors is not None and isinstance(likelihood, Poisson):
+        likelihood = likelihood.scaled(torch.tensor(factors))
+    problem = Problem(geometry.binned(2).select(views), likelihood, small)
+    limit = None if seconds is None else COARSE_SHARE * seconds
+    return finer(reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
+
+
+def _held_out_air(scan: Scan, result: Reconstruction) -> np.ndarray | None:
+    """The factor on the open beam of each held-out view, from its own pixels beside the object, as everywhere."""
+    if result.used.get("air") is None:
+        return None
+    views = np.array(scan.held_out, dtype=int)
+    likelihood = likelihood_of(scan, views)
+    assert isinstance(likelihood, Poisson)
+    geometry = corrected(scan.geometry, result).select(views)
+    integrals = Projector(geometry, result.grid).forward(
+        torch.from_numpy(np.array(result.volume)), np.arange(len(views))
+    )
+    return air_factors(likelihood, integrals).numpy()
+
+
+def _truth(scan: Scan, result: Reconstruction, run: Path) -> tuple[np.ndarray, VoxelGrid] | None:
+    description = scan.history.get("truth")
+    return None if description is None else read_truth(dict(description), result.scan)
+
+
+def _told_marks(found: np.ndarray, wedge: float) -> list[str]:
+    sentences = []
+    for mark, what in ((UNSEEN, "no view sees"), (TRUNCATED, "some views miss (values hold up to a smooth offset)")):
+        share = float(np.mean((found & mark) > 0))
+        if share > 0:
+            sentences.append(f"{100 * share:.1f} % of the voxels: {what}; they are marked")
+    if wedge > 0:
+        sentences.append(
+            f"no ray lies in a wedge of {wedge:.0f} degrees: edges along its directions are not determined"
+        )
+    return sentences
+
+
+def _fits_memory(grid: VoxelGrid) -> None:
+    needed, limit = BYTES_OF_VOXEL * grid.voxels, default_memory_limit()
+    if limit is not None and needed > limit:
+        size = " x ".join(str(count) for count in reversed(grid.shape))
+        raise UserError(
+            f"{size} voxels need {needed / 1e9:.1f} GB of memory, where {limit / 1e9:.1f} GB may be used",
+            f"take larger voxels with --voxel-size, now {grid.size:.3g}",
+        )
+
+
+def _warn_of(scan: Scan, warn: Notify) -> None:
+    if scan.kind != "line_integral" and scan.photons_per_value is None:
+        warn("nobody says how many photons a value stands for: it is told from the noise of neighbouring pixels")
