@@ -1,0 +1,115 @@
+"""What the commands do with scans by transmission: the options that make sense for them, and what is printed."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from nerfcli.cli.console import Console
+from nerfcli.errors import UserError
+
+if TYPE_CHECKING:
+    from nerfcli.tomography.result import ReconstructionSettings
+    from nerfcli.workflows.tomography import ScanEvaluation
+
+_COMPONENTS = "tv=WEIGHT, centre=COLUMNS, tilt=DEGREES, air=measured"
+
+
+def reconstruction_settings(
+    *,
+    budget_seconds: float | None,
+    passes: int | None,
+    field: str | None,
+    voxel_size: float | None,
+    include: list[str] | None,
+    exclude: list[str] | None,
+    seed: int,
+    threads: int,
+) -> "ReconstructionSettings":
+    """The settings of a reconstruction by the options of train.
+
+    Raises:
+        UserError: a component of photos is named, or a field that scans do not have.
+    """
+    from nerfcli.tomography.result import FIELDS, ReconstructionSettings
+
+    if field is not None and field not in FIELDS:
+        raise UserError(f"no {field} field for scans", f"choose {' or '.join(FIELDS)} with --field")
+    values: dict[str, float | bool | None] = {"tv": None, "centre": None, "tilt": None, "air": None}
+    for text in exclude or ():
+        values.update({_component(text, "--without"): 0.0 if text != "air" else False})
+    for text in include or ():
+        name, _, value = text.partition("=")
+        values[_component(name, "--with")] = value == "measured" if name == "air" else _number(text, value)
+    tilt = values["tilt"]
+    return ReconstructionSettings(
+        budget_seconds=budget_seconds,
+        passes=passes,
+        field=field or "voxels",
+        voxel_size=voxel_size,
+        strength=values["tv"],
+        centre=values["centre"],
+        tilt=None if tilt is None else float(tilt) * 3.141592653589793 / 180,
+        air=None if values["air"] is None else bool(values["air"]),
+        seed=seed,
+        threads=threads,
+    )
+
+
+def slices_of(texts: list[str]) -> tuple[tuple[str, float], ...]:
+    """Axes and positions of --slices.
+
+    Raises:
+        typer.BadParameter: a text is not like z=0.3.
+    """
+    found = []
+    for text in texts:
+        axis, _, value = text.partition("=")
+        try:
+            position = float(value)
+        except ValueError:
+            position = float("nan")
+        if axis not in ("x", "y", "z") or position != position:
+            raise typer.BadParameter(f"{text!r}; write x=, y= or z= and a position, as in z=0.3", param_hint="--slices")
+        found.append((axis, position))
+    return tuple(found)
+
+
+def print_scan_numbers(run: Path, evaluation: "ScanEvaluation", console: Console) -> None:
+    """Print a table of the methods; nothing of what was kept."""
+    if evaluation.is_kept:
+        return
+    metrics = evaluation.metrics
+    console.note(f"{run}: {metrics['fitted_views']} fitted views, {metrics['held_out_views']} held out")
+    rows = []
+    for name, found in metrics["methods"].items():
+        projections, volume = found["projections"], found["volume"]
+        rows.append(
+            (
+                name,
+                *(("-",) * 3 if projections is None else _projection_cells(projections)),
+                *(("-",) * 2 if volume is None else (f"{volume['psnr']:.2f}", f"{volume['ssim']:.3f}")),
+            )
+        )
+    columns = ("", "rms of line integrals", "dB", "chi-square", "volume dB", "SSIM")
+    console.table(columns, rows, styles={})
+    peaks = {found["projections"]["peak"] for found in metrics["methods"].values() if found["projections"]}
+    if peaks:
+        console.note(f"dB of projections refer to a line integral of {max(peaks):.3g}; chi-square: 1 is noise alone")
+
+
+def _projection_cells(projections: dict) -> tuple[str, str, str]:
+    return f"{projections['rms']:.4f}", f"{projections['psnr']:.2f}", f"{projections['chi_square']:.3f}"
+
+
+def _component(name: str, option: str) -> str:
+    if name not in ("tv", "centre", "tilt", "air"):
+        raise UserError(f"scans have no component {name!r} for {option}", f"choose from {_COMPONENTS}")
+    return name
+
+
+def _number(text: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError as error:
+        raise UserError(f"--with {text}: a number is missing", f"write {_COMPONENTS}") from error

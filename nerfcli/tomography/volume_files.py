@@ -1,0 +1,230 @@
+"""Volumes as files of other programs: NRRD, MetaImage, NIfTI-1, and TIFF stacks as ImageJ reads them.
+
+All are float32 (or uint8 for marks), little-endian, uncompressed, x fastest, with spacing, origin and unit. The frame is
+the one of the scan: x and y across the rotation axis, z along it.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tifffile
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+from nerfcli.tomography.grid import VoxelGrid
+
+_NIFTI_HEADER = 352
+_NIFTI_UNITS = {"m": 1, "mm": 2, "um": 3}
+_NIFTI_TYPES = {np.dtype(np.uint8): (2, 8), np.dtype(np.float32): (16, 32)}
+_WORDS = {np.dtype(np.uint8): ("uchar", "MET_UCHAR"), np.dtype(np.float32): ("float", "MET_FLOAT")}
+
+
+@dataclass(frozen=True)
+class VolumeFile:
+    """What a volume's file holds.
+
+    Args:
+        values: (Z, Y, X).
+        grid: where its voxels stand.
+        unit: of lengths; "" where the file does not say.
+        quantity: what the values are, such as "1/mm"; "" where the file does not say.
+    """
+
+    values: np.ndarray
+    grid: VoxelGrid
+    unit: str
+    quantity: str
+
+
+def write_volume(path: Path, volume: VolumeFile) -> None:
+    """Write a volume in the format of the path's suffix: .nrrd, .mha, .nii or .tif; atomic.
+
+    Args:
+        path: the file.
+        volume: float32 or uint8.
+
+    Raises:
+        UserError: the suffix is none of these, or the file cannot be written.
+        ValueError: another type of values.
+    """
+    if volume.values.dtype not in _WORDS:
+        raise ValueError(f"volumes are float32 or uint8, not {volume.values.dtype}")
+    writer = _writer(path)
+    with atomic_path(path) as partial:
+        writer(partial, volume)
+
+
+def read_volume(path: Path) -> VolumeFile:
+    """Read what `write_volume` wrote.
+
+    Raises:
+        UserError: it is missing, damaged, or of another program's making in a way that is not read here.
+    """
+    readers: dict[str, Callable[[Path], VolumeFile]] = {
+        ".nrrd": _read_nrrd,
+        ".mha": _read_mha,
+        ".nii": _read_nifti,
+        ".tif": _read_tiff,
+        ".tiff": _read_tiff,
+    }
+    try:
+        return readers[path.suffix.lower()](path)
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}", "give a volume's file") from error
+    except (KeyError, ValueError, IndexError, struct.error, tifffile.TiffFileError) as error:
+        raise UserError(
+            f"{path} is damaged, or no volume that nerfcli wrote: {error}", "export the volume again"
+        ) from error
+
+
+def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
+    writers = {".nrrd": _write_nrrd, ".mha": _write_mha, ".nii": _write_nifti, ".tif": _write_tiff, ".tiff": _write_tiff}
+    if path.suffix.lower() not in writers:
+        raise UserError(f"{path.name}: no format of volumes has this suffix", "choose .nrrd, .mha, .nii or .tif")
+    return writers[path.suffix.lower()]
+
+
+def _write_nrrd(path: Path, volume: VolumeFile) -> None:
+    z, y, x = volume.grid.shape
+    size, first = volume.grid.size, volume.grid.first
+    word = _WORDS[volume.values.dtype][0]
+    lines = [
+        "NRRD0005",
+        f"type: {word}",
+        "dimension: 3",
+        "space dimension: 3",
+        f"sizes: {x} {y} {z}",
+        f"space directions: ({size!r},0,0) (0,{size!r},0) (0,0,{size!r})",
+        "kinds: domain domain domain",
+        "endian: little",
+        "encoding: raw",
+        f"space origin: ({first[0]!r},{first[1]!r},{first[2]!r})",
+        f'space units: "{volume.unit}" "{volume.unit}" "{volume.unit}"',
+        f"quantity:={volume.quantity}",
+    ]
+    with path.open("wb") as file:
+        file.write(("\n".join(lines) + "\n\n").encode("ascii"))
+        file.write(np.ascontiguousarray(volume.values).tobytes())
+
+
+def _read_nrrd(path: Path) -> VolumeFile:
+    content = path.read_bytes()
+    if not content.startswith(b"NRRD"):
+        raise ValueError("it does not begin with NRRD")
+    head, data = content.split(b"\n\n", 1)
+    fields = {}
+    for line in head.decode("ascii").splitlines()[1:]:
+        key, _, value = line.partition(":")
+        fields[key] = value.lstrip("= ")
+    kind = {"uchar": np.dtype(np.uint8), "float": np.dtype("<f4")}[fields["type"]]
+    x, y, z = (int(n) for n in fields["sizes"].split())
+    first = tuple(float(v) for v in fields["space origin"].strip("()").split(","))
+    size = float(fields["space directions"].split(",")[0].strip("("))
+    unit = fields["space units"].split('"')[1]
+    values = np.frombuffer(data, kind).reshape(z, y, x)
+    return VolumeFile(values, VoxelGrid((z, y, x), (first[0], first[1], first[2]), size), unit, fields["quantity"])
+
+
+def _write_mha(path: Path, volume: VolumeFile) -> None:
+    z, y, x = volume.grid.shape
+    size, first = volume.grid.size, volume.grid.first
+    lines = [
+        "ObjectType = Image",
+        "NDims = 3",
+        f"Comment = unit {volume.unit or '-'} quantity {volume.quantity or '-'}",
+        "BinaryData = True",
+        "BinaryDataByteOrderMSB = False",
+        "CompressedData = False",
+        "TransformMatrix = 1 0 0 0 1 0 0 0 1",
+        f"Offset = {first[0]!r} {first[1]!r} {first[2]!r}",
+        f"ElementSpacing = {size!r} {size!r} {size!r}",
+        f"DimSize = {x} {y} {z}",
+        f"ElementType = {_WORDS[volume.values.dtype][1]}",
+        "ElementDataFile = LOCAL",
+    ]
+    with path.open("wb") as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+        file.write(np.ascontiguousarray(volume.values).tobytes())
+
+
+def _read_mha(path: Path) -> VolumeFile:
+    content = path.read_bytes()
+    end = b"ElementDataFile = LOCAL\n"
+    at = content.index(end) + len(end)
+    fields = dict(line.split(" = ", 1) for line in content[:at].decode("ascii").splitlines())
+    kind = {"MET_UCHAR": np.dtype(np.uint8), "MET_FLOAT": np.dtype("<f4")}[fields["ElementType"]]
+    x, y, z = (int(n) for n in fields["DimSize"].split())
+    first = [float(v) for v in fields["Offset"].split()]
+    _, unit, _, quantity = fields["Comment"].split(" ", 3)
+    values = np.frombuffer(content[at:], kind).reshape(z, y, x)
+    grid = VoxelGrid((z, y, x), (first[0], first[1], first[2]), float(fields["ElementSpacing"].split()[0]))
+    return VolumeFile(values, grid, unit.strip("-"), quantity.strip("-"))
+
+
+def _write_nifti(path: Path, volume: VolumeFile) -> None:
+    z, y, x = volume.grid.shape
+    size, first = volume.grid.size, volume.grid.first
+    code, bits = _NIFTI_TYPES[volume.values.dtype]
+    header = bytearray(_NIFTI_HEADER)
+    struct.pack_into("<i", header, 0, 348)
+    struct.pack_into("<8h", header, 40, 3, x, y, z, 1, 1, 1, 1)
+    struct.pack_into("<2h", header, 70, code, bits)
+    struct.pack_into("<8f", header, 76, 1, size, size, size, 0, 0, 0, 0)
+    struct.pack_into("<3f", header, 108, _NIFTI_HEADER, 1, 0)
+    struct.pack_into("<b", header, 123, _NIFTI_UNITS.get(volume.unit, 0))
+    struct.pack_into("<80s", header, 148, f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}".encode("ascii"))
+    struct.pack_into("<2h", header, 252, 0, 1)  # a scanner's frame, in the rows below
+    for row in range(3):
+        axis = [0.0] * 4
+        axis[row], axis[3] = size, first[row]
+        struct.pack_into("<4f", header, 280 + 16 * row, *axis)
+    struct.pack_into("<4s", header, 344, b"n+1\0")
+    with path.open("wb") as file:
+        file.write(bytes(header))
+        file.write(np.ascontiguousarray(volume.values).tobytes())
+
+
+def _read_nifti(path: Path) -> VolumeFile:
+    content = path.read_bytes()
+    if struct.unpack_from("<i", content, 0)[0] != 348 or content[344:347] != b"n+1":
+        raise ValueError("it has no header of NIfTI-1")
+    x, y, z = struct.unpack_from("<3h", content, 42)
+    kind = {2: np.dtype(np.uint8), 16: np.dtype("<f4")}[struct.unpack_from("<h", content, 70)[0]]
+    rows = [struct.unpack_from("<4f", content, 280 + 16 * row) for row in range(3)]
+    words = content[148:228].rstrip(b"\0").decode("ascii").split(" ", 3)
+    values = np.frombuffer(content[_NIFTI_HEADER:], kind).reshape(z, y, x)
+    grid = VoxelGrid((z, y, x), (rows[0][3], rows[1][3], rows[2][3]), rows[0][0])
+    return VolumeFile(values, grid, words[1].strip("-"), words[3].strip("-"))
+
+
+def _write_tiff(path: Path, volume: VolumeFile) -> None:
+    size, first = volume.grid.size, volume.grid.first
+    tifffile.imwrite(
+        path,
+        volume.values,
+        imagej=True,
+        resolution=(1 / size, 1 / size),
+        metadata={
+            "axes": "ZYX",
+            "spacing": size,
+            "unit": volume.unit,
+            "quantity": volume.quantity,
+            "first": f"{first[0]!r} {first[1]!r} {first[2]!r}",
+        },
+    )
+
+
+def _read_tiff(path: Path) -> VolumeFile:
+    with tifffile.TiffFile(path) as tiff:
+        found = tiff.imagej_metadata
+        if found is None:
+            raise ValueError("it has no description of ImageJ")
+        values = tiff.asarray()
+    values = values.reshape(-1, *values.shape[-2:])
+    first = [float(v) for v in str(found["first"]).split()]
+    z, y, x = values.shape
+    grid = VoxelGrid((z, y, x), (first[0], first[1], first[2]), float(found["spacing"]))
+    return VolumeFile(values, grid, str(found.get("unit", "")), str(found.get("quantity", "")))

@@ -1,0 +1,181 @@
+"""From a reconstruction to files: projections, residuals and slices to look at, volumes for other programs."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nerfcli.errors import UserError
+from nerfcli.media.images import write_png
+from nerfcli.media.preview import coloured
+from nerfcli.tomography.grid import VoxelGrid
+from nerfcli.tomography.likelihood import Likelihood, likelihood_of
+from nerfcli.tomography.marks import UNSEEN
+from nerfcli.tomography.reconstruct import Projector
+from nerfcli.tomography.result import Reconstruction, load_reconstruction
+from nerfcli.tomography.volume_files import VolumeFile, write_volume
+from nerfcli.workflows.machine import thread_count
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.tomography import corrected, scan_of
+
+OUTPUTS = ("projection", "transmission", "residual")
+FORMATS = ("nrrd", "mha", "nii", "tif")
+RENDERS = "renders"
+# Residuals are shown from so many standard deviations of the noise below to so many above.
+RESIDUAL_RANGE = 4.0
+
+
+def render_scan(
+    run: str | Path,
+    target: str | Path,
+    *,
+    outputs: tuple[str, ...] = ("projection",),
+    views: str = "test",
+    slices: tuple[tuple[str, float], ...] = (),
+    threads: int = 0,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> list[Path]:
+    """Write projections of a reconstruction, or slices through it, as float32 TIFF with a PNG to look at.
+
+    Args:
+        run: the folder that `train_scan` wrote.
+        target: the folder to write.
+        outputs: some of `OUTPUTS`: line integrals, transmissions, and (measured - predicted) in units of the noise.
+        views: "test" for the held-out ones, "train" for the fitted ones.
+        slices: axis and position in the scan's unit; if there are any, no projections are written.
+        threads: of the CPU; 0 for all.
+        overwrite: replace files that are there.
+        notify: takes lines for the user.
+        progress: takes the share done and a few words.
+
+    Returns:
+        The float files.
+
+    Raises:
+        UserError: there is no reconstruction, or a slice lies outside of it.
+    """
+    run, target = Path(run), Path(target)
+    torch.set_num_threads(thread_count(threads))
+    result = load_reconstruction(run)
+    if slices:
+        return [_write_slice(result, target, axis, at, overwrite=overwrite) for axis, at in slices]
+    scan = scan_of(result, run)
+    chosen = np.array(scan.held_out, dtype=int) if views == "test" else scan.training_views
+    if len(chosen) == 0:
+        raise UserError(f"{run} has no held-out views", "render the fitted ones with --cameras train")
+    geometry = corrected(scan.geometry, result).select(chosen)
+    projector, likelihood = Projector(geometry, result.grid), likelihood_of(scan, chosen)
+    volume = torch.from_numpy(np.array(result.volume))
+    top = float(np.nanmax(scan.line_integrals(chosen)))
+    written = []
+    for number, view in enumerate(chosen):
+        index = np.array([number])
+        integrals = projector.forward(volume, index)
+        pictures = {
+            "projection": (integrals, 0.0, top),
+            "transmission": (torch.exp(-integrals), 0.0, 1.0),
+            "residual": (_residual(likelihood, integrals, torch.from_numpy(index)), -RESIDUAL_RANGE, RESIDUAL_RANGE),
+        }
+        for name in outputs:
+            values, low, high = pictures[name]
+            path = target / name / f"{view:04d}.tif"
+            _write_picture(path, values.view(geometry.rows, geometry.columns).numpy(), low, high, overwrite=overwrite)
+            written.append(path)
+        progress((number + 1) / len(chosen), f"view {view}")
+    notify(f"{len(written)} pictures of {len(chosen)} views; line integrals up to {top:.3g}")
+    return written
+
+
+def export_scan(
+    run: str | Path, target: str | Path, *, water: float | None = None, overwrite: bool = False, notify: Notify = silent
+) -> list[Path]:
+    """Write the volume of a reconstruction as .nrrd, .mha, .nii or .tif, and its marks beside it.
+
+    Voxels that no view sees are NaN. What else the views cannot determine stands in TARGET-marks, see `marks`.
+
+    Args:
+        run: the folder that `train_scan` wrote.
+        target: the file; its suffix says the format.
+        water: attenuation of water in 1 / unit: values are Hounsfield units, 1000 (mu / water - 1).
+        overwrite: replace files that are there.
+        notify: takes lines for the user.
+
+    Raises:
+        UserError: there is no reconstruction, or a file is in the way.
+    """
+    target = Path(target)
+    result = load_reconstruction(Path(run))
+    marks = np.asarray(result.marks)
+    values = np.where(marks & UNSEEN, np.float32(np.nan), result.volume).astype(np.float32)
+    quantity = f"1/{result.unit}"
+    if water is not None:
+        values, quantity = (1000 * (values / np.float32(water) - 1)).astype(np.float32), "HU"
+    beside = target.with_name(f"{target.stem}-marks{target.suffix}")
+    for path in (target, beside):
+        _refuse_existing(path, overwrite=overwrite)
+    write_volume(target, VolumeFile(values, result.grid, result.unit, quantity))
+    written = [target]
+    if marks.any():
+        quantity = "marks: 1 no view, 2 some views, 4 missing wedge"
+        write_volume(beside, VolumeFile(marks, result.grid, result.unit, quantity))
+        written.append(beside)
+        notify(f"{100 * float((marks > 0).mean()):.0f} % of the voxels are marked in {beside.name}")
+    return written
+
+
+def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
+    """A slice across an axis at a position in the scan's unit, between layers by linear interpolation; NaN if unseen.
+
+    Raises:
+        UserError: it lies outside the volume.
+    """
+    grid: VoxelGrid = result.grid
+    positions = grid.axis(axis)
+    half = grid.size / 2
+    if not positions[0] - half <= at <= positions[-1] + half:
+        raise UserError(
+            f"no slice at {axis}={at:g}: the volume goes from {positions[0]:.4g} to {positions[-1]:.4g} {result.unit}",
+            "choose a position in between",
+        )
+    place = float(np.clip((at - positions[0]) / grid.size, 0, len(positions) - 1))
+    low = min(int(place), max(len(positions) - 2, 0))
+    high = min(low + 1, len(positions) - 1)
+    number = "zyx".index(axis)
+    layers = [
+        np.where(np.take(result.marks, k, number) & UNSEEN, np.nan, np.take(result.volume, k, number)) for k in (low, high)
+    ]
+    share = place - low
+    return ((1 - share) * layers[0] + share * layers[1]).astype(np.float32) if share else layers[0].astype(np.float32)
+
+
+def _residual(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Tensor) -> torch.Tensor:
+    """Measured minus predicted line integrals in units of their noise."""
+    # The likelihood rises with a line integral where more was measured than predicted, so its negative falls there.
+    return -torch.sign(likelihood.slope(integrals, views)) * likelihood.deviance(integrals, views).sqrt()
+
+
+def _write_slice(result: Reconstruction, target: Path, axis: str, at: float, *, overwrite: bool) -> Path:
+    values = slice_of(result, axis, at)
+    path = target / f"{axis}={at:g}.tif"
+    top = float(np.nanquantile(np.asarray(result.volume), 0.999))
+    # Rows go down on screens, and up along the second axis.
+    _write_picture(path, values[::-1].copy(), 0.0, top, overwrite=overwrite)
+    return path
+
+
+def _write_picture(path: Path, values: np.ndarray, low: float, high: float, *, overwrite: bool) -> None:
+    import tifffile
+
+    from nerfcli.atomic import atomic_path
+
+    _refuse_existing(path, overwrite=overwrite)
+    with atomic_path(path) as partial:
+        tifffile.imwrite(partial, values.astype(np.float32), photometric="minisblack", compression="zlib")
+    write_png(path.with_suffix(".png"), coloured(values, lo=low, hi=high, colour_map="grey"))
+
+
+def _refuse_existing(path: Path, *, overwrite: bool) -> None:
+    if path.exists() and not overwrite:
+        raise UserError(f"{path} is there already", "name another place with --output, or replace it by --overwrite")
