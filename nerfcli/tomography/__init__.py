@@ -1,1 +1,1 @@
-"""Transmission tomography: scans measured by I = I0 exp(-line integral of the attenuation), and volumes fitted to them."""
+"""Transmission tomography: scans measured by I = I0 exp(-line integral), and volumes fitted to them."""

@@ -6,8 +6,8 @@ programs that do this for a living.
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from nerfcli import kernels
 from nerfcli.errors import UserError
@@ -79,7 +79,7 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
             dim=-1,
         )
         picture = filtered[view][None, None]
-        seen = F.grid_sample(
+        seen = grid_sample(
             picture, place.reshape(1, -1, 1, 2).float(), mode="bilinear", padding_mode="zeros", align_corners=False
         )
         volume += seen.view(grid.shape) / depth.square().float()
@@ -124,7 +124,7 @@ def sart_total_variation(
 
 
 def _ramp(projections: np.ndarray, width: float) -> np.ndarray:
-    """Projections filtered along their rows by the ramp, sampled in space. Source: Kak and Slaney 1988, equation 3.61."""
+    """Projections filtered along their rows by the ramp, sampled in space (Kak and Slaney 1988, equation 3.61)."""
     count = projections.shape[-1]
     length = 1 << int(np.ceil(np.log2(2 * count)))
     place = np.arange(length) - length // 2
@@ -148,6 +148,6 @@ def _check_circle(geometry: ScanGeometry, outward: np.ndarray) -> None:
     upright = np.abs(down[:, :2]).max() < _CIRCULAR
     if not (circular and upright):
         raise UserError(
-            "filtered back-projection needs a source on a circle around z and an upright detector, which this scan lacks",
+            "filtered back-projection needs a source on a circle around z and an upright detector",
             "compare with SART instead",
         )

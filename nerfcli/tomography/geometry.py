@@ -146,7 +146,7 @@ class ScanGeometry:
             hit = points + length[:, None] * direction - centre
         steps = np.stack([self.column_step[view], self.row_step[view]], axis=1)  # (3, 2)
         pixel = hit @ np.linalg.pinv(steps).T
-        return pixel + [(self.columns - 1) / 2, (self.rows - 1) / 2]
+        return pixel + np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
 
     @property
     def magnification(self) -> np.ndarray:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from nerfcli import kernels
 from nerfcli.kernels import Backend
@@ -123,7 +123,7 @@ def start(problem: Problem) -> Fit:
 
 def finer(fit: Fit, grid: VoxelGrid) -> Fit:
     """The same volume on a grid with voxels half as large, or any other over the same box, to go on there."""
-    volume = F.interpolate(fit.volume[None, None], grid.shape, mode="trilinear")[0, 0]
+    volume = interpolate(fit.volume[None, None], grid.shape, mode="trilinear")[0, 0]
     return Fit(volume, torch.zeros(3, *grid.shape), fit.passes, fit.seconds)
 
 

@@ -20,8 +20,8 @@ STRENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0)
 # Every how many training views one is left out of the trial.
 LEFT_OUT_EVERY = 5
 TRIAL_PASSES = 12
-# Rows of the detector that a trial looks at. Pixels and voxels keep their size: larger ones would be wrong in other ways
-# than by noise, and ask for another weight.
+# Rows of the detector that a trial looks at. Pixels and voxels keep their size: larger ones are wrong by more than noise,
+# and ask for another weight.
 TRIAL_ROWS = 12
 
 

@@ -1,7 +1,7 @@
 """Volumes as files of other programs: NRRD, MetaImage, NIfTI-1, and TIFF stacks as ImageJ reads them.
 
-All are float32 (or uint8 for marks), little-endian, uncompressed, x fastest, with spacing, origin and unit. The frame is
-the one of the scan: x and y across the rotation axis, z along it.
+All are float32 (or uint8 for marks), little-endian, uncompressed, x fastest, with spacing, origin and unit. The frame
+is the one of the scan: x and y across the rotation axis, z along it.
 """
 
 import struct
@@ -81,7 +81,13 @@ def read_volume(path: Path) -> VolumeFile:
 
 
 def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
-    writers = {".nrrd": _write_nrrd, ".mha": _write_mha, ".nii": _write_nifti, ".tif": _write_tiff, ".tiff": _write_tiff}
+    writers = {
+        ".nrrd": _write_nrrd,
+        ".mha": _write_mha,
+        ".nii": _write_nifti,
+        ".tif": _write_tiff,
+        ".tiff": _write_tiff,
+    }
     if path.suffix.lower() not in writers:
         raise UserError(f"{path.name}: no format of volumes has this suffix", "choose .nrrd, .mha, .nii or .tif")
     return writers[path.suffix.lower()]
@@ -175,7 +181,9 @@ def _write_nifti(path: Path, volume: VolumeFile) -> None:
     struct.pack_into("<8f", header, 76, 1, size, size, size, 0, 0, 0, 0)
     struct.pack_into("<3f", header, 108, _NIFTI_HEADER, 1, 0)
     struct.pack_into("<b", header, 123, _NIFTI_UNITS.get(volume.unit, 0))
-    struct.pack_into("<80s", header, 148, f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}".encode("ascii"))
+    struct.pack_into(
+        "<80s", header, 148, f"unit {volume.unit or '-'} quantity {volume.quantity or '-'}".encode("ascii")
+    )
     struct.pack_into("<2h", header, 252, 0, 1)  # a scanner's frame, in the rows below
     for row in range(3):
         axis = [0.0] * 4

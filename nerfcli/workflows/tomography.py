@@ -312,16 +312,16 @@ def _geometry(
         centre = found.value if found.holds else 0.0
         if found.holds:
             decisions.append(
-                f"centre of rotation {found.value:+.2f} columns from where the scan says: chi-square of views that were "
-                f"not fitted falls by {found.gain:.3g} ± {found.error:.2g}"
+                f"centre of rotation {found.value:+.2f} columns from where the scan says: chi-square of views that "
+                f"were not fitted falls by {found.gain:.3g} ± {found.error:.2g}"
             )
     if tilt is None:
         found = detector_tilt(replace(scan, geometry=scan.geometry.shifted(centre)))
         tilt = found.value if found.holds else 0.0
         if found.holds:
             decisions.append(
-                f"detector turned by {np.rad2deg(found.value):+.2f} degrees in its plane: chi-square of views that were "
-                f"not fitted falls by {found.gain:.3g} ± {found.error:.2g}"
+                f"detector turned by {np.rad2deg(found.value):+.2f} degrees in its plane: chi-square of views that "
+                f"were not fitted falls by {found.gain:.3g} ± {found.error:.2g}"
             )
     return centre, tilt
 

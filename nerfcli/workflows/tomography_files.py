@@ -144,7 +144,8 @@ def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
     high = min(low + 1, len(positions) - 1)
     number = "zyx".index(axis)
     layers = [
-        np.where(np.take(result.marks, k, number) & UNSEEN, np.nan, np.take(result.volume, k, number)) for k in (low, high)
+        np.where(np.take(result.marks, k, number) & UNSEEN, np.nan, np.take(result.volume, k, number))
+        for k in (low, high)
     ]
     share = place - low
     return ((1 - share) * layers[0] + share * layers[1]).astype(np.float32) if share else layers[0].astype(np.float32)

@@ -1,4 +1,4 @@
-"""Denoising of a volume by its total variation, on CPU threads. Same operation as `reference.denoise_total_variation`."""
+"""Denoising of a volume by its total variation, on CPU threads; as `reference.denoise_total_variation`."""
 
 from typing import Any
 
