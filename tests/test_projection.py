@@ -63,7 +63,7 @@ def test_error_of_a_smooth_ball_falls_with_the_square_of_the_voxel(beam: str) ->
             rows=1 if beam == "fan" else 8, columns=12,
         )  # fmt: skip
     origins, directions = (torch.from_numpy(x.reshape(-1, 3)) for x in geometry.rays())
-    width, centre = 1.0, torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+    width, centre = 1.5, torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
     apart = torch.linalg.cross(origins - centre, directions).norm(dim=1)
     expected = (2 * torch.pi) ** 0.5 * width * torch.exp(-(apart**2) / (2 * width**2))
     errors = []
@@ -75,7 +75,7 @@ def test_error_of_a_smooth_ball_falls_with_the_square_of_the_voxel(beam: str) ->
         found = reference.project(volume, origins, directions, first=grid.first, size=grid.size)
         errors.append(float((found - expected).square().mean().sqrt()))
     assert errors[1] < 1e-2
-    assert 3.5 < errors[0] / errors[1] < 4.5
+    assert 3.5 < errors[0] / errors[1] < 5
 
 
 def test_solid_ball_has_its_chord(generator: torch.Generator) -> None:

@@ -51,6 +51,9 @@ def evaluate(
     which stages have used held-out photos. With several runs of one scene, or with --seeds, also prints mean and spread
     over the runs.
 
+    Of a reconstruction from a scan: held-out projections (rms, dB, chi-square against the counting noise), the true
+    volume where the scan names one, and filtered back-projection and SART from the same views beside it.
+
     \b
     Examples:
       nerfcli evaluate photos-scene-run
@@ -62,6 +65,7 @@ def evaluate(
     """
     from nerfcli.evaluate.predictions import KINDS
     from nerfcli.runs.run import Run
+    from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run
 
     one_of(align, ("pose",), "--align")
@@ -76,6 +80,15 @@ def evaluate(
     console = Console(quiet=quiet, json_lines=json)
     requirements = requirements_of(require)
     cores, torch_device = thread_count(threads), device_name(device)
+
+    def measure_scan(folder: Path) -> None:
+        from nerfcli.cli.scans import print_scan_numbers
+        from nerfcli.workflows.tomography import evaluate_scan
+
+        with console.progress("evaluate") as update:
+            scan = evaluate_scan(folder, threads=cores, overwrite=overwrite, notify=console.note, progress=update)
+        print_scan_numbers(folder, scan, console)
+        console.result(scan.path, scan.metrics)
 
     def measure(folder: Path) -> dict[str, Any]:
         with console.progress("evaluate") as update:
@@ -94,6 +107,9 @@ def evaluate(
         return evaluation.metrics
 
     def work(folder: Path, one_of_many: bool) -> None:
+        if is_reconstruction(folder):
+            measure_scan(folder)
+            return
         check_requirements(Run(folder), measure(folder), requirements)
 
     if seeds == 1 and len(runs) == 1:

@@ -51,7 +51,14 @@ Strict = Annotated[
     bool,
     typer.Option("--strict", help="Estimate poses from training photos only; locate held-out photos afterwards."),
 ]
-FieldKind = Annotated[str, typer.Option("--field", help="Type of field: hash, voxels or mlp.")]
+FieldKind = Annotated[
+    str | None,
+    typer.Option("--field", help="Type of field: hash, voxels or mlp.  [default: hash, voxels for scans]"),
+]
+VoxelSize = Annotated[
+    float | None,
+    typer.Option(help="Side of a voxel, in the unit of the scan; scans only.  [default: a pixel where the object is]"),
+]
 FieldMemory = Annotated[
     str | None,
     typer.Option(help="Approximate size of the parameters: 4MB, 64MB.  [default: hash 8MiB, voxels 64MiB, mlp 256KiB]"),

@@ -35,6 +35,7 @@ from nerfcli.cli.render_options import (
     tolerance_of,
     video_settings,
 )
+from nerfcli.cli.scans import is_of_scan, scan_pictures
 
 DEFAULT_FPS = 24.0
 
@@ -53,7 +54,17 @@ def render(
         Path | None,
         typer.Option(help="dataparser_transforms.json of the nerfstudio run whose coordinates --cameras FILE uses."),
     ] = None,
-    outputs: Annotated[str, typer.Option(help="Any of rgb,depth,opacity,spread,disagreement.")] = "rgb,depth,opacity",
+    outputs: Annotated[
+        str | None,
+        typer.Option(
+            help="Any of rgb,depth,opacity,spread,disagreement; for scans projection,transmission,residual.  "
+            "[default: rgb,depth,opacity; projection]"
+        ),
+    ] = None,
+    slices: Annotated[
+        list[str] | None,
+        typer.Option(help="Scans: slices through the volume, z=0.3, in the unit of the scan. Repeatable."),
+    ] = None,
     depth: Annotated[
         str,
         typer.Option(help="Definition of depth: conditional, moment, background, max-weight, median or quantile:0.05."),
@@ -175,6 +186,8 @@ def render(
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
       nerfcli render photos-scene-run --cameras orbit --lens equirectangular --width 2048 --video
       nerfcli render photos-scene-run --cameras test --width 1920 --height 1080 --crop 480,270,960,540
+      nerfcli render tooth-scene-run --outputs projection,residual
+      nerfcli render tooth-scene-run --slices z=0 --slices x=12.5
     """
     from nerfcli.export.settings import OUTPUTS, ExportSettings
     from nerfcli.media.colour_maps import COLOUR_MAPS
@@ -184,7 +197,26 @@ def render(
     from nerfcli.workflows.render import RENDERS, folder_name, render_run
     from nerfcli.workflows.views import Views, chosen_frames, file_fps, write_frames
 
-    chosen = some_of(outputs, OUTPUTS, "--outputs")
+    console = Console(quiet=quiet, json_lines=json)
+    if is_of_scan(run, outputs=outputs, slices=slices):
+        pictures = scan_pictures(outputs, slices, views=cameras)
+
+        def render_scan_of(folder: Path, one_of_many: bool) -> None:
+            target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
+            with console.progress("render") as update:
+                for path in pictures(
+                    folder,
+                    target,
+                    threads=thread_count(threads),
+                    overwrite=overwrite,
+                    notify=console.note,
+                    progress=update,
+                ):
+                    console.result(path)
+
+        for_each_input(run, render_scan_of)
+        return
+    chosen = some_of(outputs or "rgb,depth,opacity", OUTPUTS, "--outputs")
     if not is_convention(depth):
         known = f"{', '.join(CONVENTIONS)} or quantile:Q with 0 < Q < 1"
         raise typer.BadParameter(f"{depth!r}; choose {known}", param_hint="--depth")
@@ -194,7 +226,6 @@ def render(
     finite(background_distance, "--background-distance")
     finite(min_opacity, "--min-opacity")
     finite(step, "--step")
-    console = Console(quiet=quiet, json_lines=json)
     request = DepthRequest(
         convention=depth,
         axis=depth_axis or ("ray" if lens == "equirectangular" else "z"),

@@ -1,11 +1,16 @@
 """What the commands do with scans by transmission: the options that make sense for them, and what is printed."""
 
+import functools
+import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
+from nerfcli.cli.batch import STDIN
 from nerfcli.cli.console import Console
+from nerfcli.cli.options import one_of, some_of
 from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
@@ -23,7 +28,6 @@ def reconstruction_settings(
     voxel_size: float | None,
     include: list[str] | None,
     exclude: list[str] | None,
-    seed: int,
     threads: int,
 ) -> "ReconstructionSettings":
     """The settings of a reconstruction by the options of train.
@@ -49,9 +53,8 @@ def reconstruction_settings(
         voxel_size=voxel_size,
         strength=values["tv"],
         centre=values["centre"],
-        tilt=None if tilt is None else float(tilt) * 3.141592653589793 / 180,
+        tilt=None if tilt is None else math.radians(tilt),
         air=None if values["air"] is None else bool(values["air"]),
-        seed=seed,
         threads=threads,
     )
 
@@ -73,6 +76,29 @@ def slices_of(texts: list[str]) -> tuple[tuple[str, float], ...]:
             raise typer.BadParameter(f"{text!r}; write x=, y= or z= and a position, as in z=0.3", param_hint="--slices")
         found.append((axis, position))
     return tuple(found)
+
+
+def is_of_scan(run: str, *, outputs: str | None, slices: list[str] | None) -> bool:
+    """Whether the options of render, or the only run it gets, are those of a scan."""
+    from nerfcli.tomography.result import is_reconstruction
+    from nerfcli.workflows.tomography_files import OUTPUTS
+
+    if slices or (outputs is not None and set(outputs.split(",")) & set(OUTPUTS)):
+        return True
+    return run != STDIN and is_reconstruction(Path(run))
+
+
+def scan_pictures(outputs: str | None, slices: list[str] | None, *, views: str) -> "Callable[..., list[Path]]":
+    """The rendering that the options of render ask for; takes the run, the target and how to report.
+
+    Raises:
+        typer.BadParameter: the options do not fit scans.
+    """
+    from nerfcli.workflows.tomography_files import OUTPUTS, render_scan
+
+    chosen = some_of(outputs or "projection", OUTPUTS, "--outputs")
+    one_of(views, ("test", "train"), "--cameras")
+    return functools.partial(render_scan, outputs=chosen, views=views, slices=slices_of(slices or []))
 
 
 def print_scan_numbers(run: Path, evaluation: "ScanEvaluation", console: Console) -> None:

@@ -1,11 +1,12 @@
 """nerfcli train: from a scene to a field."""
 
+import functools
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from nerfcli.cli.batch import for_each_input, result_path
+from nerfcli.cli.batch import STDIN, for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Contraction,
@@ -24,6 +25,7 @@ from nerfcli.cli.options import (
     Quiet,
     Seed,
     Threads,
+    VoxelSize,
     bytes_from_text,
     contraction_name,
     device_name,
@@ -52,8 +54,9 @@ def train(
     ] = None,
     include: Include = None,
     exclude: Exclude = None,
-    field: FieldKind = "hash",
+    field: FieldKind = None,
     field_memory: FieldMemory = None,
+    voxel_size: VoxelSize = None,
     model: ModelChoice = "auto",
     downscale: Downscale = "auto",
     contraction: Contraction = "auto",
@@ -104,6 +107,11 @@ def train(
     voxels (a dense grid of density and spherical harmonics), mlp (one network on Fourier features: small and slow).
     The resolution of the last two is one pixel's footprint at the centre of the scene.
 
+    A scan by transmission (X-rays), as `nerfcli convert` writes it, is reconstructed as a volume: Poisson likelihood
+    and total variation on voxels of --voxel-size. Its components are tv (the weight of total variation), centre
+    (columns between the centre of rotation and where the scan says), tilt (degrees of the detector in its plane) and
+    air (measured: the brightness of each view from pixels beside the object); the scan decides on all four.
+
     \b
     Examples:
       nerfcli train photos-scene --budget 90s
@@ -114,44 +122,73 @@ def train(
       nerfcli train photos-scene --without view --with distortion=0.01
       nerfcli train photos-scene --with cameras=poses
       nerfcli train photos-scene --field voxels --field-memory 16MB
+      nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
     from nerfcli.runs.components import Components, choose
     from nerfcli.runs.settings import TrainSettings
+    from nerfcli.tomography.scan import is_scan
     from nerfcli.workflows.train import train_scene
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
     console = Console(quiet=quiet, json_lines=json)
-    settings = TrainSettings(
-        budget_seconds=None if budget is None else seconds_from_text(budget),
-        steps=steps,
-        downscale=downscale_factor(downscale),
-        contraction=contraction_name(contraction),
-        seed=seed,
-        device=device_name(device),
-        threads=thread_count(threads),
-        components=choose(Components(), included=include or (), excluded=exclude or ()),
-        model=model_name(model),
-        fixed=named_components(include, exclude),
-        first_samples_per_step=min(TrainSettings.first_samples_per_step, batch),
-        samples_per_step=batch,
-        levels=levels,
-        log2_rows=log2_rows,
-        width=width,
-        field=field_kind(field),
-        field_memory_bytes=None if field_memory is None else bytes_from_text(field_memory, "--field-memory"),
-    )
+    budget_seconds = None if budget is None else seconds_from_text(budget)
     rule = holdout_rule(holdout)
-
     limit = memory_limit(memory)
 
-    def work(folder: Path, one_of_many: bool) -> None:
-        run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
+    def train_one_scan(folder: Path, run: Path) -> None:
+        from nerfcli.cli.scans import reconstruction_settings
+        from nerfcli.workflows.tomography import train_scan
+
+        settings = reconstruction_settings(
+            budget_seconds=budget_seconds,
+            passes=steps,
+            field=field,
+            voxel_size=voxel_size,
+            include=include,
+            exclude=exclude,
+            threads=thread_count(threads),
+        )
+        with console.progress(f"train {folder.name}") as update:
+            train_scan(
+                folder,
+                run,
+                settings,
+                resume=resume,
+                overwrite=overwrite,
+                notify=console.note,
+                warn=console.warn,
+                progress=update,
+            )
+
+    @functools.cache
+    def photo_settings() -> TrainSettings:
+        return TrainSettings(
+            budget_seconds=budget_seconds,
+            steps=steps,
+            downscale=downscale_factor(downscale),
+            contraction=contraction_name(contraction),
+            seed=seed,
+            device=device_name(device),
+            threads=thread_count(threads),
+            components=choose(Components(), included=include or (), excluded=exclude or ()),
+            model=model_name(model),
+            fixed=named_components(include, exclude),
+            first_samples_per_step=min(TrainSettings.first_samples_per_step, batch),
+            samples_per_step=batch,
+            levels=levels,
+            log2_rows=log2_rows,
+            width=width,
+            field=field_kind(field or "hash"),
+            field_memory_bytes=None if field_memory is None else bytes_from_text(field_memory, "--field-memory"),
+        )
+
+    def train_one_scene(folder: Path, run: Path) -> None:
         with console.progress(f"train {folder.name}") as update:
             train_scene(
                 folder,
                 run,
-                settings,
+                photo_settings(),
                 memory_bytes=limit,
                 resume=resume,
                 overwrite=overwrite,
@@ -160,6 +197,15 @@ def train(
                 warn=console.warn,
                 progress=update,
             )
+
+    def work(folder: Path, one_of_many: bool) -> None:
+        run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
+        if is_scan(folder):
+            train_one_scan(folder, run)
+        else:
+            train_one_scene(folder, run)
         console.result(run)
 
+    if scene == STDIN or not is_scan(Path(scene)):
+        photo_settings()  # a wrong option is refused before anything is read
     for_each_input(scene, work)

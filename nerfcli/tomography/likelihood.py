@@ -3,11 +3,12 @@
 No logarithm of data is taken where there are counts: with few photons it is biased, and of none it does not exist.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import torch
+from scipy.optimize import brentq
 from torch import Tensor
 
 from nerfcli.tomography.scan import Scan
@@ -38,35 +39,44 @@ class Likelihood(Protocol):
 
 @dataclass(frozen=True)
 class Poisson:
-    """Counts of photons: N ~ Poisson(O exp(-p) + B).
+    """Counts of photons: N ~ Poisson(O exp(-p) + B), for a model whose line integrals p are themselves a little off.
+
+    Voxels cannot follow sharp edges, and no scanner is what its description says. A line integral that is off by some
+    `model_error` k moves the expected signal S by k S, so that counts scatter with the variance E + k^2 S^2: bright
+    rays weigh no more than the model deserves. Slopes, curvatures and deviances are those of the Poisson likelihood
+    over 1 + k^2 S^2 / E (a quasi-likelihood).
 
     Args:
         counts, open_beam, background: (views, pixels) photons N, O and B; O is 0 for pixels that are not usable.
+        model_error: k >= 0, a standard deviation of line integrals.
+
+    Source: Wedderburn 1974, Quasi-likelihood functions, Biometrika 61(3).
     """
 
     counts: Tensor
     open_beam: Tensor
     background: Tensor
+    model_error: float = 0.0
 
     def slope(self, integrals: Tensor, views: Tensor) -> Tensor:
         """-O exp(-p) (1 - N / (O exp(-p) + B)). Source: Erdogan and Fessler 1999, equation 5, with its sign changed."""
         signal = self.open_beam[views] * torch.exp(-integrals)
-        if not self.background.any():
-            return self.counts[views] - signal
         expected = signal + self.background[views]
-        return torch.where(expected > 0, signal * (self.counts[views] / expected - 1), 0)
+        inflation = 1 + self.model_error**2 * signal * signal / expected
+        return torch.where(signal > 0, signal * (self.counts[views] / expected - 1) / inflation, 0)
 
     def curvature(self, views: Tensor) -> Tensor:
         """(N - B)^2 / N, at least of one photon. Source: as for `slope`, equation 17, precomputed curvatures."""
         signal = (self.counts[views] - self.background[views]).clamp_min(1)
-        curvature = signal.square() / self.counts[views].clamp_min(1)
-        return torch.where(self.open_beam[views] > 0, torch.minimum(curvature, signal), 0)
+        curvature = torch.minimum(signal.square() / self.counts[views].clamp_min(1), signal)
+        return torch.where(self.open_beam[views] > 0, curvature / (1 + self.model_error**2 * curvature), 0)
 
     def deviance(self, integrals: Tensor, views: Tensor) -> Tensor:
-        """Pearson's: (N - E)^2 / E with the expected count E, whose mean is 1 whatever the count."""
-        expected = self.open_beam[views] * torch.exp(-integrals) + self.background[views]
-        usable = self.open_beam[views] > 0
-        return torch.where(usable, (self.counts[views] - expected).square() / expected, torch.nan)
+        """Pearson's: (N - E)^2 over its variance E + k^2 S^2, whose mean is 1 whatever the count."""
+        signal = self.open_beam[views] * torch.exp(-integrals)
+        expected = signal + self.background[views]
+        variance = expected + self.model_error**2 * signal * signal
+        return torch.where(signal > 0, (self.counts[views] - expected).square() / variance, torch.nan)
 
     def suggested(self, views: Tensor) -> Tensor:
         signal = (self.counts[views] - self.background[views]).clamp_min(0.5)
@@ -74,7 +84,22 @@ class Poisson:
 
     def scaled(self, factors: Tensor) -> "Poisson":
         """The same counts behind an open beam that is multiplied by a factor per view (views,)."""
-        return Poisson(self.counts, self.open_beam * factors[:, None], self.background)
+        return replace(self, open_beam=self.open_beam * factors[:, None])
+
+    def with_model_error(self, error: float) -> "Poisson":
+        """The same counts for a model whose line integrals are off by about so much."""
+        return replace(self, model_error=error)
+
+    def found_model_error(self, integrals: Tensor, views: Tensor) -> float:
+        """The model error with which the mean deviance of predicted line integrals is 1; 0 where it is less already."""
+        low, high = 0.0, 1.0
+
+        def excess(error: float) -> float:
+            return float(torch.nanmean(self.with_model_error(error).deviance(integrals, views))) - 1
+
+        if excess(low) <= 0:
+            return 0.0
+        return high if excess(high) > 0 else float(brentq(excess, low, high, xtol=1e-5))
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,6 @@ class ReconstructionSettings:
         centre: columns by which the detector stands off; None to find out.
         tilt: radians by which the detector is turned in its plane; None to find out.
         air: whether the open beam of each view is measured in its pixels beside the object; None to find out.
-        seed: of random numbers, which only a hash field draws.
         threads: of the CPU; 0 for all.
 
     Raises:
@@ -52,7 +51,6 @@ class ReconstructionSettings:
     centre: float | None = None
     tilt: float | None = None
     air: bool | None = None
-    seed: int = 0
     threads: int = 0
 
     def __post_init__(self) -> None:

@@ -243,15 +243,19 @@ def _fit(
     geometry = _corrected(scan.geometry, centre, tilt)
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
     _fits_memory(grid)
-    strength = settings.strength
-    if strength is None and earlier is not None:
-        strength = float(earlier.used["strength"])
-    if strength is None:
+    if earlier is not None:
+        strength, model_error = float(earlier.used["strength"]), float(earlier.used["model_error"])
+    else:
         most = STRENGTH_SHARE * (settings.budget_seconds or float("inf"))
         trial = choose_strength(scan, geometry, grid, most_seconds=most, progress=progress)
-        strength = trial.strength
-        tried = ", ".join(f"{value:g}: {deviance:.3f}" for value, deviance in trial.tried)
-        decisions.append(f"total variation {strength:g}: chi-square of left-out views {tried}")
+        strength, model_error = trial.strength, trial.model_error
+        if settings.strength is None:
+            tried = ", ".join(f"{value:g}: {deviance:.3f}" for value, deviance in sorted(trial.tried))
+            decisions.append(f"total variation {strength:g}: chi-square of views that were not fitted {tried}")
+        else:
+            strength = settings.strength
+        if model_error > 0:
+            decisions.append(f"line integrals of the model are off by {model_error:.2g} beside the noise of photons")
     likelihood = likelihood_of(scan, views)
     factors = None
     if earlier is not None:
@@ -260,6 +264,8 @@ def _fit(
         factors = _air(scan, geometry, grid, likelihood, strength, forced=settings.air is True, decisions=decisions)
     if factors is not None and isinstance(likelihood, Poisson):
         likelihood = likelihood.scaled(torch.tensor(factors))
+    if isinstance(likelihood, Poisson):
+        likelihood = likelihood.with_model_error(model_error)
     problem = Problem(geometry.select(views), likelihood, grid)
 
     def left() -> float | None:
@@ -270,7 +276,7 @@ def _fit(
     if earlier is not None:
         fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
     else:
-        fit = _coarse_start(scan, geometry, grid, factors, strength, left())
+        fit = _coarse_start(scan, geometry, grid, factors, (strength, model_error), left())
     passes = settings.passes if settings.passes is not None else MOST_PASSES
     if earlier is not None and settings.passes is not None:
         passes = max(settings.passes - earlier.passes, 1)
@@ -286,7 +292,7 @@ def _fit(
         folder,
         scan.digest,
         settings,
-        {"strength": strength, "centre": centre, "tilt": tilt, "air": factors},
+        {"strength": strength, "model_error": model_error, "centre": centre, "tilt": tilt, "air": factors},
         tuple(decisions),
         fit.passes,
         time.perf_counter() - begun,
@@ -364,15 +370,17 @@ def _coarse_start(
     geometry: ScanGeometry,
     grid: VoxelGrid,
     factors: list[float] | None,
-    strength: float,
+    weights: tuple[float, float],
     seconds: float | None,
 ) -> Fit:
     """A start for the fine grid from one with voxels and pixels twice as large."""
     views = scan.training_views
     small = grid.coarser(2)
     likelihood = likelihood_of(scan, views, binning=2)
-    if factors is not None and isinstance(likelihood, Poisson):
-        likelihood = likelihood.scaled(torch.tensor(factors))
+    strength, model_error = weights
+    if isinstance(likelihood, Poisson):
+        likelihood = likelihood.with_model_error(model_error)
+        likelihood = likelihood if factors is None else likelihood.scaled(torch.tensor(factors))
     problem = Problem(geometry.binned(2).select(views), likelihood, small)
     limit = None if seconds is None else COARSE_SHARE * seconds
     return finer(reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
