@@ -22,12 +22,12 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.doctor import camera_motion, connectivity, consensus, coverage, inventory, quality
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.examination import Diagnosis, compare_all, content, estimated_seconds, examine, judged
-from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.doctor.page import page_html, refuse_foreign
 from nerfcli.doctor.photo_facts import PhotoFacts, Source, read_photo
 from nerfcli.doctor.photo_list import ExaminedCapture, find_subject
 from nerfcli.doctor.sharpness import measure
 from nerfcli.errors import UserError
+from nerfcli.findings import BAD, GOOD, LOOK, Finding
 from nerfcli.media.images import Exif
 from nerfcli.multiview.features import LOOSE_RATIO, mutual_matches
 from nerfcli.multiview.graph import connected_groups

@@ -15,9 +15,9 @@ from turntable_capture import Turntable, turntable, write
 from nerfcli import scene as scenes
 from nerfcli.cameras.alignment import align
 from nerfcli.doctor.examination import Diagnosis, examine
-from nerfcli.doctor.findings import LOOK
 from nerfcli.doctor.photo_list import find_subject
 from nerfcli.errors import UserError
+from nerfcli.findings import LOOK
 from nerfcli.multiview.stationary import Motions, Stationary, motions, still_px, together
 from nerfcli.poses.engine.turntable import advised, sentence
 from nerfcli.poses.input import still_background as still

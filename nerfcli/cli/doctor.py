@@ -88,7 +88,7 @@ def _print_table(diagnosis: "Diagnosis", console: Console) -> None:
 
 def _hold_against(diagnosis: "Diagnosis", require: str) -> None:
     """Raise if a finding is worse than required."""
-    from nerfcli.doctor.findings import VERDICTS
+    from nerfcli.findings import VERDICTS
 
     worse = [f for f in diagnosis.findings if VERDICTS.index(f.verdict) > VERDICTS.index(require)]
     if worse:

@@ -6,8 +6,8 @@ from itertools import combinations
 import numpy as np
 
 from nerfcli.doctor.compared_pairs import Pair
-from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, worst
 from nerfcli.doctor.photo_facts import PhotoFacts
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, worst
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.retrieval import alike, likeness
 

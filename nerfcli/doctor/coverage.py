@@ -8,7 +8,6 @@ import numpy as np
 from nerfcli.cameras import rigid
 from nerfcli.cameras.formats.colmap import read_model
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction, views_of
-from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photo_facts import PhotoFacts
 from nerfcli.media.geodesy import east_north_up

@@ -9,9 +9,9 @@ import numpy as np
 from nerfcli.cameras.calibration import Calibration, Picture, calibrated
 from nerfcli.doctor import connectivity, coverage, geometry, inventory, quality, turntable
 from nerfcli.doctor.compared_pairs import Pair, compare, focal_px
-from nerfcli.doctor.findings import Finding, as_json, worst
 from nerfcli.doctor.photo_facts import MOST_FEATURES, PhotoFacts, read_all
 from nerfcli.doctor.photo_list import ExaminedCapture
+from nerfcli.findings import Finding, as_json, worst
 from nerfcli.poses.judge.checks import Checks
 
 # Measured on one core of a 2-core server; within a factor of two on other CPUs.

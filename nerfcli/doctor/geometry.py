@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerfcli.doctor.compared_pairs import Pair
-from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
 from nerfcli.doctor.moving import Patch
 from nerfcli.doctor.photo_facts import PhotoFacts
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
 
 # Baseline over depth: 0.1 is an angle of 6 degrees between the rays that meet in a point.
 BASELINE_LOOK, BASELINE_BAD = 0.08, 0.03

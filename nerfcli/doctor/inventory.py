@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from nerfcli.doctor.compared_pairs import Pair
-from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below
 from nerfcli.doctor.photo_facts import PhotoFacts
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below
 from nerfcli.media.focal_evidence import focal_evidence
 
 FEWEST_PHOTOS = 4

@@ -6,8 +6,8 @@ import numpy as np
 
 from nerfcli.doctor.compared_pairs import Pair
 from nerfcli.doctor.consensus import potentials
-from nerfcli.doctor.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below, worst
 from nerfcli.doctor.photo_facts import PhotoFacts
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_above, verdict_below, worst
 
 # log2 of detail that a photo lacks against the others: 0.3 is what a Gaussian blur of about 0.8 px takes from a sharp
 # photo of 1600 px, 0.7 one of 1.5 px.

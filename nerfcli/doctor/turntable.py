@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from nerfcli.doctor.compared_pairs import Pair
-from nerfcli.doctor.findings import LOOK, Finding
+from nerfcli.findings import LOOK, Finding
 from nerfcli.multiview.stationary import LEAST_SHARE, together
 
 
