@@ -33,6 +33,7 @@ MAY_IMPORT = {
     "kernels": set(),
     "field": {"kernels"},
     "holdout": set(),
+    "findings": set(),
     "scene": {"holdout", "cameras", "media"},
     "poses.input": {"holdout", "media"},
     "poses.model": {"poses.input", "cameras", "media"},
@@ -43,10 +44,11 @@ MAY_IMPORT = {
     },
     "scale": {"cameras", "media"},
     "doctor": {
-        *("poses.engine", "poses.judge", "scale", "scene", "cameras", "media", "pages", "multiview"),
+        *("findings", "poses.engine", "poses.judge", "scale", "scene", "cameras", "media", "pages", "multiview"),
     },
     "convert": {"multiview", "scale", "scene", "cameras", "media"},
     "render": {"field", "kernels", "cameras"},
+    "tomography": {"findings", "holdout", "kernels", "media"},
     "photos": {"runs", "render", "kernels", "cameras", "media"},
     "multiview": {"photos", "scene", "cameras"},
     "runs": {"render", "field", "kernels", "scene", "cameras"},
@@ -76,7 +78,7 @@ MAY_IMPORT = {
     "report": {"runs", "evaluate", "export", "render", "field", "scene", "cameras", "media", "pages"},
     "workflows": {
         *("ablate", "report", "export", "evaluate", "train", "runs", "photos", "doctor", "poses"),
-        *("surface", "viewer"),
+        *("surface", "viewer", "tomography", "findings"),
         *("poses.model", "poses.input", "convert", "render", "field", "scene", "cameras", "media"),
         "pages",
     },
@@ -87,7 +89,7 @@ MAY_IMPORT = {
 CONFINED = {
     "torch": {
         *("kernels", "field", "render", "runs", "train", "search", "fit", "evaluate", "export"),
-        *("selftest", "bench", "workflows", "cli", "photos", "surface", "viewer"),
+        *("selftest", "bench", "workflows", "cli", "photos", "surface", "viewer", "tomography"),
     },
     "safetensors": {"field"},
     "numba": {"kernels"},
@@ -111,6 +113,7 @@ NOT_AT_START = (
     "numpy",
     "numba",
     "scipy",
+    "h5py",
     "cv2",
     "pycolmap",
     "skimage",

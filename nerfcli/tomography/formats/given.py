@@ -1,0 +1,102 @@
+"""What the user says of a scan beyond its file, and lengths and angles in the units that files name."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.errors import UserError
+
+# Millimetres of a unit of length, by the names that files give it.
+MILLIMETRES = {
+    **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1e3),
+    **dict.fromkeys(("cm", "centimetre", "centimeter"), 10.0),
+    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), 1.0),
+    **dict.fromkeys(("um", "µm", "μm", "micron", "microns", "micrometre", "micrometer", "micrometers"), 1e-3),
+    **dict.fromkeys(("nm", "nanometre", "nanometer"), 1e-6),
+}
+# Sides of pixels that no scanner has, in mm: the unit is another one.
+PIXEL_MM = (1e-6, 20.0)
+_DEGREES = ("deg", "degree", "degrees", "°", "degs")
+_RADIANS = ("rad", "radian", "radians")
+# Angles in degrees that span less than this over many views are radians under a wrong name.
+_NARROW_DEG, _MANY_VIEWS = 6.5, 30
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user says.
+
+    Args:
+        photons: that an open pixel counts in a view.
+        unit: of lengths in the file, a key of `MILLIMETRES`; it goes before what the file says.
+        centre_column: the column that the axis of rotation is projected to, 0 for the middle of the first pixel.
+        holdout: a rule of `holdout.check_holdout` for views, which have the names 00000, 00001, ...
+    """
+
+    photons: float | None = None
+    unit: str | None = None
+    centre_column: float | None = None
+    holdout: str | None = None
+
+
+def millimetres(unit: str, *, where: str) -> float:
+    """How many millimetres a unit has.
+
+    Raises:
+        UserError: it is no unit of length.
+    """
+    found = MILLIMETRES.get(unit.strip().lower())
+    if found is None:
+        raise UserError(f"{where}: {unit!r} is no unit of length", "say with --unit which one it is: m, mm, um or nm")
+    return found
+
+
+def angles_in_radians(angles: np.ndarray, *, views: int, unit: str | None, where: str) -> np.ndarray:
+    """Angles of views as radians.
+
+    Args:
+        angles: (V,).
+        views: how many there should be.
+        unit: as the file writes it; None where it says nothing, which is degrees.
+        where: the place in the file, for errors.
+
+    Raises:
+        UserError: there are too few or too many, some are not finite, all are the same, or the unit cannot be right.
+    """
+    values = np.asarray(angles, dtype=np.float64).reshape(-1)
+    if len(values) != views:
+        raise UserError(
+            f"{where} has {len(values)} angles for {views} projections",
+            "each projection needs its angle; take out the frames or the angles that have no partner",
+        )
+    if not np.isfinite(values).all():
+        bad = int(np.argmin(np.isfinite(values)))
+        raise UserError(f"{where}: angle {bad} is {values[bad]}", "write the angles of all projections again")
+    span = float(np.ptp(values))
+    if span == 0 and views > 1:
+        raise UserError(f"{where}: all {views} angles are {values[0]:g}", "write the angle of each projection")
+    name = "degrees" if unit is None else unit.strip().lower()
+    if name in _RADIANS:
+        if span > 8 * np.pi:
+            raise UserError(f"{where}: angles span {span:.4g} radians", "they look like degrees: mend their unit")
+        return values
+    if name not in _DEGREES:
+        raise UserError(f"{where}: {unit!r} is no unit of angles", "write degrees or radians")
+    if span < _NARROW_DEG and views >= _MANY_VIEWS:
+        raise UserError(
+            f"{where}: {views} angles span {span:.4g} degrees", "they look like radians: mend their unit in the file"
+        )
+    return np.radians(values)
+
+
+def check_pixel_size(size_mm: float, *, where: str) -> None:
+    """Raise if no detector has such pixels.
+
+    Raises:
+        UserError: the size is not positive, or its unit cannot be right.
+    """
+    if not np.isfinite(size_mm) or not PIXEL_MM[0] <= size_mm <= PIXEL_MM[1]:
+        raise UserError(
+            f"{where}: a pixel of {size_mm:g} mm",
+            f"between {PIXEL_MM[0]:g} and {PIXEL_MM[1]:g} mm are possible; say with --unit which unit lengths have",
+        )

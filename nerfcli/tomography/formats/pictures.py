@@ -1,0 +1,97 @@
+"""Projections that are stored as pictures: numbered files, or pages of a TIFF."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from nerfcli.errors import UserError
+
+SUFFIXES = (".tif", ".tiff", ".png", ".bmp")
+_NAMES_SHOWN = 3
+
+
+def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) -> list[Path]:
+    """Pictures in a folder whose names match a pattern, in the order of the last number in their names.
+
+    Args:
+        folder: which.
+        pattern: of the file name, as in a shell.
+        without: a regular expression of names to pass over.
+
+    Raises:
+        UserError: a number between the first and the last one is missing, or is there twice.
+    """
+    paths = [
+        path
+        for path in sorted(folder.glob(pattern))
+        if path.suffix.lower() in SUFFIXES and not (without and re.search(without, path.name, re.IGNORECASE))
+    ]
+    numbers = [_number(path) for path in paths]
+    if len(paths) < 2 or None in numbers:
+        return paths
+    present = [number for number in numbers if number is not None]
+    twice = sorted(paths[k].name for k in range(len(present)) if present.count(present[k]) > 1)
+    if twice:
+        raise UserError(
+            f"{folder} has several pictures with the same number: {', '.join(twice[:_NAMES_SHOWN])}",
+            "keep the projections of one scan in a folder of their own",
+        )
+    steps = np.diff(sorted(present))
+    if (steps != np.median(steps)).any():
+        first = sorted(present)[int(np.argmax(steps != np.median(steps)))]
+        raise UserError(
+            f"{folder}: after number {first} the numbers of the pictures jump",
+            "a projection is missing; without it the angles of the others are wrong",
+        )
+    return [path for _, path in sorted(zip(present, paths, strict=True))]
+
+
+def read_stack(paths: Sequence[Path]) -> np.ndarray:
+    """Pictures as (views, rows, columns) float32, all pages of TIFF files; as they are stored, without any scaling.
+
+    Raises:
+        UserError: one cannot be read, has colours, or another size than the first.
+    """
+    frames: list[np.ndarray] = []
+    for path in paths:
+        for frame in _pages(path):
+            if frames and frame.shape != frames[0].shape:
+                raise UserError(
+                    f"{path} has {frame.shape[1]} x {frame.shape[0]} pixels, the first projection "
+                    f"{frames[0].shape[1]} x {frames[0].shape[0]}",
+                    "all projections of a scan have one size; take out what is no projection",
+                )
+            frames.append(frame)
+    return np.stack(frames)
+
+
+def _pages(path: Path) -> np.ndarray:
+    """(pages, rows, columns) float32."""
+    try:
+        if path.suffix.lower() in (".tif", ".tiff"):
+            import tifffile
+
+            array = tifffile.imread(path)
+        else:
+            import cv2
+
+            read = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+            if read is None:
+                raise ValueError("no picture that OpenCV knows")
+            array = np.asarray(read)
+    except FileNotFoundError as error:
+        raise UserError(f"there is no {path}", "the description of the scan names it: put it there") from error
+    except Exception as error:  # tifffile raises what its decoders raise
+        raise UserError(f"{path} cannot be read: {error}", "it is damaged or no picture: export it again") from error
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3 or array.shape[-1] in (3, 4):
+        raise UserError(f"{path} has the shape {array.shape}", "projections are grey: rows x columns, or pages of them")
+    return array.astype(np.float32)
+
+
+def _number(path: Path) -> int | None:
+    found = re.findall(r"\d+", path.stem)
+    return int(found[-1]) if found else None

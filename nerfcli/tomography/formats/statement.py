@@ -1,0 +1,97 @@
+"""Descriptions in text files: "key = value" lines of scanners, and JSON; what is missing or no number is named."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.errors import UserError
+
+
+class Statement:
+    """Fields of a description, by names without case."""
+
+    def __init__(self, path: Path, fields: Mapping[str, Any], *, hint: str):
+        self.path, self.hint = path, hint
+        self._fields = {name.strip().lower(): value for name, value in fields.items()}
+
+    def __contains__(self, name: str) -> bool:
+        return name.lower() in self._fields
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all fields, in small letters."""
+        return list(self._fields)
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """A field as it stands there."""
+        value = self._fields.get(name.lower(), default)
+        if value is None:
+            raise UserError(f"{self.path} has no {name}", self.hint)
+        return str(value).strip()
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """A finite number; of a text, what it begins with."""
+        if default is not None and name not in self:
+            return default
+        text = self.text(name)
+        found = re.match(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text.replace(",", "."))
+        if not found:
+            raise UserError(f"{self.path}: {name} is {text!r}", "a number should stand there")
+        return float(found[0])
+
+    def positive(self, name: str) -> float:
+        """A number above 0."""
+        value = self.number(name)
+        if not (np.isfinite(value) and value > 0):
+            raise UserError(f"{self.path}: {name} is {value:g}", "a number above 0 should stand there")
+        return value
+
+    def whole(self, name: str) -> int:
+        """A count, above 0."""
+        value = self.positive(name)
+        if value != round(value):
+            raise UserError(f"{self.path}: {name} is {value:g}", "a whole number should stand there")
+        return round(value)
+
+    def value(self, name: str, default: Any = None) -> Any:
+        """Whatever stands there."""
+        return self._fields.get(name.lower(), default)
+
+
+def read_lines(path: Path, *, hint: str) -> Statement:
+    """The "key = value" lines of a file in any 8-bit encoding; the first of equal keys counts.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        text = path.read_bytes().decode("latin-1")
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}", hint) from error
+    fields: dict[str, str] = {}
+    for line in text.splitlines():
+        name, equals, value = line.partition("=")
+        if equals and name.strip() and not name.lstrip().startswith((";", "#")):
+            fields.setdefault(name.strip().lower(), value.strip())
+    return Statement(path, fields, hint=hint)
+
+
+def read_object(path: Path, *, hint: str) -> Statement:
+    """A JSON object.
+
+    Raises:
+        UserError: it cannot be read or is something else.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}", hint) from error
+    except ValueError as error:
+        raise UserError(f"{path} is no JSON: {error}", hint) from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path} holds a {type(content).__name__}", hint)
+    return Statement(path, content, hint=hint)

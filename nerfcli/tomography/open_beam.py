@@ -1,0 +1,113 @@
+"""What a detector shows without an object: flats and darks averaged, dead pixels, and photons per detector value."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerfcli.errors import UserError
+
+# A frame's pixel that is further from the median over frames than this many robust deviations is left out.
+OUTLIER = 5.0
+# A pixel with less of the median open beam than this sees next to nothing.
+DEAD_BELOW = 0.05
+# Median of |x - median| of a normal distribution, as a part of its deviation.
+_MAD = 0.6745
+# Pixels that the noise of flats has to be averaged over.
+_ENOUGH = 200
+
+
+@dataclass(frozen=True)
+class OpenBeam:
+    """The beam without an object.
+
+    Args:
+        values: (1, rows, columns) float32 detector values above the dark ones; 1 where the pixel is not usable.
+        dark: (1, rows, columns) float32 values without beam; None where there are none.
+        usable: (1, rows, columns) bool.
+        photons_per_value: photons that a detector value stands for; None where flats cannot say.
+    """
+
+    values: np.ndarray
+    dark: np.ndarray | None
+    usable: np.ndarray
+    photons_per_value: float | None
+
+
+def open_beam_of(flats: np.ndarray, darks: np.ndarray | None) -> OpenBeam:
+    """Average flats and darks.
+
+    Each pixel is the mean over frames without outliers (gamma quanta that hit the camera, a frame taken with the
+    object in the beam). Photons per value are mean / variance of the flats, where both are sums over all pixels, the
+    drift of whole frames is divided out, and the variance of the darks is subtracted.
+
+    Args:
+        flats: (frames, rows, columns) detector values.
+        darks: likewise, or None.
+
+    Raises:
+        UserError: the flats are all 0, or darker than the darks.
+    """
+    flat = robust_mean(flats)
+    dark = None if darks is None or len(darks) == 0 else robust_mean(darks)
+    beam = flat if dark is None else flat - dark
+    finite = np.isfinite(beam)
+    middle = float(np.median(beam[finite])) if finite.any() else 0.0
+    if not middle > 0:
+        above = "" if dark is None else " above the darks"
+        raise UserError(
+            f"the flats have a median of {middle:g}{above}: no pixel sees the beam",
+            "flats are frames with the beam on and without the object; check that they are not swapped with the darks",
+        )
+    usable = finite & (beam > DEAD_BELOW * middle)
+    if len(flats) >= 4:  # a stuck pixel gives the same value whatever comes
+        usable &= np.ptp(flats, axis=0) > 0 if np.ptp(flats, axis=0).any() else True
+    photons = _photons_per_value(flats, darks, beam, usable)
+    return OpenBeam(
+        np.where(usable, beam, 1).astype(np.float32)[None],
+        None if dark is None else np.where(np.isfinite(dark), dark, 0).astype(np.float32)[None],
+        usable[None],
+        photons,
+    )
+
+
+def robust_mean(frames: np.ndarray) -> np.ndarray:
+    """(rows, columns) mean over frames, in float64, without outliers; plain for fewer than three frames."""
+    frames = np.asarray(frames, dtype=np.float64)
+    if len(frames) < 3:
+        return frames.mean(0)
+    # Whole frames may be lighter or darker: outliers are looked for after that is divided out.
+    scale = np.median(frames.reshape(len(frames), -1), axis=1)
+    middle = float(np.median(scale))
+    level = np.where((scale > 0) & (middle > 0), scale / middle if middle > 0 else 1.0, 1.0)
+    frames = frames / level[:, None, None]
+    centre = np.median(frames, axis=0)
+    apart = np.abs(frames - centre)
+    # A pixel's own deviation is known badly from few frames: that of all pixels together is its least.
+    deviation = np.median(apart, axis=0) / _MAD
+    deviation = np.maximum(deviation, float(np.nanmedian(deviation)))
+    kept = apart <= OUTLIER * deviation + 1e-12 * np.abs(centre)
+    return np.where(kept, frames, 0).sum(0) / np.maximum(kept.sum(0), 1)
+
+
+def _photons_per_value(
+    flats: np.ndarray, darks: np.ndarray | None, beam: np.ndarray, usable: np.ndarray
+) -> float | None:
+    if len(flats) < 3 or usable.sum() < _ENOUGH:
+        return None
+    variance, kept = _variance(np.asarray(flats, dtype=np.float64)[:, usable], divided=True)
+    if darks is not None and len(darks) >= 3:
+        of_dark, good = _variance(np.asarray(darks, dtype=np.float64)[:, usable], divided=False)
+        variance, kept = variance - of_dark, kept & good
+    total = float(variance[kept].sum())
+    return float(beam[usable][kept].sum()) / total if total > 0 else None
+
+
+def _variance(frames: np.ndarray, *, divided: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Variance over frames per pixel, and the pixels without outliers; with the drift of frames divided out or not."""
+    if divided:
+        level = np.median(frames, axis=1, keepdims=True)
+        frames = frames * (np.median(level) / np.where(level > 0, level, 1))
+    variance = frames.var(axis=0, ddof=1)
+    # Of n frames the variance of pure noise is within a factor 1 + 8 sqrt(2 / (n - 1)) of what it should be.
+    limit = float(np.median(variance)) * (1 + 8 * np.sqrt(2 / (len(frames) - 1)))
+    return variance, variance <= limit
