@@ -1,13 +1,15 @@
 """nerfcli convert: convert cameras between formats and verify the result; detect conventions."""
 
+import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nerfcli.cli.batch import for_each_input
+from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
-from nerfcli.cli.options import Json, Overwrite, Quiet, one_of
+from nerfcli.cli.convert_scan import CentreOfRotation, Mirrored, Photons, Unit, scan_work
+from nerfcli.cli.options import Holdout, Json, Overwrite, Quiet, one_of
 
 if TYPE_CHECKING:
     from nerfcli.convert.conversion import Conversion
@@ -114,6 +116,11 @@ def convert(
     ] = False,
     verify: Annotated[bool, typer.Option(help="Read OUT back with other code and compare.")] = True,
     tolerance: Annotated[float, typer.Option(help="Maximum residual, in pixels.", min=0)] = 1e-6,
+    photons: Photons = None,
+    unit: Unit = None,
+    mirrored: Mirrored = False,
+    centre_of_rotation: CentreOfRotation = None,
+    holdout: Holdout = None,
     overwrite: Overwrite = False,
     json: Json = False,
     quiet: Quiet = False,
@@ -139,7 +146,16 @@ def convert(
     If you are not sure, --detect compares the possible conventions with the photos.
 
     \b
+    Scans by X-rays become a scan folder, or ASTRA's vectors with --to astra (OUT ends in .npy or .txt):
+      DataExchange and NXtomo (.h5, .nxs), Nikon (.xtekct), SkyScan (.log), HelTomo (.mat), R2-Gaussian
+      (meta_data.json), NAF (.pickle, which is not executed), pictures with a scan.json that states what they are
+    --photons, --unit, --mirrored, --centre-of-rotation and --holdout are for them; --detect ranks the direction of
+    rotation, the side that columns are numbered from, and the centre of rotation by how well they predict other views.
+
+    \b
     Examples:
+      nerfcli convert tooth.h5 tooth-scan --centre-of-rotation 295.8
+      nerfcli convert tooth-scan tooth.npy --to astra
       nerfcli convert photos-scene transforms.json --to transforms
       nerfcli convert fox/transforms.json fox/sparse/0 --to colmap
       nerfcli convert fern poses.txt --to kitti --allow-loss
@@ -152,6 +168,7 @@ def convert(
       nerfcli convert strange/ repaired.json --to transforms --from-axes opencv --from-inverted
       ls -d captures/*/ | nerfcli convert - converted/ --to transforms
     """
+    values = dict(locals())
     from nerfcli.convert.camera_files import read_intrinsics
     from nerfcli.convert.conversion import Doubt, TargetOptions
     from nerfcli.convert.formats import Given, format_named
@@ -159,6 +176,10 @@ def convert(
     from nerfcli.workflows.convert import convert_capture, detect_convention, detection_record
 
     console = Console(quiet=quiet, json_lines=json)
+    defaults = {name: parameter.default for name, parameter in inspect.signature(convert).parameters.items()}
+    convert_scan = scan_work(values, defaults, console)
+    if source != STDIN and convert_scan(Path(source), False):
+        return
     from_centre = _pixel_centre(from_pixel_center, "--from-pixel-center")
     doubt = Doubt(axes=from_axes, inverted=from_inverted, pixel_centre=from_centre, intrinsics_scale=from_size)
 
@@ -211,7 +232,11 @@ def convert(
             _print_verification(done.conversion, console)
             console.result(done.conversion.path, done.record)
 
-    for_each_input(source, work)
+    def either(path: Path, one_of_many: bool) -> None:
+        if not convert_scan(path, one_of_many):
+            work(path, one_of_many)
+
+    for_each_input(source, either)
 
 
 def _print_verification(done: "Conversion", console: Console) -> None:

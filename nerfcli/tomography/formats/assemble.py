@@ -66,6 +66,8 @@ def scan_of(found: Found, given: Given) -> Scan:
     notes = list(found.notes)
     values = _checked(found)
     unit, placed = _in_millimetres(found, given)
+    if given.mirrored:
+        placed = replace(placed, mirrored=not placed.mirrored) if isinstance(placed, Circle) else placed.mirrored()
     geometry = placed.geometry() if isinstance(placed, Circle) else placed
     if values.shape != (geometry.views, geometry.rows, geometry.columns):
         views, rows, columns = values.shape

@@ -31,12 +31,14 @@ class Given:
         unit: of lengths in the file, a key of `MILLIMETRES`; it goes before what the file says.
         centre_column: the column that the axis of rotation is projected to, 0 for the middle of the first pixel.
         holdout: a rule of `holdout.check_holdout` for views, which have the names 00000, 00001, ...
+        mirrored: whether columns are numbered from the other side than the file says.
     """
 
     photons: float | None = None
     unit: str | None = None
     centre_column: float | None = None
     holdout: str | None = None
+    mirrored: bool = False
 
 
 def millimetres(unit: str, *, where: str) -> float:

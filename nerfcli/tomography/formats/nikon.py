@@ -67,20 +67,21 @@ def _angles(fields: Statement, views: int, recorded: np.ndarray | None, notes: l
     where = f"{fields.path}: angles"
     first = fields.number("InitialAngle", 0.0)
     step = fields.number("AngularStep", 0.0)
-    if recorded is None and step == 0:
-        raise UserError(
-            f"{fields.path} has no AngularStep, and there is no list of angles beside it",
-            "put the scanner's _ctdata.txt or .ang file there, or write AngularStep in degrees",
-        )
-    turned = step * np.arange(views)
-    if recorded is not None and step == 0:
-        turned = recorded
-    elif recorded is not None:
-        recorded = recorded - recorded[0]
-        recorded = recorded if float(recorded @ turned) >= 0 else -recorded
-        apart = float(np.abs(recorded - turned).max())
+    if step == 0:
+        if recorded is None:
+            raise UserError(
+                f"{fields.path} has no AngularStep, and there is no list of angles beside it",
+                "put the scanner's _ctdata.txt or .ang file there, or write AngularStep in degrees",
+            )
+        return angles_in_radians(first + recorded, views=views, unit="degrees", where=where)
+    turned: np.ndarray = step * np.arange(views)
+    if recorded is not None:
+        measured: np.ndarray = recorded - recorded[0]
+        if float(measured @ turned) < 0:
+            measured = -measured
+        apart = float(np.abs(measured - turned).max())
         if apart <= abs(step) / 2:
-            turned = recorded
+            turned = measured
         else:
             notes.append(f"recorded angles are up to {apart:.3g} degrees off those of AngularStep, which are used")
     return angles_in_radians(first + turned, views=views, unit="degrees", where=where)

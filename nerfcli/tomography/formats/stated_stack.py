@@ -24,6 +24,7 @@
 | vectors | instead of angles and distances: views x 12 numbers as ASTRA's cone_vec or parallel3d_vec |
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ def read_stated_stack(path: Path, given: Given = Given()) -> Scan:
         held_out=_held_out(fields, views),
     )
     if photons is not None and given.photons is None and measured != "line_integral":
-        given = Given(photons, given.unit, given.centre_column, given.holdout)
+        given = replace(given, photons=photons)
     return scan_of(found, given)
 
 

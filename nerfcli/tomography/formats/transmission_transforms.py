@@ -50,7 +50,7 @@ def read_transmission_transforms(path: Path, given: Given = Given()) -> Scan:
     for name in ("fl_x", "fl_y"):
         if abs(lens.positive(name) * pitch - distance) > 1e-6 * distance:
             raise UserError(
-                f"{folder}: {name} is {lens.positive(name):g} px of {pitch:g}, the source_detector_distance {distance:g}",
+                f"{folder}: {name} is {lens.positive(name):g} px of {pitch:g}, the detector {distance:g} away",
                 "both say how far the detector is: mend one of them",
             )
     geometry = ScanGeometry("cone", source, source - distance * back, pitch * right, -pitch * up, rows, columns)

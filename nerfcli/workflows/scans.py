@@ -1,0 +1,214 @@
+"""Scans by transmission: from a scanner's files to a scan folder, proved; and to ASTRA's vectors."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerfcli.errors import GATE_NOT_MET, UserError
+from nerfcli.tomography.astra import write_astra
+from nerfcli.tomography.circle import circle_from_json, circle_of, differences
+from nerfcli.tomography.formats.assemble import axis_column
+from nerfcli.tomography.formats.given import Given
+from nerfcli.tomography.formats.read import READERS, read_scan, recognise
+from nerfcli.tomography.hypotheses import Judgement, judge
+from nerfcli.tomography.scan import Scan, is_scan, load_scan, save_scan
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+
+OWN, ASTRA = "nerfcli", "astra"
+WRITTEN = (OWN, ASTRA)
+# What a statement and what is recovered from stored vectors may differ by: rounding of float64.
+TOLERANCES = {"angle_deg": 1e-9, "length": 1e-9, "shift_px": 1e-6, "tilt_deg": 1e-9}
+
+
+@dataclass(frozen=True)
+class ConvertedScan:
+    """A conversion.
+
+    Args:
+        path: what was written.
+        scan: as it was read back.
+        record: plain values.
+        lines: for the user.
+    """
+
+    path: Path
+    scan: Scan
+    record: dict[str, Any]
+    lines: tuple[str, ...]
+
+
+def is_scan_input(path: Path) -> bool:
+    """Whether a file or folder is a scan in a format that is read.
+
+    Raises:
+        UserError: it looks like one and cannot be read.
+    """
+    return recognise(path) is not None
+
+
+def convert_scan(
+    source: Path,
+    target: Path,
+    *,
+    to: str = OWN,
+    given: Given = Given(),
+    overwrite: bool = False,
+    notify: Notify = silent,
+) -> ConvertedScan:
+    """Write a scan as a scan folder, or its geometry as ASTRA's vectors.
+
+    What is written is read back, and angles, distances and pixel sizes that the source states are recovered from it.
+
+    Args:
+        source: a file or folder in a known format.
+        target: the folder, or the file of vectors.
+        to: nerfcli or astra.
+        given: what the user says of the scan.
+        overwrite: replace a scan folder, or a file of vectors.
+        notify: takes lines for the user.
+
+    Raises:
+        UserError: it cannot be read or written, something else stands there, or what was written is not the same.
+    """
+    if to not in WRITTEN:
+        raise UserError(f"a scan cannot be written as {to}", f"scans are written as {' or '.join(WRITTEN)}")
+    if target.exists() and not (overwrite and (target.is_file() or is_scan(target))):
+        what = "use --overwrite to replace it" if target.is_file() or is_scan(target) else "choose another place"
+        raise UserError(f"{target} is there already", what)
+    if target.exists() and target.resolve() == source.resolve():
+        raise UserError(f"{target} is what is converted", "choose another place")
+    if to == ASTRA:
+        scan = read_scan(source, given)
+        facts = write_astra(scan, target)
+        notify(f"{source}: {in_words(scan)}")
+        record = {"to": to, "views": scan.geometry.views, "json": str(facts)}
+        return ConvertedScan(target, scan, record, ())
+    scan = read_scan(source, given)
+    notify(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
+    for note in scan.history.get("notes", ()):
+        notify(note)
+    save_scan(target, scan)
+    stored = load_scan(target)
+    checks = _read_back(scan, stored)
+    line = _proof(checks)
+    notify(f"{target}: {line}")
+    record = {"from": scan.history.get("format"), "to": to, **facts_of(stored), "read_back": checks}
+    return ConvertedScan(target, stored, record, (line,))
+
+
+def detect_scan(
+    source: Path, *, given: Given = Given(), notify: Notify = silent, progress: Progress = no_progress
+) -> Judgement:
+    """Which direction, which side of the detector and which centre of rotation the data follow.
+
+    Raises:
+        UserError: it cannot be read, or has too few views.
+    """
+    scan = read_scan(source, given)
+    notify(f"{source}: {scan.history.get('format')}, {in_words(scan)}")
+    return judge(scan, progress=progress)
+
+
+def describe_scan(path: Path) -> dict[str, Any]:
+    """What a scan folder, or a scan in a format that is read, holds.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    scan = load_scan(path) if is_scan(path) else read_scan(path)
+    return {"kind": "scan", **facts_of(scan), "notes": list(scan.history.get("notes", ()))}
+
+
+def facts_of(scan: Scan) -> dict[str, Any]:
+    """A scan as plain values, those of `nerfcli info`."""
+    geometry = scan.geometry
+    height, width = geometry.pixel_at_origin
+    circle, apart = circle_of(geometry)
+    angles = np.degrees(np.array(circle.angles))
+    around = apart < 1e-3
+    return {
+        "measurement": "transmission",
+        "format": scan.history.get("format"),
+        "views": geometry.views,
+        "held_out": len(scan.held_out),
+        "detector": f"{geometry.columns} x {geometry.rows} pixels",
+        "beam": "fan" if geometry.beam == "cone" and geometry.rows == 1 else geometry.beam,
+        "values": scan.kind,
+        "unit": scan.unit,
+        "pixel_at_object": [float(f"{width:.6g}"), float(f"{height:.6g}")],
+        "magnification": float(f"{np.median(geometry.magnification):.6g}"),
+        "angles_deg": [float(f"{angles.min():.6g}"), float(f"{angles.max():.6g}")] if around else None,
+        "orbit": "a circle" if around else "views that are not on one circle",
+        "source_origin": float(f"{circle.source_origin:.6g}") if around and geometry.beam == "cone" else None,
+        "source_detector": float(f"{circle.source_detector:.6g}") if around and geometry.beam == "cone" else None,
+        "axis_column": float(f"{axis_column(geometry):.6g}"),
+        "photons_per_value": scan.photons_per_value,
+        "unusable": None if scan.usable is None else float(f"{1 - float(scan.usable.mean()):.4g}"),
+        "truth": (scan.history.get("truth") or {}).get("path"),
+    }
+
+
+def in_words(scan: Scan) -> str:
+    """A scan in a few words."""
+    geometry = scan.geometry
+    beam = "fan" if geometry.beam == "cone" and geometry.rows == 1 else geometry.beam
+    size = f"{geometry.columns} x {geometry.rows} pixels"
+    words = f"{geometry.views} views of {size}, {beam} beam, {scan.kind.replace('_', ' ')}s"
+    return words.replace("countss", "counts") + f", {len(scan.held_out)} held out"
+
+
+def _read_back(scan: Scan, stored: Scan) -> dict[str, float]:
+    """Differences of what the source states and what stands in the folder.
+
+    Raises:
+        UserError: they are larger than rounding.
+    """
+    checks = {"vector": float(np.abs(stored.geometry.vectors() - scan.geometry.vectors()).max())}
+    checks["value"] = float(np.abs(np.asarray(stored.values) - scan.values).max())
+    largest = float(np.abs(scan.geometry.vectors()).max())
+    wrong = [name for name, least in (("vector", 1e-12 * largest), ("value", 0.0)) if not checks[name] <= least]
+    if "circle" in scan.history:
+        found, apart = circle_of(stored.geometry)
+        of_circle = differences(circle_from_json(scan.history["circle"]), found)
+        wrong += [name for name, value in of_circle.items() if not value <= TOLERANCES[name]]
+        checks |= {**of_circle, "orbit_px": apart}
+    if wrong:
+        raise UserError(
+            f"what was written is not what the source says: {', '.join(f'{n} {checks[n]:.3g}' for n in wrong)}",
+            "this is a fault of nerfcli; please report it with the file",
+            GATE_NOT_MET,
+        )
+    return checks
+
+
+def _proof(checks: dict[str, float]) -> str:
+    if "angle_deg" not in checks:
+        return "read back: the same vectors and values"
+    return (
+        f"read back: angles within {checks['angle_deg']:.1g} degrees, distances and pixel sizes within "
+        f"{checks['length']:.1g} of themselves, the axis within {checks['shift_px']:.1g} px"
+    )
+
+
+def formats_read() -> tuple[str, ...]:
+    """Names of the formats of scans."""
+    return tuple(READERS)
+
+
+def judgement_record(found: Judgement) -> dict[str, Any]:
+    """A judgement as plain values."""
+    return {
+        "verdict": found.verdict,
+        "ratio": found.ratio,
+        "standard_errors": found.margin if np.isfinite(found.margin) else None,
+        "stated_column": found.stated_column,
+        "centre_column": found.centre_column,
+        "centre_error": found.centre_error,
+        "centre_holds": found.centre_holds,
+        "centre_ratio": found.centre_ratio,
+        "ambiguity": found.ambiguity,
+        "options": found.options,
+        "hypotheses": [vars(each) for each in found.hypotheses],
+    }
