@@ -48,7 +48,7 @@ MAY_IMPORT = {
     },
     "convert": {"multiview", "scale", "scene", "cameras", "media"},
     "render": {"field", "kernels", "cameras"},
-    "tomography": {"findings", "holdout", "kernels", "media"},
+    "tomography": {"findings", "holdout", "kernels", "media", "pages"},
     "photos": {"runs", "render", "kernels", "cameras", "media"},
     "multiview": {"photos", "scene", "cameras"},
     "runs": {"render", "field", "kernels", "scene", "cameras"},

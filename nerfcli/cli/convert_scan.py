@@ -43,12 +43,14 @@ def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console
     target, to = values["target"], values["to"]
 
     def work(path: Path, one_of_many: bool) -> bool:
-        from nerfcli.tomography.formats.given import Given
-        from nerfcli.workflows.scans import ASTRA, OWN, convert_scan, detect_scan, is_scan_input, judgement_record
+        from nerfcli.tomography.formats.read import recognise
 
-        if not is_scan_input(path):
+        if recognise(path) is None:
             _refuse(path, [name for name in given if name in OF_SCANS], of="scans, and this is none")
             return False
+        from nerfcli.tomography.formats.given import Given
+        from nerfcli.workflows.scans import ASTRA, OWN, convert_scan, detect_scan, judgement_record
+
         _refuse(path, [name for name in given if name not in (*OF_SCANS, *OF_BOTH)], of="photos, and this is a scan")
         said = Given(
             photons=values["photons"],

@@ -13,6 +13,7 @@ from nerfcli.errors import GATE_NOT_MET, UserError
 
 if TYPE_CHECKING:
     from nerfcli.doctor.examination import Diagnosis
+    from nerfcli.tomography.checks.examine import ScanDiagnosis
 
 _NAMES_SHOWN = 4
 _GATES = ("good", "look")
@@ -40,6 +41,9 @@ def doctor(
     cameras. Prints a table on stderr and writes a page with thumbnails next to the capture, CAPTURE-doctor.html. Each
     finding is good, look or bad, with its number, its threshold and advice.
 
+    Of a scan by X-rays: I > I0, drift, rings, counts, truncation, directions and number of views, the centre of
+    rotation, beam hardening.
+
     \b
     Examples:
       nerfcli doctor photos/kitchen
@@ -50,12 +54,18 @@ def doctor(
     """
     one_of(require, _GATES, "--require")
     from nerfcli.doctor.examination import content
+    from nerfcli.tomography.formats.read import recognise
     from nerfcli.workflows.doctor import examine_capture
 
     console = Console(quiet=quiet, json_lines=json)
 
     def work(path: Path, one_of_many: bool) -> None:
         page = result_path(path, suffix="-doctor.html", output=output, one_of_many=one_of_many)
+        if recognise(path) is not None:
+            if intrinsics is not None:
+                raise UserError(f"{path}: --intrinsics is for photos, and this is a scan", "leave --intrinsics out")
+            _examine_scan(path, page, console, overwrite=overwrite, require=require)
+            return
         with console.progress(f"doctor {path.name}") as update:
             diagnosis = examine_capture(
                 path,
@@ -74,7 +84,19 @@ def doctor(
     for_each_input(capture, work)
 
 
-def _print_table(diagnosis: "Diagnosis", console: Console) -> None:
+def _examine_scan(path: Path, page: Path, console: Console, *, overwrite: bool, require: str | None) -> None:
+    """The same for a scan by transmission."""
+    from nerfcli.workflows.scans import examine_scan_input, scan_diagnosis_record
+
+    with console.progress(f"doctor {path.name}") as update:
+        diagnosis = examine_scan_input(path, page, overwrite=overwrite, notify=console.note, progress=update)
+    _print_table(diagnosis, console)
+    console.result(page, scan_diagnosis_record(diagnosis))
+    if require is not None:
+        _hold_against(diagnosis, require)
+
+
+def _print_table(diagnosis: "Diagnosis | ScanDiagnosis", console: Console) -> None:
     rows = []
     for finding in diagnosis.findings:
         names = ", ".join(finding.names[:_NAMES_SHOWN])
@@ -86,7 +108,7 @@ def _print_table(diagnosis: "Diagnosis", console: Console) -> None:
         console.note(f"not checked: {check}: {reason}")
 
 
-def _hold_against(diagnosis: "Diagnosis", require: str) -> None:
+def _hold_against(diagnosis: "Diagnosis | ScanDiagnosis", require: str) -> None:
     """Raise if a finding is worse than required."""
     from nerfcli.findings import VERDICTS
 

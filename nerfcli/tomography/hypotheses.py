@@ -18,7 +18,7 @@ from nerfcli.tomography.scan import Scan
 Progress = Callable[[float, str], None]
 
 # Columns of the row on which the centre is looked for, and on which it is made precise.
-COARSE, FINE = 96, 256
+COARSE, FINE = 80, 200
 # The axis is looked for within this part of the detector's width on either side.
 RANGE = 0.12
 # Standard errors by which one hypothesis has to predict better than another.

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.kernels.numba_cpu.projection import back_project, project
+from nerfcli import kernels
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.scan import Scan
 
 # Steps of the reconstruction, accelerated; more fit noise.
 STEPS = 15
-MOST_VIEWS = 120
+MOST_VIEWS = 96
 # Rows of a cone beam within this part of the detector's height from the plane of the source count as fan beams.
 FAN_PART = 0.05
 
@@ -100,8 +100,13 @@ def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarra
     fitted, left = views[::2], views[1::2]
     grid = _grid(geometry)
     volume = _reconstructed(geometry.select(fitted), row.integrals[fitted], grid)
-    predicted = _forward(volume, geometry.select(left), grid).reshape(len(left), -1).numpy()
-    return ((predicted - row.integrals[left]) ** 2).mean(1)
+    others = _forward(volume, _rays(geometry.select(left)), grid).reshape(len(left), -1).numpy()
+    return ((others - row.integrals[left]) ** 2).mean(1)
+
+
+def predicted(volume: np.ndarray, row: Row, grid: VoxelGrid) -> np.ndarray:
+    """Line integrals (V, columns) of a volume (Y, X) along the rays of a row."""
+    return _forward(torch.from_numpy(volume[None]), _rays(row.geometry), grid).reshape(row.integrals.shape).numpy()
 
 
 def reconstructed(row: Row) -> tuple[np.ndarray, VoxelGrid]:
@@ -115,14 +120,14 @@ def _reconstructed(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGri
     measured = torch.from_numpy(np.ascontiguousarray(integrals, dtype=np.float32).reshape(-1))
     rays = _rays(geometry)
     ones = torch.ones(grid.shape)
-    chord = _forward(ones, geometry, grid)
+    chord = _forward(ones, rays, grid)
     by_ray = torch.where(chord > grid.size, 1 / chord.clamp_min(grid.size), 0)
     met = _backward(torch.ones_like(chord), rays, grid)
     by_voxel = torch.where(met > 0, 1 / met.clamp_min(1e-3 * float(met.max())), 0)
     volume = torch.zeros(grid.shape)
     ahead, momentum = volume, 1.0
     for _ in range(STEPS):
-        left = (measured - _forward(ahead, geometry, grid)) * by_ray
+        left = (measured - _forward(ahead, rays, grid)) * by_ray
         stepped = (ahead + by_voxel * _backward(left, rays, grid)).clamp_min(0)
         following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
         ahead = stepped + (momentum - 1) / following * (stepped - volume)
@@ -130,12 +135,16 @@ def _reconstructed(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGri
     return volume
 
 
-def _forward(volume: Tensor, geometry: ScanGeometry, grid: VoxelGrid) -> Tensor:
-    return project(volume, *_rays(geometry), first=grid.first, size=grid.size)
+def _forward(volume: Tensor, rays: tuple[Tensor, Tensor], grid: VoxelGrid) -> Tensor:
+    return _backend().project(volume, *rays, first=grid.first, size=grid.size)
 
 
 def _backward(values: Tensor, rays: tuple[Tensor, Tensor], grid: VoxelGrid) -> Tensor:
-    return back_project(values, *rays, shape=grid.shape, first=grid.first, size=grid.size)
+    return _backend().back_project(values, *rays, shape=grid.shape, first=grid.first, size=grid.size)
+
+
+def _backend() -> kernels.Backend:
+    return kernels.backend_for(torch.device("cpu"), torch.float32)
 
 
 def _rays(geometry: ScanGeometry) -> tuple[Tensor, Tensor]:

@@ -23,6 +23,10 @@ def describe(path: str | Path) -> dict[str, Any]:
         raise UserError(f"{folder} does not exist", "give a scene, a run, renders, or one of their files")
     if folder.name == RENDERS:
         folder = folder.parent
+    if _is_scan_to_describe(folder):
+        from nerfcli.workflows.scans import describe_scan
+
+        return describe_scan(folder)
     if folder.is_file() and folder.suffix == ".safetensors":
         from nerfcli.workflows.describe_run import describe_tensors
 
@@ -43,6 +47,15 @@ def describe(path: str | Path) -> dict[str, Any]:
     from nerfcli.workflows.describe_run import describe_run
 
     return describe_run(Run(folder))
+
+
+def _is_scan_to_describe(path: Path) -> bool:
+    """Whether it is a scan; depth and pictures of one projection are none, whatever stands beside them."""
+    if path.is_file() and path.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".png", ".safetensors"):
+        return False
+    from nerfcli.tomography.formats.read import recognise
+
+    return recognise(path) is not None
 
 
 def _describe_scene(folder: Path) -> dict[str, Any]:

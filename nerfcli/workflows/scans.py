@@ -7,11 +7,14 @@ from typing import Any
 import numpy as np
 
 from nerfcli.errors import GATE_NOT_MET, UserError
+from nerfcli.findings import as_json
 from nerfcli.tomography.astra import write_astra
+from nerfcli.tomography.checks.examine import ScanDiagnosis, examine_scan
+from nerfcli.tomography.checks.page import refuse_foreign, write_scan_page
 from nerfcli.tomography.circle import circle_from_json, circle_of, differences
 from nerfcli.tomography.formats.assemble import axis_column
 from nerfcli.tomography.formats.given import Given
-from nerfcli.tomography.formats.read import READERS, read_scan, recognise
+from nerfcli.tomography.formats.read import read_scan
 from nerfcli.tomography.hypotheses import Judgement, judge
 from nerfcli.tomography.scan import Scan, is_scan, load_scan, save_scan
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
@@ -37,15 +40,6 @@ class ConvertedScan:
     scan: Scan
     record: dict[str, Any]
     lines: tuple[str, ...]
-
-
-def is_scan_input(path: Path) -> bool:
-    """Whether a file or folder is a scan in a format that is read.
-
-    Raises:
-        UserError: it looks like one and cannot be read.
-    """
-    return recognise(path) is not None
 
 
 def convert_scan(
@@ -111,6 +105,35 @@ def detect_scan(
     return judge(scan, progress=progress)
 
 
+def examine_scan_input(
+    source: Path, page: Path, *, overwrite: bool = False, notify: Notify = silent, progress: Progress = no_progress
+) -> ScanDiagnosis:
+    """Make all checks of a scan, and write their page.
+
+    Raises:
+        UserError: it cannot be read, or something else stands where the page should go.
+    """
+    if page.is_dir():
+        raise UserError(f"{page} is a folder", "give the page's file name with -o")
+    if not overwrite:
+        refuse_foreign(page, source)
+    scan = read_scan(source)
+    notify(f"{source}: {in_words(scan)}")
+    diagnosis = examine_scan(scan, progress=progress)
+    write_scan_page(diagnosis, page, source=source)
+    return diagnosis
+
+
+def scan_diagnosis_record(diagnosis: ScanDiagnosis) -> dict[str, Any]:
+    """A diagnosis as plain values."""
+    return {
+        "kind": "scan",
+        "verdict": diagnosis.verdict,
+        "findings": [as_json(finding) for finding in diagnosis.findings],
+        "not_checked": dict(diagnosis.not_checked),
+    }
+
+
 def describe_scan(path: Path) -> dict[str, Any]:
     """What a scan folder, or a scan in a format that is read, holds.
 
@@ -137,9 +160,9 @@ def facts_of(scan: Scan) -> dict[str, Any]:
         "beam": "fan" if geometry.beam == "cone" and geometry.rows == 1 else geometry.beam,
         "values": scan.kind,
         "unit": scan.unit,
-        "pixel_at_object": [float(f"{width:.6g}"), float(f"{height:.6g}")],
+        "pixel_at_object": {"width": float(f"{width:.6g}"), "height": float(f"{height:.6g}")},
         "magnification": float(f"{np.median(geometry.magnification):.6g}"),
-        "angles_deg": [float(f"{angles.min():.6g}"), float(f"{angles.max():.6g}")] if around else None,
+        "angles_deg": {"from": _rounded(angles.min()), "to": _rounded(angles.max())} if around else None,
         "orbit": "a circle" if around else "views that are not on one circle",
         "source_origin": float(f"{circle.source_origin:.6g}") if around and geometry.beam == "cone" else None,
         "source_detector": float(f"{circle.source_detector:.6g}") if around and geometry.beam == "cone" else None,
@@ -148,6 +171,10 @@ def facts_of(scan: Scan) -> dict[str, Any]:
         "unusable": None if scan.usable is None else float(f"{1 - float(scan.usable.mean()):.4g}"),
         "truth": (scan.history.get("truth") or {}).get("path"),
     }
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}") + 0.0  # no minus before 0
 
 
 def in_words(scan: Scan) -> str:
@@ -190,11 +217,6 @@ def _proof(checks: dict[str, float]) -> str:
         f"read back: angles within {checks['angle_deg']:.1g} degrees, distances and pixel sizes within "
         f"{checks['length']:.1g} of themselves, the axis within {checks['shift_px']:.1g} px"
     )
-
-
-def formats_read() -> tuple[str, ...]:
-    """Names of the formats of scans."""
-    return tuple(READERS)
 
 
 def judgement_record(found: Judgement) -> dict[str, Any]:

@@ -1,0 +1,60 @@
+"""All checks of a scan."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from nerfcli.findings import Finding, worst
+from nerfcli.tomography.checks import coverage, fit, values
+from nerfcli.tomography.checks.sample import Sample, sample_of
+from nerfcli.tomography.scan import Scan
+
+Check = Callable[[Sample], Finding | str]
+CHECKS: dict[str, Check] = {
+    "open beam": values.above_open_beam,
+    "drift": values.drift,
+    "rings": values.rings,
+    "counts": values.counts,
+    "dead pixels": values.unusable,
+    "truncation": coverage.truncation,
+    "repeated angles": coverage.repeated_angles,
+    "missing wedge": coverage.missing_wedge,
+    "number of views": coverage.few_views,
+    "centre of rotation": fit.centre,
+    "beam hardening": fit.beam_hardening,
+}
+
+
+@dataclass(frozen=True)
+class ScanDiagnosis:
+    """What was found.
+
+    Args:
+        sample: what was looked at.
+        findings: of all checks that could be made, in their order.
+        not_checked: names of the others, with the reason.
+    """
+
+    sample: Sample
+    findings: tuple[Finding, ...]
+    not_checked: tuple[tuple[str, str], ...]
+
+    @property
+    def verdict(self) -> str:
+        """The worst of the findings' verdicts."""
+        return worst(finding.verdict for finding in self.findings)
+
+
+def examine_scan(scan: Scan, *, progress: Callable[[float, str], None] = lambda share, detail: None) -> ScanDiagnosis:
+    """Make all checks of a scan. Deterministic."""
+    progress(0.0, "reading")
+    sample = sample_of(scan)
+    findings: list[Finding] = []
+    not_checked: list[tuple[str, str]] = []
+    for number, (name, check) in enumerate(CHECKS.items()):
+        progress((1 + number) / (1 + len(CHECKS)), name)
+        found = check(sample)
+        if isinstance(found, Finding):
+            findings.append(found)
+        else:
+            not_checked.append((name, found))
+    return ScanDiagnosis(sample, tuple(findings), tuple(not_checked))

@@ -1,0 +1,110 @@
+"""Checks that need a quick reconstruction: where the axis is, and whether the beam hardens."""
+
+import numpy as np
+
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above
+from nerfcli.tomography.checks.sample import Sample
+from nerfcli.tomography.formats.assemble import axis_column
+from nerfcli.tomography.hypotheses import FEWEST_VIEWS, FINE, SIGNIFICANT, centre_of
+from nerfcli.tomography.quick import Row, predicted, reconstructed, telling_row
+
+CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
+# Views of a parallel beam that are half a turn apart to this part of a step show the same lines from the other end.
+_OPPOSITE = 1.01
+HARDENING_LOOK, HARDENING_BAD = 0.05, 0.25
+# Below this part of the variance explained, the object is not of one material, and hardening cannot be told from it.
+ONE_MATERIAL = 0.97
+
+
+def centre(sample: Sample) -> Finding | str:
+    """Where the axis of rotation is."""
+    scan = sample.scan
+    if scan.geometry.views < FEWEST_VIEWS:
+        return "too few views"
+    row = telling_row(scan)
+    stated = axis_column(scan.geometry)
+    found = centre_of(row.thinned())
+    column = stated - found.shift
+    gain = found.at_stated - found.errors
+    error = float(gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else 0.0
+    certain = float(gain.mean()) > SIGNIFICANT * error
+    number = abs(found.shift) if certain else 0.0
+    verdict = verdict_above(number, look=CENTRE_LOOK, bad=CENTRE_BAD)
+    pair = mirror_centre(row)
+    by_pair = f"; the pair of opposite views says {pair:.1f}" if pair is not None else ""
+    return Finding(
+        "centre of rotation",
+        verdict,
+        f"the axis is at column {column:.2f} +- {found.error:.2f}, the scan says {stated:.2f}{by_pair}",
+        abs(found.shift),
+        f"look from {CENTRE_LOOK:g} columns, bad from {CENTRE_BAD:g}, where it predicts other views better for certain",
+        "" if verdict == GOOD else f"convert with --centre-of-rotation {column:.2f}, or let the fit find it",
+    )
+
+
+def mirror_centre(row: Row) -> float | None:
+    """The column of the axis by two opposite views of a parallel beam, which mirror each other; None without such."""
+    geometry = row.geometry
+    if geometry.beam != "parallel":
+        return None
+    angles = np.arctan2(geometry.emitter[:, 1], geometry.emitter[:, 0])
+    step = float(np.median(np.abs(np.diff(np.unwrap(angles))))) if len(angles) > 1 else 0.0
+    apart = np.abs(np.angle(np.exp(1j * (angles - angles[0] - np.pi))))
+    other = int(np.argmin(apart))
+    if apart[other] > _OPPOSITE * step:
+        return None
+    one, two = row.integrals[0].astype(np.float64), row.integrals[other].astype(np.float64)
+    columns = np.arange(len(one), dtype=np.float64)
+    least, best = np.inf, None
+    for middle in np.arange(0.3 * len(one), 0.7 * len(one), 0.25):
+        mirrored = np.interp(2 * middle - columns, columns, two, left=np.nan, right=np.nan)
+        there = np.isfinite(mirrored)
+        error = float(np.mean((one[there] - mirrored[there]) ** 2)) if there.sum() > len(one) // 3 else np.inf
+        if error < least:
+            least, best = error, float(middle)
+    return best
+
+
+def beam_hardening(sample: Sample) -> Finding | str:
+    """Whether line integrals grow less than path lengths through an object of one material."""
+    if sample.scan.geometry.views < FEWEST_VIEWS:
+        return "too few views"
+    row = telling_row(sample.scan).thinned().binned(FINE)
+    volume, grid = reconstructed(row)
+    inside = volume > _otsu(volume)
+    lengths = predicted(inside.astype(np.float32), row, grid)
+    longest = float(np.quantile(lengths, 0.999))
+    used = lengths > 0.1 * longest
+    if longest <= 0 or used.sum() < 100:
+        return "there is no object to speak of"
+    length, p = lengths[used].astype(np.float64) / longest, row.integrals[used].astype(np.float64)
+    (straight, bent), *_ = np.linalg.lstsq(np.stack([length, length**2], axis=1), p, rcond=None)
+    left = p - straight * length - bent * length**2
+    explained = 1 - float(left.var() / p.var())
+    if explained < ONE_MATERIAL:
+        return f"path lengths explain {100 * explained:.0f} % of the line integrals: the object is not of one material"
+    number = float(-bent / straight) if straight > 0 else 0.0
+    verdict = BAD if number >= HARDENING_BAD else LOOK if number >= HARDENING_LOOK else GOOD
+    return Finding(
+        "beam hardening",
+        verdict,
+        f"behind the longest path the line integral is {100 * number:.3g} % lower than short paths promise "
+        f"({100 * explained:.4g} % explained)",
+        number,
+        f"look from {100 * HARDENING_LOOK:g} %, bad from {100 * HARDENING_BAD:g} %",
+        ""
+        if verdict == GOOD
+        else "values inside come out too low (cupping): filter the beam, or correct line integrals by a polynomial",
+    )
+
+
+def _otsu(volume: np.ndarray) -> float:
+    """The threshold between two classes of values. Source: Otsu 1979, IEEE SMC 9(1)."""
+    counts, edges = np.histogram(volume, bins=256)
+    middles = (edges[:-1] + edges[1:]) / 2
+    below = np.cumsum(counts)
+    above = below[-1] - below
+    sums = np.cumsum(counts * middles)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
+    return float(middles[int(np.nanargmax(np.where(above > 0, between, np.nan)))])

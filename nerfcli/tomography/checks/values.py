@@ -1,0 +1,133 @@
+"""Checks of what the detector measured: open beam, drift, rings, counts."""
+
+import numpy as np
+
+from nerfcli.findings import Finding, several, verdict_above, verdict_below, worst
+from nerfcli.tomography.checks.sample import Sample
+
+# Deviations of the noise beyond which a pixel is brighter than the open beam.
+BEYOND_NOISE = 3.0
+# Noise that is normal puts 0.13 % of the air there.
+BRIGHT_LOOK, BRIGHT_BAD = 0.002, 0.05
+# Negative line integrals at all: noise makes half of the air so, but this part of all pixels is more than that.
+NEGATIVE_LOOK = 0.10
+DRIFT_LOOK, DRIFT_BAD = 0.005, 0.03
+# A pixel draws a ring that is off its neighbours by this much in the median over views, and to the same side in this
+# part of them: an edge of the object is on another side in other views.
+RING_FLOOR, RING_NOISE, RING_VIEWS = 0.005, 0.5, 0.95
+RINGS_LOOK, RINGS_BAD = 0.002, 0.05
+PHOTONS_LOOK, PHOTONS_BAD = 100.0, 10.0
+UNUSABLE_LOOK, UNUSABLE_BAD = 0.01, 0.2
+
+
+def above_open_beam(sample: Sample) -> Finding:
+    """How many pixels are brighter than without an object."""
+    p = sample.integrals
+    negative = float((p < 0).mean())
+    beyond = float((p < -BEYOND_NOISE * sample.noise).mean())
+    verdict = verdict_above(beyond, look=BRIGHT_LOOK, bad=BRIGHT_BAD)
+    air = p[np.abs(p) < sample.air_level]
+    middle = float(np.median(air)) if len(air) else 0.0
+    if negative > NEGATIVE_LOOK and middle < 0:
+        verdict = worst((verdict, verdict_above(negative, look=NEGATIVE_LOOK, bad=2)))
+    return Finding(
+        "open beam",
+        verdict,
+        f"{100 * negative:.1f} % of the pixels have I > I0, {100 * beyond:.2g} % by more than noise; "
+        f"air has a median line integral of {middle:.2g}",
+        beyond,
+        f"look from {100 * BRIGHT_LOOK:g} % beyond {BEYOND_NOISE:g} deviations of noise (or {100 * NEGATIVE_LOOK:g} % "
+        f"at all with air below 0), bad from {100 * BRIGHT_BAD:g} %",
+        "" if verdict == "good" else "let the fit scale I0 per view; never clip or take logarithms of such values",
+    )
+
+
+def drift(sample: Sample) -> Finding | str:
+    """How much the air differs between views; in words why it cannot be told."""
+    border = sample.border
+    if float(np.median(border)) > sample.air_level:
+        return "no column sees past the object"
+    means = np.median(np.minimum(border[..., 0], border[..., 1]), axis=1)
+    if len(means) < 4:
+        return "too few views"
+    low, high = np.quantile(means, [0.02, 0.98])
+    # What noise alone makes of a mean over these pixels.
+    pixels = border.shape[1] * max(1, round(0.02 * sample.integrals.shape[2]))
+    by_noise = 4 * sample.noise / np.sqrt(pixels)
+    change = float(high - low)
+    number = change if change > by_noise else 0.0
+    verdict = verdict_above(number, look=DRIFT_LOOK, bad=DRIFT_BAD)
+    return Finding(
+        "drift",
+        verdict,
+        f"air changes by {100 * change:.2g} % between views (noise alone makes up to {100 * by_noise:.2g} %)",
+        number,
+        f"look from {100 * DRIFT_LOOK:g} %, bad from {100 * DRIFT_BAD:g} %",
+        "" if verdict == "good" else "the source or the camera drifts: let the fit scale I0 per view",
+    )
+
+
+def rings(sample: Sample) -> Finding | str:
+    """How many columns are off their neighbours in all views."""
+    from scipy.ndimage import median_filter
+
+    views, _, columns = sample.integrals.shape
+    if views < 16 or columns < 32:
+        return "too few views or columns"
+    some = sample.integrals[:: max(1, views // 100), :: max(1, sample.integrals.shape[1] // 8)]
+    offsets = (some - median_filter(some, size=(1, 1, 9), mode="nearest"))[..., 4:-4]
+    inner = np.median(offsets, axis=0)  # (rows, columns)
+    limit = max(RING_FLOOR, RING_NOISE * sample.noise)
+    agree = np.maximum((offsets > 0).mean(0), (offsets < 0).mean(0))
+    bad = (np.abs(inner) > limit) & (agree >= RING_VIEWS)
+    share = float(bad.mean())
+    verdict = verdict_above(share, look=RINGS_LOOK, bad=RINGS_BAD)
+    worst_column = int(np.argmax((np.abs(inner) * bad).max(0))) + 4
+    return Finding(
+        "rings",
+        verdict,
+        f"{100 * share:.2g} % of the detector's pixels are off their neighbours in all views by more than {limit:.2g}"
+        + (f"; the worst is column {worst_column}" if share > 0 else ""),
+        share,
+        f"look from {100 * RINGS_LOOK:g} %, bad from {100 * RINGS_BAD:g} %",
+        "" if verdict == "good" else "they draw rings around the axis: take newer flats, or mark these pixels unusable",
+    )
+
+
+def counts(sample: Sample) -> Finding | str:
+    """How few photons come through the thickest part."""
+    scan = sample.scan
+    if scan.kind == "line_integral":
+        return "line integrals do not tell how many photons were counted"
+    if scan.photons_per_value is None:
+        return "how many photons a value stands for is not known: give --photons when converting"
+    open_beam = 1.0 if scan.open_beam is None else float(np.median(scan.open_beam))
+    photons = scan.photons_per_value * open_beam
+    least = photons * float(np.exp(-np.quantile(sample.integrals, 0.999)))
+    verdict = verdict_below(least, look=PHOTONS_LOOK, bad=PHOTONS_BAD)
+    return Finding(
+        "counts",
+        verdict,
+        f"an open pixel counts {photons:.3g} photons, behind the thickest part {least:.3g}",
+        least,
+        f"look below {PHOTONS_LOOK:g} photons, bad below {PHOTONS_BAD:g}",
+        ""
+        if verdict == "good"
+        else "logarithms of such counts are biased: fit the counts by their Poisson likelihood; expose longer",
+    )
+
+
+def unusable(sample: Sample) -> Finding:
+    """How many pixels are left out."""
+    usable = sample.scan.usable
+    share = 0.0 if usable is None else 1 - float(usable.mean())
+    views = 0 if usable is None or len(usable) == 1 else int((~usable.any(axis=(1, 2))).sum())
+    verdict = verdict_above(share, look=UNUSABLE_LOOK, bad=UNUSABLE_BAD)
+    return Finding(
+        "dead pixels",
+        verdict,
+        f"{100 * share:.2g} % of the values are left out" + (f", {several(views, 'whole view')}" if views else ""),
+        share,
+        f"look from {100 * UNUSABLE_LOOK:g} %, bad from {100 * UNUSABLE_BAD:g} %",
+        "" if verdict == "good" else "check the flats, and export damaged frames again",
+    )
