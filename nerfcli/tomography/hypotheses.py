@@ -134,14 +134,14 @@ def judge(scan: Scan, *, progress: Progress = lambda share, detail: None) -> Jud
             )
     hypotheses.sort(key=lambda each: (each.rms, not each.as_stated))
     better, worse = (plain, other) if plain.errors.mean() <= other.errors.mean() else (other, plain)
-    margin, ratio = _margin(better.errors, worse.errors)
-    decided = not parallel and margin > SIGNIFICANT and ratio > LEAST_RATIO
+    by, ratio = margin(better.errors, worse.errors)
+    decided = not parallel and by > SIGNIFICANT and ratio > LEAST_RATIO
     verdict = "undecided" if not decided else "holds" if better is plain else "mirrored"
     chosen = other if verdict == "mirrored" else plain
-    centre_margin, centre_ratio = _margin(chosen.errors, chosen.at_stated)
+    centre_margin, centre_ratio = margin(chosen.errors, chosen.at_stated)
     base = last - stated if verdict == "mirrored" else stated
     return Judgement(
-        *(tuple(hypotheses), verdict, ratio, margin, base, base - chosen.shift, chosen.error),
+        *(tuple(hypotheses), verdict, ratio, by, base, base - chosen.shift, chosen.error),
         centre_ratio=centre_ratio,
         centre_holds=not (centre_margin > SIGNIFICANT and abs(chosen.shift) > max(0.1, 2 * chosen.error)),
         ambiguity=_PARALLEL if parallel else _CONE,
@@ -196,13 +196,20 @@ def _parabola(best: float, step: float, errors: Callable[[float], np.ndarray]) -
     return best + at * step, max(error * step, 1e-3)
 
 
-def _margin(better: np.ndarray, worse: np.ndarray) -> tuple[float, float]:
-    """By how many standard errors over views one is better, and the ratio of rms."""
+def margin(better: np.ndarray, worse: np.ndarray) -> tuple[float, float]:
+    """By how many standard errors over views one is better, and the ratio of rms.
+
+    The larger of two tests: of the mean gain, and of signed ranks, which a few views with large gains do not weaken.
+    Source of the second: Wilcoxon 1945, Individual comparisons by ranking methods, Biometrics Bulletin 1(6).
+    """
     gain = worse - better
-    error = float(gain.std(ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else 0.0
     ratio = float(np.sqrt(worse.mean() / max(better.mean(), 1e-300)))
-    mean = float(gain.mean())
-    return (mean / error if error > 0 else (np.inf if mean > 0 else 0.0)), ratio
+    if len(gain) < 2 or not gain.any():
+        return 0.0, ratio
+    error = float(gain.std(ddof=1) / np.sqrt(len(gain)))
+    ranks = 1 + np.argsort(np.argsort(np.abs(gain)))
+    by_ranks = float((np.sign(gain) * ranks).sum() / np.sqrt((ranks.astype(float) ** 2).sum()))
+    return max(float(gain.mean()) / max(error, 1e-300), by_ranks), ratio
 
 
 _CONE = (

@@ -85,7 +85,8 @@ def missing_wedge(sample: Sample) -> Finding | str:
     fan = _fan(geometry)
     # A source that leaves out a gap below a half turn less the fan meets each line from its other end.
     span = 2 * np.pi - (gap if gap > 2 * step else 0.0)
-    missing = max(0.0, np.pi - span - (step if geometry.beam == "parallel" else 0.0))
+    missing = np.pi - span - (step if geometry.beam == "parallel" else 0.0)
+    missing = missing if missing > step / 2 else 0.0
     missing_deg, span_deg = float(np.degrees(missing)), float(np.degrees(span))
     once = span < np.pi + fan - step and missing == 0
     begin = float(np.degrees(ordered[widest]))

@@ -15,6 +15,8 @@ DRIFT_LOOK, DRIFT_BAD = 0.005, 0.03
 # A pixel draws a ring that is off its neighbours by this much in the median over views, and to the same side in this
 # part of them: an edge of the object is on another side in other views.
 RING_FLOOR, RING_NOISE, RING_VIEWS = 0.005, 0.5, 0.95
+# Change over four columns, as a part of the object's line integral, that is a border.
+STEEP = 0.15
 RINGS_LOOK, RINGS_BAD = 0.002, 0.05
 PHOTONS_LOOK, PHOTONS_BAD = 100.0, 10.0
 UNUSABLE_LOOK, UNUSABLE_BAD = 0.01, 0.2
@@ -28,7 +30,7 @@ def above_open_beam(sample: Sample) -> Finding:
     verdict = verdict_above(beyond, look=BRIGHT_LOOK, bad=BRIGHT_BAD)
     air = p[np.abs(p) < sample.air_level]
     middle = float(np.median(air)) if len(air) else 0.0
-    if negative > NEGATIVE_LOOK and middle < 0:
+    if negative > NEGATIVE_LOOK and middle < -sample.noise / 2:
         verdict = worst((verdict, verdict_above(negative, look=NEGATIVE_LOOK, bad=2)))
     return Finding(
         "open beam",
@@ -37,7 +39,7 @@ def above_open_beam(sample: Sample) -> Finding:
         f"air has a median line integral of {middle:.2g}",
         beyond,
         f"look from {100 * BRIGHT_LOOK:g} % beyond {BEYOND_NOISE:g} deviations of noise (or {100 * NEGATIVE_LOOK:g} % "
-        f"at all with air below 0), bad from {100 * BRIGHT_BAD:g} %",
+        f"at all with air clearly below 0), bad from {100 * BRIGHT_BAD:g} %",
         "" if verdict == "good" else "let the fit scale I0 per view; never clip or take logarithms of such values",
     )
 
@@ -54,13 +56,12 @@ def drift(sample: Sample) -> Finding | str:
     # What noise alone makes of a mean over these pixels.
     pixels = border.shape[1] * max(1, round(0.02 * sample.integrals.shape[2]))
     by_noise = 4 * sample.noise / np.sqrt(pixels)
-    change = float(high - low)
-    number = change if change > by_noise else 0.0
+    number = float(np.sqrt(max((high - low) ** 2 - by_noise**2, 0)))
     verdict = verdict_above(number, look=DRIFT_LOOK, bad=DRIFT_BAD)
     return Finding(
         "drift",
         verdict,
-        f"air changes by {100 * change:.2g} % between views (noise alone makes up to {100 * by_noise:.2g} %)",
+        f"air changes by {100 * number:.2g} % between views, beyond the {100 * by_noise:.2g} % of noise",
         number,
         f"look from {100 * DRIFT_LOOK:g} %, bad from {100 * DRIFT_BAD:g} %",
         "" if verdict == "good" else "the source or the camera drifts: let the fit scale I0 per view",
@@ -69,20 +70,22 @@ def drift(sample: Sample) -> Finding | str:
 
 def rings(sample: Sample) -> Finding | str:
     """How many columns are off their neighbours in all views."""
-    from scipy.ndimage import median_filter
-
     views, _, columns = sample.integrals.shape
     if views < 16 or columns < 32:
         return "too few views or columns"
-    some = sample.integrals[:: max(1, views // 100), :: max(1, sample.integrals.shape[1] // 8)]
-    offsets = (some - median_filter(some, size=(1, 1, 9), mode="nearest"))[..., 4:-4]
-    inner = np.median(offsets, axis=0)  # (rows, columns)
-    limit = max(RING_FLOOR, RING_NOISE * sample.noise)
+    p = sample.integrals[:: max(1, views // 100), :: max(1, sample.integrals.shape[1] // 8)]
+    # Off the cubic through two neighbours on either side, which smooth objects follow.
+    outer, near = p[..., :-4] + p[..., 4:], p[..., 1:-3] + p[..., 3:-1]
+    offsets = p[..., 2:-2] - (4 * near - outer) / 6
+    inner = np.median(offsets, axis=0)  # (rows, columns - 4)
     agree = np.maximum((offsets > 0).mean(0), (offsets < 0).mean(0))
-    bad = (np.abs(inner) > limit) & (agree >= RING_VIEWS)
+    # The border of a round object stands in the same columns in all views.
+    steep = np.median(np.abs(p[..., 4:] - p[..., :-4]), axis=0) > STEEP * sample.object_level
+    limit = max(RING_FLOOR, RING_NOISE * sample.noise)
+    bad = (np.abs(inner) > limit) & (agree >= RING_VIEWS) & ~steep
     share = float(bad.mean())
     verdict = verdict_above(share, look=RINGS_LOOK, bad=RINGS_BAD)
-    worst_column = int(np.argmax((np.abs(inner) * bad).max(0))) + 4
+    worst_column = int(np.argmax((np.abs(inner) * bad).max(0))) + 2
     return Finding(
         "rings",
         verdict,
@@ -103,7 +106,10 @@ def counts(sample: Sample) -> Finding | str:
         return "how many photons a value stands for is not known: give --photons when converting"
     open_beam = 1.0 if scan.open_beam is None else float(np.median(scan.open_beam))
     photons = scan.photons_per_value * open_beam
-    least = photons * float(np.exp(-np.quantile(sample.integrals, 0.999)))
+    # Means over neighbours: the least of single pixels tells of noise.
+    wide = max(1, min(5, sample.integrals.shape[2] // 8))
+    through = np.exp(-sample.integrals[..., : sample.integrals.shape[2] // wide * wide])
+    least = photons * float(np.quantile(through.reshape(*through.shape[:2], -1, wide).mean(-1), 0.005))
     verdict = verdict_below(least, look=PHOTONS_LOOK, bad=PHOTONS_BAD)
     return Finding(
         "counts",

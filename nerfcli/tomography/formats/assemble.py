@@ -40,6 +40,7 @@ class Found:
         names: of the views, for errors.
         notes: for the user.
         history: more for `Scan.history`.
+        stated_mm: millimetres of the unit that the file states, which are multiplied in already; 1 if it states none.
     """
 
     path: Path
@@ -54,6 +55,7 @@ class Found:
     names: Sequence[str] = ()
     notes: Sequence[str] = ()
     history: Mapping[str, Any] | None = None
+    stated_mm: float = 1.0
 
 
 def scan_of(found: Found, given: Given) -> Scan:
@@ -143,6 +145,7 @@ def _in_millimetres(found: Found, given: Given) -> tuple[str, Circle | ScanGeome
     factor = MILLIMETRES.get(given.unit)
     if factor is None:
         raise UserError(f"--unit {given.unit} is no unit of length", f"choose one of {', '.join(sorted(MILLIMETRES))}")
+    factor /= found.stated_mm
     if isinstance(found.geometry, Circle):
         return "mm", found.geometry.scaled(factor)
     g = found.geometry

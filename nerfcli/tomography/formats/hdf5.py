@@ -103,7 +103,7 @@ def _parallel(
     *,
     flats: np.ndarray | None,
     darks: np.ndarray | None,
-    sides: tuple[float, float] | None,
+    sides: tuple[float, float, float] | None,
     given: Given,
 ) -> Scan:
     for name, frames in (("flats", flats), ("darks", darks)):
@@ -114,7 +114,7 @@ def _parallel(
                 "flats and darks come from the detector of the projections: crop them the same way",
             )
     notes = ["the file does not say which way the object turned: counter-clockwise is assumed"]
-    width, height = (1.0, 1.0) if sides is None else sides
+    width, height, stated = (1.0, 1.0, 1.0) if sides is None else sides
     circle = Circle("parallel", tuple(angles.tolist()), width, height, data.shape[1], data.shape[2])
     unit = "mm" if sides is not None else UNKNOWN_UNIT
     if sides is None and given.unit is None:
@@ -131,7 +131,7 @@ def _parallel(
     else:
         beam = open_beam_of(flats, darks)
     kind = "transmission" if beam is None else "counts"
-    return scan_of(Found(path, form, data, kind, circle, unit, beam=beam, notes=notes), given)
+    return scan_of(Found(path, form, data, kind, circle, unit, beam=beam, notes=notes, stated_mm=stated), given)
 
 
 def _opened(path: Path) -> Any:
@@ -190,18 +190,19 @@ def _unit(dataset: Any) -> str | None:
     return None
 
 
-def _pixel_mm(file: Any, path: Path) -> tuple[float, float] | None:
-    """Width and height of a pixel in mm, None if the file does not say."""
+def _pixel_mm(file: Any, path: Path) -> tuple[float, float, float] | None:
+    """Width and height of a pixel in mm, and mm of the width's unit; None if the file does not say."""
     names = {found.rpartition("/")[2]: found for found in _walk(file)}
     width = next((names[name] for name in _PIXEL_WIDTH if name in names), None)
     if width is None:
         return None
     height = next((names[name] for name in _PIXEL_HEIGHT if name in names), width)
-    sides = []
+    sides, units = [], []
     for name in (width, height):
         value = np.asarray(file[name][...]).reshape(-1)
         unit = _unit(file[name]) or "m"  # the unit of NeXus
         if len(value) == 0 or not np.issubdtype(value.dtype, np.number):
             return None
-        sides.append(float(value[0]) * millimetres(unit, where=f"{path}: {name}"))
-    return sides[0], sides[1]
+        units.append(millimetres(unit, where=f"{path}: {name}"))
+        sides.append(float(value[0]) * units[-1])
+    return sides[0], sides[1], units[0]

@@ -55,7 +55,17 @@ def read_heltomo(path: Path, given: Given = Given()) -> Scan:
     )
     project = str(getattr(parameters, "projectName", path.stem))
     return scan_of(
-        Found(path, "heltomo", sinogram[:, None], "line_integral", circle, "mm", history={"project": project}), given
+        Found(
+            path,
+            "heltomo",
+            sinogram[:, None],
+            "line_integral",
+            circle,
+            "mm",
+            history={"project": project},
+            stated_mm=unit,
+        ),
+        given,
     )
 
 

@@ -77,6 +77,7 @@ def read_stated_stack(path: Path, given: Given = Given()) -> Scan:
         beam=beam,
         photons=photons if beam is None else None,
         held_out=_held_out(fields, views),
+        stated_mm=factor,
     )
     if photons is not None and given.photons is None and measured != "line_integral":
         given = replace(given, photons=photons)

@@ -1,0 +1,62 @@
+"""Scans of the phantom, computed from its closed-form chords: no projector of the program is part of them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from phantom import Ellipsoid, bean, line_integrals
+
+from nerfcli.tomography.circle import Circle
+from nerfcli.tomography.geometry import Beam
+from nerfcli.tomography.scan import Scan, held_out_views
+
+
+def phantom_circle(
+    *,
+    beam: Beam = "cone",
+    views: int = 36,
+    first_deg: float = 0.0,
+    span_deg: float = 360.0,
+    columns: int = 48,
+    rows: int = 1,
+    column_shift: float = 0.0,
+) -> Circle:
+    """A circle around the phantom of `bean`, some 20 wide: a fan of 40 degrees for a cone beam."""
+    angles = np.radians(first_deg + span_deg / views * np.arange(views))
+    width = 24 / columns
+    magnified = 2.0 if beam == "cone" else 1.0
+    side = width * magnified
+    return Circle(
+        beam,
+        tuple(angles.tolist()),
+        *(side, side, rows, columns),
+        source_origin=34.0 if beam == "cone" else 0.0,
+        source_detector=68.0 if beam == "cone" else 0.0,
+        column_shift=column_shift,
+    )
+
+
+def scan_of_phantom(
+    circle: Circle,
+    *,
+    stated: Circle | None = None,
+    photons: float | None = None,
+    phantom: Sequence[Ellipsoid] = (),
+    seed: int = 0,
+) -> Scan:
+    """Line integrals, or with photons transmissions with counting noise, of the phantom on a circle.
+
+    Args:
+        circle: as the scanner really stood.
+        stated: as its file says.
+        photons: of an open pixel.
+        phantom: instead of `bean`.
+        seed: of the noise.
+    """
+    integrals = line_integrals(phantom or bean(), *circle.geometry().rays())
+    held_out = held_out_views(len(circle.angles))
+    geometry = (stated or circle).geometry()
+    if photons is None:
+        return Scan(geometry, "line_integral", integrals.astype(np.float32), held_out=held_out)
+    counts = np.random.default_rng(seed).poisson(photons * np.exp(-integrals))
+    values = (counts / photons).astype(np.float32)
+    return Scan(geometry, "transmission", values, photons_per_value=photons, held_out=held_out)

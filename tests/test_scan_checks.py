@@ -1,0 +1,189 @@
+"""Checks of nerfcli doctor on scans of a phantom with one fault each, and on one without."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import error_of, nerfcli
+from phantom import Ellipsoid
+from scan_of_phantom import phantom_circle, scan_of_phantom
+
+from nerfcli.errors import GATE_NOT_MET
+from nerfcli.findings import Finding
+from nerfcli.tomography.checks.examine import CHECKS, examine_scan
+from nerfcli.tomography.checks.sample import sample_of
+from nerfcli.tomography.scan import Scan, save_scan
+
+VIEWS, COLUMNS = 126, 64
+SOLID = (Ellipsoid((0.5, -0.3, 0), (8, 6, 7), 0.3, turn=0.4),)
+
+
+def scan(**changes: object) -> Scan:
+    """A fan beam of a solid with 30,000 photons."""
+    circle = phantom_circle(views=VIEWS, columns=COLUMNS, **changes)  # type: ignore[arg-type]
+    return scan_of_phantom(circle, photons=3e4, phantom=SOLID)
+
+
+def checked(name: str, of: Scan) -> Finding | str:
+    return CHECKS[name](sample_of(of))
+
+
+def finding(name: str, of: Scan) -> Finding:
+    found = checked(name, of)
+    assert isinstance(found, Finding), found
+    return found
+
+
+def changed(of: Scan, change: Callable[[np.ndarray], np.ndarray]) -> Scan:
+    return replace(of, values=change(np.array(of.values)).astype(np.float32))
+
+
+def test_a_sound_scan_is_sound() -> None:
+    found = examine_scan(scan())
+    verdicts = {each.check: each.verdict for each in found.findings}
+    assert not found.not_checked
+    assert verdicts.pop("number of views") == "good"
+    assert set(verdicts.values()) == {"good"}, verdicts
+    assert len(verdicts) + 1 == len(CHECKS)
+
+
+def test_pixels_brighter_than_the_open_beam() -> None:
+    found = finding("open beam", changed(scan(), lambda values: values * 1.1))
+    assert found.verdict == "bad"
+    assert "have I > I0" in found.summary
+
+
+def test_drift_of_the_source() -> None:
+    """A sine of +- 2 %: 4 % between views."""
+    factors = 1 + 0.02 * np.sin(np.linspace(0, 6, VIEWS))[:, None, None]
+    found = finding("drift", changed(scan(), lambda values: values * factors))
+    assert found.verdict == "bad"
+    assert found.number == pytest.approx(0.04, rel=0.2)
+
+
+def test_constant_columns_are_rings() -> None:
+    def wrong(values: np.ndarray) -> np.ndarray:
+        values[:, :, [20, 41]] *= 0.95
+        return values
+
+    clear = scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), photons=1e6, phantom=SOLID)
+    found = finding("rings", changed(clear, wrong))
+    assert found.verdict != "good"
+    # A wrong column also lifts what its neighbours are compared with.
+    assert 2 / 60 <= (found.number or 0) <= 6 / 60
+
+
+def test_few_photons() -> None:
+    """Closed form: 100 photons through 2 * 8 * 0.3 = 4.8 leave 0.8, and 500 leave 4."""
+    low = scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), photons=500, phantom=SOLID)
+    found = finding("counts", low)
+    assert found.verdict == "bad"
+    assert 1 < (found.number or 0) < 6
+    assert "--photons" in str(checked("counts", replace(low, photons_per_value=None)))
+
+
+def test_an_object_wider_than_the_detector() -> None:
+    wide = scan_of_phantom(
+        phantom_circle(views=VIEWS, columns=COLUMNS), phantom=(Ellipsoid((6, 0, 0), (9, 5, 5), 0.3),)
+    )
+    found = finding("truncation", wide)
+    assert found.verdict == "bad"
+    assert "on both sides" in found.summary
+    assert "no column sees" not in str(found)
+
+
+@pytest.mark.parametrize(("held_out", "verdict"), [((), "look"), ((0, VIEWS), "look"), ((VIEWS,), "bad")])
+def test_0_and_360_degrees(held_out: tuple[int, ...], verdict: str) -> None:
+    circle = phantom_circle(views=VIEWS, columns=COLUMNS)
+    both = replace(circle, angles=(*circle.angles, circle.angles[0] + 2 * np.pi))
+    found = finding("repeated angles", replace(scan_of_phantom(both), held_out=held_out))
+    assert found.verdict == verdict
+    assert found.number == 1
+    assert "0 and 360 degrees" in found.summary
+
+
+@pytest.mark.parametrize(
+    ("beam", "span", "missing", "verdict"),
+    [
+        ("parallel", 180, 0, "good"),
+        ("parallel", 120, 60, "bad"),
+        ("parallel", 170, 10, "look"),
+        ("cone", 360, 0, "good"),
+        ("cone", 90, 90, "bad"),
+        ("cone", 190, 0, "look"),  # less than 180 and the fan of 39
+        ("cone", 240, 0, "good"),
+    ],
+)
+def test_the_missing_wedge_is_named(beam: str, span: float, missing: float, verdict: str) -> None:
+    """Closed form, to a step of the views."""
+    kind = "cone" if beam == "cone" else "parallel"
+    circle = phantom_circle(beam=kind, views=VIEWS, columns=COLUMNS, span_deg=span)
+    found = finding("missing wedge", scan_of_phantom(circle))
+    assert found.verdict == verdict
+    assert found.number == pytest.approx(missing, abs=2 * span / VIEWS)
+    assert ("is missing, ray directions" in found.summary) == (missing > 0)
+
+
+def test_too_few_views_for_the_detector() -> None:
+    found = finding("number of views", scan_of_phantom(phantom_circle(views=24, columns=64)))
+    assert found.verdict == "look"
+    assert found.number == pytest.approx(20 / (np.pi / 2 * 64))
+
+
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+def test_a_centre_off_the_middle(beam: str) -> None:
+    kind = "cone" if beam == "cone" else "parallel"
+    circle = phantom_circle(beam=kind, views=48, columns=COLUMNS, span_deg=360)
+    moved = scan_of_phantom(replace(circle, column_shift=2.5), stated=circle, photons=3e4)
+    found = finding("centre of rotation", moved)
+    assert found.verdict == "bad"
+    assert found.number == pytest.approx(2.5, abs=0.1)
+    assert "--centre-of-rotation 29.0" in found.advice or "--centre-of-rotation 28.9" in found.advice
+    assert ("opposite views" in found.summary) == (beam == "parallel")
+
+
+@pytest.mark.parametrize(("bend", "verdict"), [(0.0, "good"), (0.10, "look"), (0.30, "bad")])
+def test_beam_hardening_is_named(bend: float, verdict: str) -> None:
+    """Line integrals lowered by a square that takes a known part at the longest path, 16 * 0.3 = 4.8."""
+    circle = phantom_circle(views=VIEWS, columns=COLUMNS)
+    hard = scan_of_phantom(circle, phantom=SOLID)
+    found = finding("beam hardening", changed(hard, lambda p: p * (1 - bend * p / 4.8)))
+    assert found.verdict == verdict
+    assert found.number == pytest.approx(bend, abs=0.04)
+
+
+def test_hardening_is_not_told_from_two_materials() -> None:
+    two = (*SOLID, Ellipsoid((2, 1, 0), (2, 2, 2), 3.0))
+    answer = checked("beam hardening", scan_of_phantom(phantom_circle(views=VIEWS, columns=COLUMNS), phantom=two))
+    assert "not of one material" in str(answer)
+
+
+def test_the_command_writes_a_page_and_holds_a_gate(tmp_path: Path) -> None:
+    folder, page = tmp_path / "scan", tmp_path / "page.html"
+    save_scan(folder, changed(scan(), lambda values: values * 1.1))
+    result = nerfcli("doctor", folder, "-o", page, "--json")
+    record = json.loads(result.stdout)
+    assert record["verdict"] == "bad"
+    assert {each["check"] for each in record["findings"]} <= set(CHECKS)
+    text = page.read_text()
+    assert "Sinogram" in text
+    assert "have I &gt; I0" in text
+    gated = nerfcli("doctor", folder, "-o", page, "--require", "look")
+    assert gated.exit_code == GATE_NOT_MET
+    assert "open beam (bad)" in error_of(gated)[0]
+
+
+def test_flats_tell_the_photons() -> None:
+    """Known truth: 8000 photons a pixel at a gain of 0.25 values a photon, with noise of reading and drift; 5 %."""
+    from nerfcli.tomography.open_beam import open_beam_of
+
+    rng = np.random.default_rng(0)
+    lamp = 1 + 0.02 * rng.normal(size=(12, 1, 1))
+    flats = 50 + 0.25 * rng.poisson(8000 * lamp * np.ones((12, 40, 40))) + rng.normal(0, 12, (12, 40, 40))
+    darks = 50 + rng.normal(0, 12, (12, 40, 40))
+    found = open_beam_of(flats, darks)
+    assert found.photons_per_value == pytest.approx(4.0, rel=0.05)
+    assert float(found.values.mean()) == pytest.approx(2000, rel=0.01)

@@ -1,0 +1,403 @@
+"""Damaged and mistaken scans: two lines that say what is wrong, or the right answer; never a traceback."""
+
+import json
+import os
+import pickle
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import tifffile
+from commands import error_of, nerfcli
+from scan_files import (
+    ANGLES_DEG,
+    COLUMNS,
+    ROWS,
+    VIEWS,
+    data_exchange,
+    heltomo,
+    naf,
+    nikon,
+    nxtomo,
+    r2_gaussian,
+    skyscan,
+    stack,
+    transforms,
+)
+
+from nerfcli.errors import BAD_INPUT
+from nerfcli.tomography.formats.read import read_scan
+from nerfcli.tomography.scan import load_scan
+
+
+def rewritten(path: Path, name: str, value: object, *, units: str | None = None) -> Path:
+    """An HDF5 file with another dataset."""
+    with h5py.File(path, "r+") as file:
+        kept = dict(file[name].attrs)
+        del file[name]
+        if value is not None:
+            file[name] = value
+            for key, attribute in kept.items():
+                file[name].attrs[key] = attribute
+            if units is not None:
+                file[name].attrs["units"] = units
+    return path
+
+
+def edited(path: Path, old: str, new: str) -> Path:
+    """A text file with other words."""
+    text = path.read_bytes().decode("latin-1")
+    assert old in text
+    path.write_bytes(text.replace(old, new).encode("latin-1"))
+    return path
+
+
+def pickled(folder: Path, change: Callable[[dict], object]) -> Path:
+    """NAF's pickle with another content."""
+    path = naf(folder).path
+    content = pickle.loads(path.read_bytes())
+    change(content)
+    path.write_bytes(pickle.dumps(content))
+    return path
+
+
+def without(folder: Path, name: str) -> Path:
+    """A folder without one of its files."""
+    (folder / name).unlink()
+    return folder
+
+
+def cut(path: Path, share: float) -> Path:
+    """A file of which only the first part was copied."""
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    return path
+
+
+class Bomb:
+    """What a pickle that runs a program looks like."""
+
+    def __init__(self, mark: Path):
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (f"touch {self.mark}",)
+
+
+def bomb(folder: Path) -> Path:
+    path = folder / "bomb.pickle"
+    path.write_bytes(pickle.dumps({"DSD": 1500.0, "train": Bomb(folder / "executed")}))
+    return path
+
+
+def pickle_of_a_list(folder: Path) -> Path:
+    (folder / "a.pkl").write_bytes(pickle.dumps([1]))
+    return folder / "a.pkl"
+
+
+def wrapped_bomb(folder: Path) -> Path:
+    """A reference to eval through builtins, written by hand."""
+    path = folder / "eval.pkl"
+    path.write_bytes(b"cbuiltins\neval\n(S'open(\"" + bytes(folder / "executed") + b'","w")\'\ntR.')
+    return path
+
+
+def several_scans(folder: Path) -> Path:
+    path = nikon(folder).path
+    shutil.copy(path, folder / "other.xtekct")
+    return folder
+
+
+def frame_of_another_size(folder: Path) -> Path:
+    stack(folder)
+    tifffile.imwrite(folder / "proj/p_004.tif", np.zeros((3, 5), np.uint16))
+    return folder
+
+
+def coloured(folder: Path) -> Path:
+    stack(folder)
+    picture = np.zeros((ROWS, COLUMNS, 3), np.uint8)
+    tifffile.imwrite(folder / "proj/p_000.tif", picture, photometric="rgb")
+    return folder
+
+
+def repeated_view(folder: Path) -> Path:
+    transforms(folder)
+    train = json.loads((folder / "transforms_train.json").read_text())
+    test = json.loads((folder / "transforms_test.json").read_text())
+    test["frames"].append(train["frames"][0])
+    (folder / "transforms_test.json").write_text(json.dumps(test))
+    return folder
+
+
+def ang_file(folder: Path) -> Path:
+    path = nikon(folder).path
+    (folder / "bone.ang").write_text("Proj Angle(deg)\n1: 0.0\n2: 30.0\n3: 60.0\n")
+    return path
+
+
+def other_mat(folder: Path) -> Path:
+    scipy.io.savemat(folder / "b.mat", {"reconstruction": np.zeros((4, 4))})
+    return folder / "b.mat"
+
+
+# What is made in a folder, options, and what the error says.
+REFUSED: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
+    # Code in pickles.
+    "pickle with code": (bomb, (), "wants to call .*system: it was not opened"),
+    "pickle with eval": (wrapped_bomb, (), "wants to call builtins.eval"),
+    "pickle cut off": (lambda f: cut(naf(f).path, 0.6), (), "is no pickle that can be read"),
+    "pickle of a list": (pickle_of_a_list, (), "holds a list"),
+    "pickle without DSD": (lambda f: pickled(f, lambda c: c.pop("DSD")), (), "has no DSD"),
+    "pickle of another detector": (
+        lambda f: pickled(f, lambda c: c.update(nDetector=[7, 7])),
+        (),
+        "nDetector says 7 x 7",
+    ),
+    "pickle with missing angles": (
+        lambda f: pickled(f, lambda c: c["train"].update(angles=c["train"]["angles"][:4])),
+        (),
+        "4 angles for 6 projections",
+    ),
+    "pickle in degrees": (
+        lambda f: pickled(f, lambda c: c["train"].update(angles=np.linspace(0, 300, 6))),
+        (),
+        "look|angles span 300 radians",
+    ),
+    "pickle of another beam": (lambda f: pickled(f, lambda c: c.update(mode="helix")), (), "mode 'helix'"),
+    # HDF5.
+    "zero flats": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/data_white", np.zeros((3, ROWS, COLUMNS))),
+        (),
+        "no pixel sees the beam",
+    ),
+    "flats and darks swapped": (
+        lambda f: rewritten(
+            rewritten(data_exchange(f).path, "exchange/data_white", np.full((3, ROWS, COLUMNS), 100.0)),
+            "exchange/data_dark",
+            np.full((3, ROWS, COLUMNS), 1100.0),
+        ),
+        (),
+        "median of -1000 above the darks",
+    ),
+    "no flats": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/data_white", None),
+        (),
+        "has no flats",
+    ),
+    "flats of another size": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/data_white", np.ones((3, 4, 4))),
+        (),
+        "flats of 4 x 4 pixels",
+    ),
+    "missing angles": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/theta", ANGLES_DEG[:-2]),
+        (),
+        "7 angles for 9 projections",
+    ),
+    "no angles": (lambda f: rewritten(data_exchange(f).path, "exchange/theta", None), (), "has no exchange/theta"),
+    "angle of NaN": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/theta", np.where(ANGLES_DEG > 200, np.nan, ANGLES_DEG)),
+        (),
+        "angle 7 is nan",
+    ),
+    "one angle for all": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/theta", np.full(VIEWS, 30.0)),
+        (),
+        "all 9 angles are 30",
+    ),
+    "angles in an unknown unit": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/theta", ANGLES_DEG, units="gon"),
+        (),
+        "'gon' is no unit of angles",
+    ),
+    "degrees called radians": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/theta", ANGLES_DEG, units="radians"),
+        (),
+        "angles span 240 radians",
+    ),
+    "wrong unit of a pixel": (
+        lambda f: rewritten(nxtomo(f).path, "entry/instrument/detector/x_pixel_size", 75.0, units="m"),
+        (),
+        "a pixel of 75000 mm",
+    ),
+    "all values NaN": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/data", np.full((VIEWS, ROWS, COLUMNS), np.nan)),
+        (),
+        "only 0 % of the values are finite",
+    ),
+    "all values the same": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/data", np.full((VIEWS, ROWS, COLUMNS), 7.0)),
+        (),
+        "all values are 7",
+    ),
+    "text instead of frames": (
+        lambda f: rewritten(data_exchange(f).path, "exchange/data", "lost"),
+        (),
+        "exchange/data",
+    ),
+    "HDF5 cut off": (lambda f: cut(data_exchange(f).path, 0.4), (), "is no HDF5 file that can be read"),
+    "keys without frames": (
+        lambda f: rewritten(nxtomo(f).path, "entry/instrument/detector/image_key", [1, 2, 0]),
+        (),
+        "3 image keys for 13 frames",
+    ),
+    "no projections": (
+        lambda f: rewritten(nxtomo(f).path, "entry/instrument/detector/image_key", [1] * 13),
+        (),
+        "no frame has image_key 0",
+    ),
+    # Scanners.
+    "projection missing": (lambda f: without(nikon(f).path.parent, "bone_0004.tif"), (), "after number 3 the numbers"),
+    "last projection missing": (lambda f: without(nikon(f).path.parent, "bone_0009.tif"), (), "holds 8 projections"),
+    "no distance": (lambda f: edited(nikon(f).path, "SrcToObject=100", ""), (), "has no SrcToObject"),
+    "negative distance": (
+        lambda f: edited(nikon(f).path, "SrcToDetector=400", "SrcToDetector=-400"),
+        (),
+        "SrcToDetector is -400",
+    ),
+    "words for a number": (lambda f: edited(nikon(f).path, "WhiteLevel=60000", "WhiteLevel=high"), (), "is 'high'"),
+    "no step of angles": (lambda f: edited(nikon(f).path, "AngularStep=30", ""), (), "has no AngularStep"),
+    "angles for some views": (ang_file, (), "lists 3 angles for 9 projections"),
+    "several scans in a folder": (several_scans, (), "holds several scans"),
+    "picture cut off": (
+        lambda f: cut(nikon(f).path.parent / "bone_0003.tif", 0.5).parent,
+        (),
+        "bone_0003.tif cannot be read",
+    ),
+    "no flat field": (
+        lambda f: edited(skyscan(f).path, "Depth", "Flat Field Correction=OFF\nDepth"),
+        (),
+        "the open beam is not known",
+    ),
+    "log of another size": (
+        lambda f: edited(skyscan(f).path, "Number Of Columns=10", "Number Of Columns=20"),
+        (),
+        "Number Of Columns is 20, the projections have 10",
+    ),
+    "other .mat file": (other_mat, (), "holds reconstruction, and no sinogram"),
+    "mat cut off": (lambda f: cut(heltomo(f).path, 0.5), (), "is no MATLAB file"),
+    # Folders with JSON.
+    "stack of another size": (frame_of_another_size, (), "has 5 x 3 pixels, the first projection 10 x 6"),
+    "coloured picture": (coloured, (), "projections are grey|has the shape"),
+    "unknown key": (lambda f: stack(f, changed={"anlges": [1]}).path, (), "'anlges' is no key"),
+    "no JSON": (lambda f: edited(stack(f).path / "scan.json", '"kind"', '"kind').parent, (), "is no JSON"),
+    "no projections there": (lambda f: stack(f, changed={"projections": "p/*.tif"}).path, (), "no projections match"),
+    "counts called transmissions": (
+        lambda f: stack(f, changed={"kind": "transmission"}).path,
+        (),
+        "transmissions up to",
+    ),
+    "counts called line integrals": (
+        lambda f: stack(f, changed={"kind": "line_integral"}).path,
+        (),
+        "line integrals up to",
+    ),
+    "held out beyond the end": (lambda f: stack(f, changed={"held_out": [40]}).path, (), "held_out is"),
+    "unit of no length": (lambda f: stack(f, changed={"unit": "kg"}).path, (), "'kg' is no unit of length"),
+    "vectors of another shape": (lambda f: stack(f, changed={"vectors": [[1, 2]] * VIEWS}).path, (), "vectors"),
+    "npy missing": (lambda f: without(r2_gaussian(f).path, "proj_train/0002.npy"), (), "there is no .*0002.npy"),
+    "npy cut off": (
+        lambda f: cut(r2_gaussian(f).path / "proj_train/0002.npy", 0.3).parents[1],
+        (),
+        "0002.npy cannot be read",
+    ),
+    "view in both parts": (repeated_view, (), "is there twice"),
+    "lens and detector disagree": (
+        lambda f: edited(transforms(f).path / "geometry.json", "60.0", "90.0").parent,
+        (),
+        "fl_x is 30",
+    ),
+    # Options.
+    "photons of line integrals": (lambda f: heltomo(f).path, ("--photons", "1e4"), "says nothing of line integrals"),
+    "no photons": (lambda f: stack(f).path, ("--photons", "-5"), "--photons -5"),
+    "unit that is none": (lambda f: stack(f).path, ("--unit", "parsec"), "--unit parsec is no unit"),
+    "axis far outside": (lambda f: stack(f).path, ("--centre-of-rotation", "900"), "far outside of the 10 columns"),
+    "format of photos": (lambda f: stack(f).path, ("--to", "colmap"), "cannot be written as colmap"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_damage_is_told_in_two_lines_and_nothing_is_written(name: str, tmp_path: Path) -> None:
+    make, options, expected = REFUSED[name]
+    place = tmp_path / "in"
+    place.mkdir()
+    path = make(place)
+    result = nerfcli("convert", path, tmp_path / "out", *options)
+    assert result.exit_code == BAD_INPUT, result.stderr
+    error, hint = error_of(result)
+    assert re.search(expected, error), error
+    assert len(hint) > 10
+    assert not (tmp_path / "out").exists()
+    assert not (place / "executed").exists()
+
+
+def test_the_bomb_would_have_gone_off(tmp_path: Path) -> None:
+    """The pickle of the test above is one that runs a program where it is loaded."""
+    pickle.loads(bomb(tmp_path).read_bytes())
+    assert (tmp_path / "executed").exists()
+
+
+def test_rows_of_nan_are_left_out(tmp_path: Path) -> None:
+    written = data_exchange(tmp_path)
+    values = written.values.copy()
+    values[3, 2], values[5, 4, 1] = np.nan, np.inf
+    scan = read_scan(rewritten(written.path, "exchange/data", values))
+    assert scan.usable is not None
+    bad = ~np.isfinite(values)
+    np.testing.assert_array_equal(np.broadcast_to(scan.usable, values.shape), ~bad)
+    np.testing.assert_allclose(np.asarray(scan.values)[~bad], values[~bad])
+    assert np.isfinite(scan.line_integrals(np.arange(VIEWS))).all()
+
+
+def test_a_view_without_content_is_left_out(tmp_path: Path) -> None:
+    written = data_exchange(tmp_path)
+    values = written.values.copy()
+    values[4] = 0
+    scan = read_scan(rewritten(written.path, "exchange/data", values))
+    assert scan.usable is not None
+    assert (~scan.usable.any(axis=(1, 2))).tolist() == [view == 4 for view in range(VIEWS)]
+    assert "1 projections without content" in " ".join(scan.history["notes"])
+
+
+def test_dead_pixels_of_the_flats_are_left_out(tmp_path: Path) -> None:
+    flats = np.full((3, ROWS, COLUMNS), 1100.0)
+    flats[:, 1, 7] = 100
+    scan = read_scan(rewritten(data_exchange(tmp_path).path, "exchange/data_white", flats))
+    assert scan.usable is not None
+    assert np.argwhere(~scan.usable).tolist() == [[0, 1, 7]]
+
+
+def test_a_flat_with_the_object_in_the_beam_is_an_outlier(tmp_path: Path) -> None:
+    """The mean of the others, to a per mille."""
+    flats = np.random.default_rng(0).normal(1100, 2, (8, ROWS, COLUMNS))
+    flats[2, 2:4, 3:8] = 300
+    scan = read_scan(rewritten(data_exchange(tmp_path).path, "exchange/data_white", flats))
+    assert scan.open_beam is not None
+    assert scan.open_beam == pytest.approx(1000, rel=4e-3)
+
+
+def test_a_wrong_unit_is_mended(tmp_path: Path) -> None:
+    """The file says 75 m, --unit says that its 75 are micrometres."""
+    path = rewritten(nxtomo(tmp_path).path, "entry/instrument/detector/x_pixel_size", 75.0, units="m")
+    result = nerfcli("convert", path, tmp_path / "out", "--unit", "um")
+    assert result.exit_code == 0, result.stderr
+    scan = load_scan(tmp_path / "out")
+    assert scan.unit == "mm"
+    assert scan.geometry.pixel_at_origin[1] == pytest.approx(0.075)
+
+
+def test_a_changed_scan_folder_is_refused(tmp_path: Path) -> None:
+    written = stack(tmp_path)
+    nerfcli("convert", written.path, tmp_path / "out")
+    values = np.load(tmp_path / "out/values.npy")
+    values[0, 0, 0] += 1
+    np.save(tmp_path / "out/values.npy", values)
+    error, hint = error_of(nerfcli("info", tmp_path / "out"))
+    assert "values.npy is not what was written" in error
+    assert "convert" in hint

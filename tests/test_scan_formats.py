@@ -1,0 +1,180 @@
+"""Formats of scans: pixels by each format's own formula, and what is stated found again in stored vectors."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import error_of, nerfcli
+from scan_files import WRITERS, Written, naf, nikon, stack
+
+from nerfcli.tomography.circle import Circle, circle_from_json, circle_of, differences
+from nerfcli.tomography.formats.assemble import axis_column
+from nerfcli.tomography.formats.given import Given
+from nerfcli.tomography.formats.read import read_scan, recognise
+from nerfcli.tomography.geometry import ScanGeometry
+from nerfcli.tomography.scan import load_scan
+from nerfcli.tomography.truth import load_truth
+
+
+def pixels_by_formula(written: Written, geometry: ScanGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and rows (views, points, 2) by `pixel_of` and by the format's own formula, of points near the axis."""
+    size = geometry.pixel_at_origin[1]
+    points = np.random.default_rng(1).normal(0, 2 * size, (8, 3))
+    if geometry.rows == 1:
+        points[:, 2] = 0
+    views = range(geometry.views)
+    by_vectors = np.array([geometry.pixel_of(view, points) for view in views])
+    by_formula = np.array([[written.seen(view, point) for point in points] for view in views])
+    return by_vectors, by_formula
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_points_are_seen_where_the_formula_of_the_format_says(form: str, tmp_path: Path) -> None:
+    """Independent: every format's formula turns the object, or is a pinhole camera; 1e-9 px in all views."""
+    written = WRITERS[form](tmp_path)
+    assert recognise(written.path) == form
+    scan = read_scan(written.path)
+    by_vectors, by_formula = pixels_by_formula(written, scan.geometry)
+    np.testing.assert_allclose(by_vectors, by_formula, atol=1e-9)
+    np.testing.assert_allclose(scan.values, written.values, rtol=1e-6)
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_what_a_format_states_is_found_in_what_was_stored(form: str, tmp_path: Path) -> None:
+    """Round trip: convert, read the folder, and recover the circle from its vectors by other formulas."""
+    written = WRITERS[form](tmp_path)
+    result = nerfcli("convert", written.path, tmp_path / "out", "--json")
+    assert result.exit_code == 0, result.stderr
+    stored = load_scan(tmp_path / "out")
+    stated = circle_from_json(stored.history["circle"])
+    found, apart = circle_of(stored.geometry)
+    assert apart < 1e-9
+    assert max(differences(stated, found).values()) < 1e-9
+    assert json.loads(result.stdout)["read_back"]["value"] == 0
+
+
+@pytest.mark.parametrize(("top", "bottom"), [(0.0, 0.0), (5.0, 5.0), (0.4, -0.4)])
+@pytest.mark.parametrize("recorded", [False, True])
+def test_the_axis_of_nikon_is_moved_and_tilted(top: float, bottom: float, recorded: bool, tmp_path: Path) -> None:
+    """Independent: rotation about a tilted axis, as the Core Imaging Library describes these files."""
+    written = nikon(tmp_path, top=top, bottom=bottom, recorded=recorded)
+    scan = read_scan(written.path)
+    by_vectors, by_formula = pixels_by_formula(written, scan.geometry)
+    np.testing.assert_allclose(by_vectors, by_formula, atol=1e-9)
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4, 5])
+@pytest.mark.parametrize("order", [1, -1])
+def test_naf_is_read_in_every_protocol_and_order_of_the_detector(protocol: int, order: int, tmp_path: Path) -> None:
+    written = naf(tmp_path, protocol=protocol, order=order)
+    scan = read_scan(written.path)
+    np.testing.assert_allclose(*pixels_by_formula(written, scan.geometry), atol=1e-9)
+    assert scan.held_out == (6, 7, 8)
+
+
+@pytest.mark.parametrize(
+    ("form", "per_value"), [("naf", 1e-3), ("r2-gaussian", 1.0), ("transmission-transforms", None)]
+)
+def test_the_true_volume_is_found_in_its_unit(form: str, per_value: float | None, tmp_path: Path) -> None:
+    """Values of NAF are 1/m, indexed x, y, z; those of transforms are 8-bit, x fastest."""
+    found = load_truth(read_scan(WRITERS[form](tmp_path).path).history)
+    assert found is not None
+    grid, volume = found
+    assert volume.shape == grid.shape
+    if per_value is None:
+        assert volume[1, 2, 3] == pytest.approx(23 * 0.5 / 255)
+        assert grid.first == (-1.5, -1.0, -0.5)
+    else:
+        assert volume[3, 2, 1] == pytest.approx(per_value * (16 * 1 + 4 * 2 + 3))
+
+
+def test_options_say_more_than_the_file(tmp_path: Path) -> None:
+    written = stack(tmp_path)
+    plain = read_scan(written.path)
+    scan = read_scan(written.path, Given(photons=4e4, unit="mm", centre_column=3.25, holdout="every:4", mirrored=True))
+    assert axis_column(plain.geometry) == pytest.approx(5.5)
+    assert axis_column(scan.geometry) == pytest.approx(3.25)
+    assert scan.photons_per_value == pytest.approx(4e4 / 50000)
+    assert scan.held_out == (0, 4, 8)
+    assert plain.held_out == (1, 4)
+    assert scan.geometry.pixel_at_origin[1] == pytest.approx(plain.geometry.pixel_at_origin[1] / 10)
+    assert not circle_of(scan.geometry)[0].mirrored
+    assert circle_of(plain.geometry)[0].mirrored
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".txt"])
+def test_vectors_of_astra_are_written(suffix: str, tmp_path: Path) -> None:
+    """The vectors by themselves project points as the format says."""
+    written = stack(tmp_path)
+    place = tmp_path / f"v{suffix}"
+    assert nerfcli("convert", written.path, place, "--to", "astra").exit_code == 0
+    vectors = np.load(place) if suffix == ".npy" else np.loadtxt(place)
+    facts = json.loads(place.with_suffix(".json").read_text())
+    assert facts["type"] == "cone_vec"
+    point = np.array([3.0, -2.0, 1.0])
+    for view, (source, centre, along, down) in enumerate(vectors.reshape(-1, 4, 3)):
+        # Where source + t (point - source) = centre + a along + b down.
+        a, b, _ = np.linalg.solve(np.stack([along, down, source - point], axis=1), source - centre)
+        expected = written.seen(view, point)
+        assert a + (facts["detector_columns"] - 1) / 2 == pytest.approx(expected[0], abs=1e-9)
+        assert b + (facts["detector_rows"] - 1) / 2 == pytest.approx(expected[1], abs=1e-9)
+
+
+def test_options_of_photos_are_refused_for_scans_and_the_other_way_round(tmp_path: Path, capture: Path) -> None:
+    written = stack(tmp_path)
+    error, _ = error_of(nerfcli("convert", written.path, tmp_path / "o", "--axes", "opencv"))
+    assert "--axes is for photos" in error
+    error, _ = error_of(nerfcli("convert", capture, tmp_path / "o.json", "--to", "transforms", "--photons", "100"))
+    assert "--photons is for scans" in error
+
+
+def test_a_scan_is_not_replaced_unless_one_says_so(tmp_path: Path) -> None:
+    written = stack(tmp_path)
+    out = tmp_path / "o"
+    assert nerfcli("convert", written.path, out).exit_code == 0
+    assert "there already" in error_of(nerfcli("convert", written.path, out))[0]
+    assert nerfcli("convert", written.path, out, "--overwrite").exit_code == 0
+    foreign = tmp_path / "mine"
+    foreign.mkdir()
+    (foreign / "diary.txt").write_text("dear diary")
+    assert "there already" in error_of(nerfcli("convert", written.path, foreign, "--overwrite"))[0]
+    assert (foreign / "diary.txt").exists()
+
+
+def test_info_says_what_a_scan_is(tmp_path: Path) -> None:
+    written = stack(tmp_path)
+    nerfcli("convert", written.path, tmp_path / "o")
+    facts = json.loads(nerfcli("info", tmp_path / "o", "--json").stdout)
+    assert facts["views"] == 9
+    assert facts["held_out"] == 2
+    assert facts["detector"] == "10 x 6 pixels"
+    assert facts["beam"] == "cone"
+    assert facts["unit"] == "mm"
+    assert facts["magnification"] == pytest.approx(55 / 41, rel=1e-5)
+    assert facts["source_origin"] == pytest.approx(410)
+    text = nerfcli("info", tmp_path / "o").stdout
+    assert "detector: 10 x 6 pixels" in text
+
+
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_circle_is_recovered_from_its_vectors(beam: str, mirrored: bool) -> None:
+    """Round trip with every number in use."""
+    cone = beam == "cone"
+    circle = Circle(
+        "cone" if cone else "parallel",
+        tuple(np.radians(ANGLES := [5.0, 95.0, 185.0, 310.0]).tolist()),
+        *(0.2, 0.3, 7, 11),
+        source_origin=100.0 if cone else 0.0,
+        source_detector=300.0 if cone else 0.0,
+        lateral=1.5 if cone else 0.0,
+        column_shift=1.25,
+        row_shift=-0.75,
+        tilt=0.02,
+        mirrored=mirrored,
+    )
+    found, apart = circle_of(circle.geometry())
+    assert len(ANGLES) == circle.geometry().views
+    assert apart < 1e-9
+    assert max(differences(circle, found).values()) < 1e-9
