@@ -135,6 +135,7 @@ def reconstruct(
     passes: int | None = None,
     seconds: float | None = None,
     progress: Callable[[float, str], None] | None = None,
+    keep: Callable[[Fit], None] | None = None,
 ) -> Fit:
     """Go on fitting until the passes are done, the time is over, or nothing changes any more.
 
@@ -146,9 +147,10 @@ def reconstruct(
         passes: how many times to look at all views.
         seconds: how long to work; at least one pass is done.
         progress: takes the share done and a few words after every step.
+        keep: takes the fit after every pass, for one that is interrupted.
 
     Returns:
-        The fit; the one given is not changed. An interrupt is passed on as `KeyboardInterrupt`.
+        The fit; the one given is not changed.
     """
     begun = time.perf_counter()
     projector = Projector(problem.geometry, problem.grid)
@@ -188,6 +190,8 @@ def reconstruct(
         done += 1
         settled = float((volume - before).norm()) <= SETTLED * max(float(volume.norm()), 1e-30)
         spent = time.perf_counter() - begun
+        if keep is not None:
+            keep(Fit(volume, dual, fit.passes + done, fit.seconds + spent, settled))
         over = (passes is not None and done >= passes) or (seconds is not None and spent * (done + 1) / done > seconds)
         if over or (settled and done > 1):
             break

@@ -1,6 +1,6 @@
 """A reconstruction: the volume that was fitted to a scan, and the run folder it is kept in.
 
-RUN/config.json says what was fitted, how, and what was decided; RUN/volume.npy holds the attenuation and
+RUN/reconstruction.json says what was fitted, how, and what was decided; RUN/volume.npy holds the attenuation and
 RUN/marks.npy what the views cannot determine, see `marks`.
 """
 
@@ -17,11 +17,11 @@ from nerfcli.sealed import read_sealed, write_sealed
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.scan import MEASUREMENT
 
-CONFIG = "config.json"
+DESCRIPTION = "reconstruction.json"
 VOLUME = "volume.npy"
 MARKS = "marks.npy"
 
-FIELDS = ("voxels", "hash")
+FIELDS = ("voxels",)
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ReconstructionSettings:
     Args:
         budget_seconds: for everything, trials included; None for none.
         passes: how many times to look at all views; None for no limit.
-        field: "voxels" with total variation, or "hash".
+        field: one of `FIELDS`.
         voxel_size: in the scan's unit; None for the size of a pixel at the object.
         strength: of total variation; None to choose it on training views that are left out.
         centre: columns by which the detector stands off; None to find out.
@@ -103,13 +103,13 @@ class Reconstruction:
 def is_reconstruction(run: Path) -> bool:
     """Whether a folder is a run that `save_reconstruction` wrote."""
     try:
-        return (run / CONFIG).is_file() and read_sealed(run / CONFIG).get("measurement") == MEASUREMENT
+        return (run / DESCRIPTION).is_file() and read_sealed(run / DESCRIPTION).get("measurement") == MEASUREMENT
     except (OSError, ValueError):
         return False
 
 
 def save_reconstruction(run: Path, result: Reconstruction) -> None:
-    """Write a run's folder; config.json comes last, and names the arrays by their digests.
+    """Write a run's folder; reconstruction.json comes last, and names the arrays by their digests.
 
     Raises:
         UserError: it cannot be written.
@@ -122,7 +122,7 @@ def save_reconstruction(run: Path, result: Reconstruction) -> None:
             np.save(partial, array, allow_pickle=False)
         digests[name] = array_digest(array)
     write_sealed(
-        run / CONFIG,
+        run / DESCRIPTION,
         {
             "measurement": MEASUREMENT,
             "scan": str(result.scan),
@@ -151,7 +151,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
     from nerfcli.tomography.scan import read_array
 
     try:
-        content = read_sealed(run / CONFIG)
+        content = read_sealed(run / DESCRIPTION)
         arrays = {name: read_array(run / name, digest) for name, digest in content["arrays"].items()}
         grid = content["grid"]
         shape, first = grid["shape"], grid["first"]

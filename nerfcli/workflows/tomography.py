@@ -2,6 +2,7 @@
 
 import platform
 import time
+from collections import deque
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -91,8 +92,8 @@ def train_scan(
     """
     folder, run = Path(scan), Path(run)
     loaded = load_scan(folder)
-    earlier = load_reconstruction(run) if is_reconstruction(run) else None
-    if earlier is not None and not overwrite:
+    earlier = load_reconstruction(run) if is_reconstruction(run) and not overwrite else None
+    if earlier is not None:
         same = earlier.scan_digest == loaded.digest and _wanted(earlier.settings) == _wanted(settings)
         if same and not resume:
             notify(f"{run} is kept: it was fitted with these settings; --overwrite fits again")
@@ -101,7 +102,7 @@ def train_scan(
             raise UserError(
                 f"{run} holds another reconstruction", "name another folder with --output, or replace it by --overwrite"
             )
-    elif run.exists() and any(run.iterdir()) and not overwrite:
+    elif run.exists() and any(run.iterdir()) and not (overwrite and is_reconstruction(run)):
         raise UserError(f"{run} is there and holds no reconstruction", "name another folder with --output")
     with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
         clear_leftovers(run)
@@ -109,10 +110,10 @@ def train_scan(
         _warn_of(loaded, warn)
         threads = thread_count(settings.threads)
         torch.set_num_threads(threads)
-        result = _fit(
-            loaded, folder, settings, earlier=earlier if resume else None, notify=notify, progress=progress, run=run
-        )
+        result, interrupted = _fit(loaded, folder, settings, earlier=earlier if resume else None, progress=progress)
         save_reconstruction(run, result)
+    if interrupted:
+        raise KeyboardInterrupt
     for sentence in result.decisions:
         notify(sentence)
     return result
@@ -232,10 +233,9 @@ def _fit(
     settings: ReconstructionSettings,
     *,
     earlier: Reconstruction | None,
-    notify: Notify,
     progress: Progress,
-    run: Path,
-) -> Reconstruction:
+) -> tuple[Reconstruction, bool]:
+    """The reconstruction, and whether it was interrupted after some passes; before that, `KeyboardInterrupt`."""
     begun = time.perf_counter()
     decisions: list[str] = []
     views = scan.training_views
@@ -280,11 +280,18 @@ def _fit(
     passes = settings.passes if settings.passes is not None else MOST_PASSES
     if earlier is not None and settings.passes is not None:
         passes = max(settings.passes - earlier.passes, 1)
-    fit = reconstruct(problem, fit, strength=strength, passes=passes, seconds=left(), progress=progress)
+    kept = deque([fit], maxlen=1)
+    interrupted = False
+    try:
+        fit = reconstruct(
+            problem, fit, strength=strength, passes=passes, seconds=left(), progress=progress, keep=kept.append
+        )
+    except KeyboardInterrupt:
+        fit, interrupted = kept[-1], True
     found = marks(problem.geometry, grid)
     for sentence in _told_marks(found, missing_wedge_deg(problem.geometry)):
         decisions.append(sentence)
-    return Reconstruction(
+    result = Reconstruction(
         fit.volume.numpy(),
         found,
         grid,
@@ -300,6 +307,7 @@ def _fit(
         missing_wedge_deg(problem.geometry),
         {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
     )
+    return result, interrupted
 
 
 def _geometry(
