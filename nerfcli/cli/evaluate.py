@@ -83,7 +83,7 @@ def evaluate(
 
     def measure_scan(folder: Path) -> None:
         from nerfcli.cli.scans import print_scan_numbers
-        from nerfcli.workflows.tomography import evaluate_scan
+        from nerfcli.workflows.tomography_scores import evaluate_scan
 
         with console.progress("evaluate") as update:
             scan = evaluate_scan(folder, threads=cores, overwrite=overwrite, notify=console.note, progress=update)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from nerfcli.cli.batch import for_each_input
+from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, one_of, thread_count
 from nerfcli.cli.render_options import finite
@@ -32,6 +32,9 @@ def export(
     max_size: Annotated[
         int, typer.Option(help="Longer side of the depth maps that are fused, in pixels.", min=16, max=8192)
     ] = 480,
+    water: Annotated[
+        float | None, typer.Option(help="Scans: attenuation of water, so that values are Hounsfield units.")
+    ] = None,
     device: Device = "auto",
     threads: Threads = 0,
     overwrite: Overwrite = False,
@@ -54,6 +57,9 @@ def export(
     Writes RUN.html, RUN-mesh.ply, ... next to the run. Regions that no photo sees stay open. In a .glb, the rotation to
     +Y up is in the root node; positions stay in the scene's frame.
 
+    Of a reconstruction from a scan: --to volume, as .nrrd, .mha, .nii or .tif, with a second file of marks where the
+    views do not determine the values.
+
     \b
     Examples:
       nerfcli export photos-scene-run --to page
@@ -62,10 +68,21 @@ def export(
       nerfcli export photos-scene-run --to points -o kitchen.ply
       nerfcli export photos-scene-run --to volume --format nrrd
       nerfcli export photos-scene-run --to colmap-dense -o kitchen-dense
+      nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """
     from nerfcli.surface.settings import SurfaceSettings
+    from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.export import TARGETS, default_target, export_run
 
+    console = Console(quiet=quiet, json_lines=json)
+    if run != STDIN and is_reconstruction(Path(run)):
+        from nerfcli.workflows.tomography_files import export_scan
+
+        one_of(to, ("volume",), "--to")
+        target = output or Path(run).with_name(f"{Path(run).name}-volume.nrrd")
+        for path in export_scan(run, target, water=water, overwrite=overwrite, notify=console.note):
+            console.result(path)
+        return
     one_of(to, tuple(TARGETS), "--to")
     suffix = None if form is None else f".{form.lstrip('.').lower()}"
     if suffix is not None:
@@ -76,7 +93,6 @@ def export(
     settings = SurfaceSettings(
         box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces, max_size=max_size
     )
-    console = Console(quiet=quiet, json_lines=json)
 
     def work(folder: Path, one_of_many: bool) -> None:
         target = output

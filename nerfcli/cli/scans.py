@@ -15,7 +15,7 @@ from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
     from nerfcli.tomography.result import ReconstructionSettings
-    from nerfcli.workflows.tomography import ScanEvaluation
+    from nerfcli.workflows.tomography_scores import ScanEvaluation
 
 _COMPONENTS = "tv=WEIGHT, centre=COLUMNS, tilt=DEGREES, air=measured"
 
@@ -44,7 +44,8 @@ def reconstruction_settings(
         values.update({_component(text, "--without"): 0.0 if text != "air" else False})
     for text in include or ():
         name, _, value = text.partition("=")
-        values[_component(name, "--with")] = value == "measured" if name == "air" else _number(text, value)
+        name = _component(name, "--with")
+        values[name] = value == "measured" if name == "air" else _number(text, value)
     tilt = values["tilt"]
     return ReconstructionSettings(
         budget_seconds=budget_seconds,

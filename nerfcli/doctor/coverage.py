@@ -10,6 +10,7 @@ from nerfcli.cameras.formats.colmap import read_model
 from nerfcli.cameras.layout import centres_of, focus_point, horizontal_axes, up_direction, views_of
 from nerfcli.doctor.geometry import BASELINE_BAD, BASELINE_LOOK
 from nerfcli.doctor.photo_facts import PhotoFacts
+from nerfcli.findings import BAD, GOOD, LOOK, Finding, several, verdict_below, worst
 from nerfcli.media.geodesy import east_north_up
 from nerfcli.scene import Scene, model_folder
 

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 from torch import Tensor
 
 from nerfcli.tomography.scan import Scan
@@ -99,7 +99,7 @@ class Poisson:
 
         if excess(low) <= 0:
             return 0.0
-        return high if excess(high) > 0 else float(brentq(excess, low, high, xtol=1e-5))
+        return high if excess(high) > 0 else float(root_scalar(excess, bracket=(low, high), xtol=1e-5).root)
 
 
 @dataclass(frozen=True)

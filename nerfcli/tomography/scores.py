@@ -1,14 +1,12 @@
 """How good a reconstruction is: held-out projections against their noise, and a true volume where there is one."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.ndimage import map_coordinates
 from skimage.metrics import structural_similarity
 
-from nerfcli.errors import UserError
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.likelihood import likelihood_of
@@ -111,30 +109,3 @@ def resampled(volume: np.ndarray, grid: VoxelGrid, other: VoxelGrid) -> np.ndarr
     place = [(other.axis(name) - grid.first["xyz".index(name)]) / grid.size for name in "zyx"]
     coordinates = np.meshgrid(*place, indexing="ij")
     return map_coordinates(volume, coordinates, order=1, mode="constant", cval=0.0, prefilter=False)
-
-
-def read_truth(description: dict, folder: Path) -> tuple[np.ndarray, VoxelGrid]:
-    """The true volume that a scan's history names.
-
-    Args:
-        description: "file" (raw values or .npy), "shape" (z, y, x), "type" of a raw file, "scale" to 1 / unit, "first"
-            (x, y, z) and "size" of its voxels.
-        folder: that the file's name is relative to.
-
-    Raises:
-        UserError: it is not there, or has another size.
-    """
-    path = folder / description["file"]
-    try:
-        if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
-        else:
-            values = np.fromfile(path, dtype=np.dtype(description["type"]))
-        shape = tuple(description["shape"])
-        volume = values.reshape(shape).astype(np.float32) * np.float32(description["scale"])
-    except (OSError, ValueError) as error:
-        raise UserError(
-            f"the true volume {path} cannot be read: {error}", "put it back, or take it out of scene.json"
-        ) from error
-    first = description["first"]
-    return volume, VoxelGrid((shape[0], shape[1], shape[2]), (first[0], first[1], first[2]), description["size"])

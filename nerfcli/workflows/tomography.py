@@ -3,21 +3,19 @@
 import platform
 import time
 from collections import deque
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from nerfcli import __version__
-from nerfcli.atomic import clear_leftovers, read_json, write_json
+from nerfcli.atomic import clear_leftovers
 from nerfcli.errors import UserError
 from nerfcli.exclusive import exclusive
 from nerfcli.memory import default_memory_limit
 from nerfcli.runs.files import LOCK, METRICS
-from nerfcli.tomography.baselines import filtered_back_projection, sart_total_variation
 from nerfcli.tomography.calibrate import air_factors, centre_of_rotation, detector_tilt
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid, grid_of_scan
@@ -32,7 +30,6 @@ from nerfcli.tomography.result import (
     save_reconstruction,
 )
 from nerfcli.tomography.scan import Scan, load_scan
-from nerfcli.tomography.scores import read_truth, score_projections, score_volume
 from nerfcli.tomography.strength import choose_strength
 from nerfcli.workflows.machine import thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
@@ -47,21 +44,6 @@ MOST_PASSES = 200
 BYTES_OF_VOXEL = 48
 # Scatter of the open beam between views, in standard errors, from which it counts as drift.
 DRIFT = 3.0
-
-
-@dataclass(frozen=True)
-class ScanEvaluation:
-    """Numbers of a reconstruction.
-
-    Args:
-        path: RUN/metrics.json.
-        metrics: its content.
-        is_kept: whether the file was there already.
-    """
-
-    path: Path
-    metrics: dict[str, Any]
-    is_kept: bool
 
 
 def train_scan(
@@ -119,105 +101,8 @@ def train_scan(
     return result
 
 
-def evaluate_scan(
-    run: str | Path,
-    *,
-    threads: int = 0,
-    overwrite: bool = False,
-    baselines: bool = True,
-    notify: Notify = silent,
-    progress: Progress = no_progress,
-) -> ScanEvaluation:
-    """Write RUN/metrics.json: held-out projections, a true volume if the scan names one, and other methods beside it.
-
-    Args:
-        run: the folder that `train_scan` wrote.
-        threads: of the CPU; 0 for all.
-        overwrite: measure again.
-        baselines: whether filtered back-projection and SART with total variation are computed from the same views.
-        notify: takes lines for the user.
-        progress: takes the share done and a few words.
-
-    Raises:
-        UserError: there is no reconstruction, or its scan is no longer what it was.
-    """
-    run = Path(run)
-    torch.set_num_threads(thread_count(threads))
-    result = load_reconstruction(run)
-    path = run / METRICS
-    if path.exists() and not overwrite:
-        kept = read_json(path)
-        if kept.get("scan_digest") == result.scan_digest and kept.get("passes") == result.passes:
-            notify(f"{path} is kept; --overwrite measures again")
-            return ScanEvaluation(path, kept, True)
-    scan = scan_of(result, run)
-    geometry = corrected(scan.geometry, result)
-    truth = _truth(scan, result, run)
-    methods: dict[str, Any] = {}
-
-    def measure(name: str, volume: np.ndarray) -> None:
-        projections = score_projections(
-            scan, geometry, torch.from_numpy(np.ascontiguousarray(volume)), result.grid, air=_held_out_air(scan, result)
-        )
-        methods[name] = {
-            "projections": None if projections is None else asdict(projections),
-            "volume": None if truth is None else asdict(score_volume(volume, result.grid, *truth)),
-        }
-
-    progress(0.0, "held-out views")
-    measure("nerfcli", np.asarray(result.volume))
-    if baselines:
-        views = scan.training_views
-        integrals = scan.line_integrals(views)
-        if (factors := result.used.get("air")) is not None:
-            integrals = integrals + np.log(np.asarray(factors, dtype=np.float32))[:, None, None]
-        progress(0.3, "filtered back-projection")
-        try:
-            filtered = filtered_back_projection(geometry.select(views), integrals, result.grid)
-            measure("filtered back-projection", filtered.clamp_min(0).numpy())
-        except UserError as error:
-            notify(f"no filtered back-projection: {error.message}")
-        progress(0.5, "SART with total variation")
-        measure(
-            "SART with total variation", sart_total_variation(geometry.select(views), integrals, result.grid).numpy()
-        )
-    metrics = {
-        "measurement": "transmission",
-        "scan_digest": result.scan_digest,
-        "passes": result.passes,
-        "unit": result.unit,
-        "held_out_views": len(scan.held_out),
-        "fitted_views": len(scan.training_views),
-        "missing_wedge_deg": result.missing_wedge_deg,
-        "methods": methods,
-    }
-    write_json(path, metrics)
-    return ScanEvaluation(path, metrics, False)
-
-
-def scan_of(result: Reconstruction, run: Path) -> Scan:
-    """The scan that a reconstruction was fitted to.
-
-    Raises:
-        UserError: it is no longer there, or was changed.
-    """
-    if not result.scan.exists():
-        raise UserError(
-            f"the scan of {run} should be in {result.scan}, which is not there",
-            "call it from the folder that the run was trained from, or train again",
-        )
-    scan = load_scan(result.scan)
-    if scan.digest != result.scan_digest:
-        raise UserError(f"{result.scan} has changed since {run} was trained", "train again with --overwrite")
-    return scan
-
-
-def corrected(geometry: ScanGeometry, result: Reconstruction) -> ScanGeometry:
-    """The geometry with the centre and the tilt that a reconstruction used."""
-    return _corrected(geometry, result.used["centre"], result.used["tilt"])
-
-
-def _corrected(geometry: ScanGeometry, centre: float, tilt: float) -> ScanGeometry:
+def corrected_by(geometry: ScanGeometry, centre: float, tilt: float) -> ScanGeometry:
+    """The geometry with its centre moved by some columns and its detector turned."""
     shifted = geometry.shifted(centre) if centre else geometry
     return shifted.tilted(tilt) if tilt else shifted
 
@@ -240,7 +125,7 @@ def _fit(
     decisions: list[str] = []
     views = scan.training_views
     centre, tilt = _geometry(scan, settings, earlier, decisions, progress)
-    geometry = _corrected(scan.geometry, centre, tilt)
+    geometry = corrected_by(scan.geometry, centre, tilt)
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
     _fits_memory(grid)
     if earlier is not None:
@@ -392,25 +277,6 @@ def _coarse_start(
     problem = Problem(geometry.binned(2).select(views), likelihood, small)
     limit = None if seconds is None else COARSE_SHARE * seconds
     return finer(reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
-
-
-def _held_out_air(scan: Scan, result: Reconstruction) -> np.ndarray | None:
-    """The factor on the open beam of each held-out view, from its own pixels beside the object, as everywhere."""
-    if result.used.get("air") is None:
-        return None
-    views = np.array(scan.held_out, dtype=int)
-    likelihood = likelihood_of(scan, views)
-    assert isinstance(likelihood, Poisson)
-    geometry = corrected(scan.geometry, result).select(views)
-    integrals = Projector(geometry, result.grid).forward(
-        torch.from_numpy(np.array(result.volume)), np.arange(len(views))
-    )
-    return air_factors(likelihood, integrals).numpy()
-
-
-def _truth(scan: Scan, result: Reconstruction, run: Path) -> tuple[np.ndarray, VoxelGrid] | None:
-    description = scan.history.get("truth")
-    return None if description is None else read_truth(dict(description), result.scan)
 
 
 def _told_marks(found: np.ndarray, wedge: float) -> list[str]:

@@ -16,7 +16,7 @@ from nerfcli.tomography.result import Reconstruction, load_reconstruction
 from nerfcli.tomography.volume_files import VolumeFile, write_volume
 from nerfcli.workflows.machine import thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
-from nerfcli.workflows.tomography import corrected, scan_of
+from nerfcli.workflows.tomography_scores import corrected, scan_of
 
 OUTPUTS = ("projection", "transmission", "residual")
 FORMATS = ("nrrd", "mha", "nii", "tif")
@@ -76,7 +76,7 @@ def render_scan(
         pictures = {
             "projection": (integrals, 0.0, top),
             "transmission": (torch.exp(-integrals), 0.0, 1.0),
-            "residual": (_residual(likelihood, integrals, torch.from_numpy(index)), -RESIDUAL_RANGE, RESIDUAL_RANGE),
+            "residual": (residual_of(likelihood, integrals, torch.from_numpy(index)), -RESIDUAL_RANGE, RESIDUAL_RANGE),
         }
         for name in outputs:
             values, low, high = pictures[name]
@@ -151,7 +151,7 @@ def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
     return ((1 - share) * layers[0] + share * layers[1]).astype(np.float32) if share else layers[0].astype(np.float32)
 
 
-def _residual(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Tensor) -> torch.Tensor:
+def residual_of(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Tensor) -> torch.Tensor:
     """Measured minus predicted line integrals in units of their noise."""
     # The likelihood rises with a line integral where more was measured than predicted, so its negative falls there.
     return -torch.sign(likelihood.slope(integrals, views)) * likelihood.deviance(integrals, views).sqrt()

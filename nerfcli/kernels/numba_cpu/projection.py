@@ -137,8 +137,15 @@ def back_project(
     """See `reference.back_project`; float32 values, lines in float64."""
     use_threads()
     out = np.zeros(shape[0] * shape[1] * shape[2], dtype=np.float32)
-    rays = (values.detach().contiguous().numpy(), *(x.detach().contiguous().numpy() for x in (origins, directions)))
-    _back_project(*rays, np.array(first, dtype=np.float64), float(size), np.array(shape[::-1]), out)
+    _back_project(
+        values.detach().contiguous().numpy(),
+        origins.contiguous().numpy(),
+        directions.contiguous().numpy(),
+        np.array(first, dtype=np.float64),
+        float(size),
+        np.array(shape[::-1]),
+        out,
+    )
     return torch.from_numpy(out).view(shape)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from nerfcli.findings import VERDICTS, Finding
 from nerfcli.pages import page
-from nerfcli.pages.pictures import data_uri, jpeg_bytes
+from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes
 from nerfcli.tomography.checks.examine import ScanDiagnosis
 
 _LONGEST_PX = 640

@@ -1,0 +1,151 @@
+"""From a reconstruction to its numbers: held-out projections, a true volume, other methods with the same views."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerfcli.atomic import read_json, write_json
+from nerfcli.errors import UserError
+from nerfcli.runs.files import METRICS
+from nerfcli.tomography.baselines import filtered_back_projection, sart_total_variation
+from nerfcli.tomography.calibrate import air_factors
+from nerfcli.tomography.geometry import ScanGeometry
+from nerfcli.tomography.likelihood import Poisson, likelihood_of
+from nerfcli.tomography.reconstruct import Projector
+from nerfcli.tomography.result import Reconstruction, load_reconstruction
+from nerfcli.tomography.scan import Scan, load_scan
+from nerfcli.tomography.scores import score_projections, score_volume
+from nerfcli.tomography.truth import load_truth
+from nerfcli.workflows.machine import thread_count
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.tomography import corrected_by
+
+
+@dataclass(frozen=True)
+class ScanEvaluation:
+    """Numbers of a reconstruction.
+
+    Args:
+        path: RUN/metrics.json.
+        metrics: its content.
+        is_kept: whether the file was there already.
+    """
+
+    path: Path
+    metrics: dict[str, Any]
+    is_kept: bool
+
+
+def evaluate_scan(
+    run: str | Path,
+    *,
+    threads: int = 0,
+    overwrite: bool = False,
+    baselines: bool = True,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> ScanEvaluation:
+    """Write RUN/metrics.json: held-out projections, a true volume if the scan names one, and other methods beside it.
+
+    Args:
+        run: the folder that `train_scan` wrote.
+        threads: of the CPU; 0 for all.
+        overwrite: measure again.
+        baselines: whether filtered back-projection and SART with total variation are computed from the same views.
+        notify: takes lines for the user.
+        progress: takes the share done and a few words.
+
+    Raises:
+        UserError: there is no reconstruction, or its scan is no longer what it was.
+    """
+    run = Path(run)
+    torch.set_num_threads(thread_count(threads))
+    result = load_reconstruction(run)
+    path = run / METRICS
+    if path.exists() and not overwrite:
+        kept = read_json(path, needed=("methods",), hint="measure again with --overwrite")
+        if kept.get("scan_digest") == result.scan_digest and kept.get("passes") == result.passes:
+            notify(f"{path} is kept; --overwrite measures again")
+            return ScanEvaluation(path, kept, True)
+    scan = scan_of(result, run)
+    geometry = corrected(scan.geometry, result)
+    truth = load_truth(scan.history)
+    methods: dict[str, Any] = {}
+
+    def measure(name: str, volume: np.ndarray) -> None:
+        projections = score_projections(
+            scan, geometry, torch.from_numpy(np.array(volume)), result.grid, air=_held_out_air(scan, result)
+        )
+        methods[name] = {
+            "projections": None if projections is None else asdict(projections),
+            "volume": None if truth is None else asdict(score_volume(volume, result.grid, truth[1], truth[0])),
+        }
+
+    progress(0.0, "held-out views")
+    measure("nerfcli", np.asarray(result.volume))
+    if baselines:
+        views = scan.training_views
+        integrals = scan.line_integrals(views)
+        if (factors := result.used.get("air")) is not None:
+            integrals = integrals + np.log(np.asarray(factors, dtype=np.float32))[:, None, None]
+        progress(0.3, "filtered back-projection")
+        try:
+            filtered = filtered_back_projection(geometry.select(views), integrals, result.grid)
+            measure("filtered back-projection", filtered.clamp_min(0).numpy())
+        except UserError as error:
+            notify(f"no filtered back-projection: {error.message}")
+        progress(0.5, "SART with total variation")
+        measure(
+            "SART with total variation", sart_total_variation(geometry.select(views), integrals, result.grid).numpy()
+        )
+    metrics = {
+        "measurement": "transmission",
+        "scan_digest": result.scan_digest,
+        "passes": result.passes,
+        "unit": result.unit,
+        "held_out_views": len(scan.held_out),
+        "fitted_views": len(scan.training_views),
+        "missing_wedge_deg": result.missing_wedge_deg,
+        "methods": methods,
+    }
+    write_json(path, metrics)
+    return ScanEvaluation(path, metrics, False)
+
+
+def scan_of(result: Reconstruction, run: Path) -> Scan:
+    """The scan that a reconstruction was fitted to.
+
+    Raises:
+        UserError: it is no longer there, or was changed.
+    """
+    if not result.scan.exists():
+        raise UserError(
+            f"the scan of {run} should be in {result.scan}, which is not there",
+            "call it from the folder that the run was trained from, or train again",
+        )
+    scan = load_scan(result.scan)
+    if scan.digest != result.scan_digest:
+        raise UserError(f"{result.scan} has changed since {run} was trained", "train again with --overwrite")
+    return scan
+
+
+def corrected(geometry: ScanGeometry, result: Reconstruction) -> ScanGeometry:
+    """The geometry with the centre and the tilt that a reconstruction used."""
+    return corrected_by(geometry, result.used["centre"], result.used["tilt"])
+
+
+def _held_out_air(scan: Scan, result: Reconstruction) -> np.ndarray | None:
+    """The factor on the open beam of each held-out view, from its own pixels beside the object, as everywhere."""
+    if result.used.get("air") is None:
+        return None
+    views = np.array(scan.held_out, dtype=int)
+    likelihood = likelihood_of(scan, views)
+    assert isinstance(likelihood, Poisson)
+    geometry = corrected(scan.geometry, result).select(views)
+    integrals = Projector(geometry, result.grid).forward(
+        torch.from_numpy(np.array(result.volume)), np.arange(len(views))
+    )
+    return air_factors(likelihood, integrals).numpy()

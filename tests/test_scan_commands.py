@@ -1,0 +1,199 @@
+"""Scans through the commands: train, evaluate, render on a small phantom, and what they refuse."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from phantom import attenuation_of_voxels, bean
+from test_reconstruct import cone, scan_of
+from typer.testing import CliRunner
+
+from nerfcli.cli import app
+from nerfcli.errors import UserError
+from nerfcli.media.images import read_image
+from nerfcli.tomography.grid import centred_grid
+from nerfcli.tomography.marks import UNSEEN
+from nerfcli.tomography.result import load_reconstruction
+from nerfcli.tomography.scan import save_scan
+from nerfcli.tomography.volume_files import VolumeFile, read_volume, write_volume
+from nerfcli.workflows.tomography_files import export_scan, slice_of
+
+
+def call(*arguments: str | Path) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.fixture(scope="module")
+def bean_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scan of the bean with its truth beside it, and the run that `train` made of it."""
+    folder = tmp_path_factory.mktemp("bean")
+    grid = centred_grid((18.0, 18.0, 15.0), 0.6)
+    true = attenuation_of_voxels(bean(), x=grid.axis("x"), y=grid.axis("y"), z=grid.axis("z")).astype(np.float32)
+    np.save(folder / "truth.npy", true)
+    scan = scan_of(cone(), held_out=(0, 6, 12, 18, 24))
+    described = {
+        "path": str(folder / "truth.npy"),
+        "shape": list(true.shape),
+        "layout": "zyx",
+        "attenuation_per_value": 1.0,
+        "first": list(grid.first),
+        "size": grid.size,
+    }
+    from dataclasses import replace
+
+    save_scan(folder / "bean", replace(scan, history={"truth": described}))
+    code, out, err = call("train", folder / "bean", "--steps", "8", "--with", "centre=0", "--with", "tilt=0")
+    assert code == 0, err
+    assert out.strip() == str(folder / "bean-run")
+    return folder / "bean-run"
+
+
+def test_train_says_what_it_decided_and_keeps_a_run(bean_run: Path) -> None:
+    result = load_reconstruction(bean_run)
+    assert result.passes >= 8
+    assert any("total variation" in sentence for sentence in result.decisions)
+    assert result.grid.size == pytest.approx(0.6)
+    scan = bean_run.with_name("bean")
+    again = ("train", scan, "--steps", "8", "--with", "centre=0", "--with", "tilt=0")
+    code, _, err = call(*again)
+    assert code == 0
+    assert "is kept" in err
+    code, _, err = call("train", scan, "--steps", "9")
+    assert code == 3
+    assert "another reconstruction" in err
+
+
+def test_evaluate_compares_with_other_methods(bean_run: Path) -> None:
+    code, out, err = call("evaluate", bean_run, "--json", "--overwrite")
+    assert code == 0, err
+    methods = json.loads(out.splitlines()[-1])["methods"]
+    assert set(methods) == {"nerfcli", "filtered back-projection", "SART with total variation"}
+    own = methods["nerfcli"]
+    assert own["volume"]["psnr"] > methods["SART with total variation"]["volume"]["psnr"]
+    assert own["volume"]["ssim"] > 0.9
+    assert 0.8 < own["projections"]["chi_square"] < 6
+    assert len(own["projections"]["chi_square_of_view"]) == 5
+
+
+def test_render_writes_projections_residuals_and_slices(bean_run: Path, tmp_path: Path) -> None:
+    code, out, err = call("render", bean_run, "--outputs", "projection,residual", "-o", tmp_path / "pictures")
+    assert code == 0, err
+    assert len(out.splitlines()) == 10
+    residual = tifffile.imread(tmp_path / "pictures" / "residual" / "0006.tif")
+    assert residual.shape == (24, 40)
+    assert 0.8 < float(np.sqrt(np.mean(residual**2))) < 2.5
+    assert read_image(tmp_path / "pictures" / "projection" / "0000.png").shape == (24, 40, 3)
+    code, out, err = call("render", bean_run, "--slices", "z=0.3", "-o", tmp_path / "slices")
+    assert code == 0, err
+    picture = tifffile.imread(tmp_path / "slices" / "z=0.3.tif")
+    result = load_reconstruction(bean_run)
+    np.testing.assert_array_equal(picture[::-1], slice_of(result, "z", 0.3))
+    code, _, err = call("render", bean_run, "--slices", "z=400")
+    assert code == 3
+    assert "the volume goes from" in err
+    assert call("render", bean_run, "--slices", "w=1")[0] == 2
+
+
+def test_sign_of_residuals(bean_run: Path) -> None:
+    """More photons than predicted: the measured line integral is smaller, the residual negative; closed form."""
+    import torch
+
+    from nerfcli.tomography.likelihood import Gaussian, Poisson
+    from nerfcli.workflows.tomography_files import residual_of
+
+    zero = torch.zeros(1, 1)
+    view = torch.tensor([0])
+    counts = Poisson(torch.full((1, 1), 110.0), torch.full((1, 1), 100.0), zero)
+    assert float(residual_of(counts, zero, view)) == pytest.approx(-1.0)
+    integrals = Gaussian(torch.full((1, 1), 0.2), torch.full((1, 1), 100.0))
+    assert float(residual_of(integrals, zero, view)) == pytest.approx(2.0)
+
+
+def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
+    scan, run = bean_run.with_name("bean"), tmp_path / "run"
+    fixed = ("--with", "centre=0", "--with", "tilt=0", "--with", "tv=1", "-o", run)
+    assert call("train", scan, "--steps", "2", *fixed)[0] == 0
+    first = load_reconstruction(run)
+    code, _, err = call("train", scan, "--steps", "5", "--resume", *fixed)
+    assert code == 0, err
+    assert load_reconstruction(run).passes > first.passes
+
+
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii", ".tif"])
+def test_volume_files_read_back(bean_run: Path, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"bean{suffix}"
+    written = export_scan(bean_run, path)
+    result, back = load_reconstruction(bean_run), read_volume(path)
+    unseen = (np.asarray(result.marks) & UNSEEN) > 0
+    np.testing.assert_array_equal(np.isnan(back.values), unseen)
+    np.testing.assert_array_equal(back.values[~unseen], np.asarray(result.volume)[~unseen])
+    assert back.grid.shape == result.grid.shape
+    np.testing.assert_allclose(back.grid.first, result.grid.first, rtol=1e-6)
+    assert back.grid.size == pytest.approx(result.grid.size, rel=1e-6)
+    assert back.unit == "mm"
+    if suffix != ".tif":
+        assert back.quantity == "1/mm"
+    if len(written) == 2:
+        np.testing.assert_array_equal(read_volume(written[1]).values, result.marks)
+    with pytest.raises(UserError, match="is there already"):
+        export_scan(bean_run, path)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(UserError, match="damaged"):
+        read_volume(path)
+
+
+def test_hounsfield_units_of_water_and_air(tmp_path: Path, bean_run: Path) -> None:
+    """Closed form: 0 for water, -1000 for nothing."""
+    export_scan(bean_run, tmp_path / "hu.nrrd", water=0.12)
+    back = read_volume(tmp_path / "hu.nrrd")
+    assert back.quantity == "HU"
+    volume = np.asarray(load_reconstruction(bean_run).volume)
+    seen = np.isfinite(back.values)
+    np.testing.assert_allclose(back.values[seen], 1000 * (volume[seen] / 0.12 - 1), rtol=1e-4, atol=0.02)
+
+
+def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:
+    grid = centred_grid((2.0, 2.0, 2.0), 1.0)
+    with pytest.raises(UserError, match="no format of volumes"):
+        write_volume(tmp_path / "a.vol", VolumeFile(np.zeros((2, 2, 2), np.float32), grid, "mm", ""))
+    with pytest.raises(ValueError, match="float64"):
+        write_volume(tmp_path / "a.nrrd", VolumeFile(np.zeros((2, 2, 2)), grid, "mm", ""))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--field", "hash"), "no hash field"),
+        (("--with", "exposure=learned"), "no component 'exposure'"),
+        (("--with", "tv=much"), "a number is missing"),
+        (("--with", "tv=-1"), "cannot weigh"),
+        (("--voxel-size", "0"), "voxels of 0"),
+        (("--voxel-size", "0.001"), "need .* GB of memory"),
+    ],
+)
+def test_train_refuses_in_two_lines(bean_run: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+    import re
+
+    code, _, err = call("train", bean_run.with_name("bean"), "--steps", "1", "-o", tmp_path / "run", *arguments)
+    assert code == 3
+    assert re.search(said, err)
+    assert len([line for line in err.strip().splitlines() if line.strip()]) <= 3
+
+
+def test_a_changed_scan_is_not_evaluated_as_the_old_one(bean_run: Path, tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(bean_run.parent, tmp_path / "copy")
+    run = tmp_path / "copy" / "bean-run"
+    from nerfcli.workflows.tomography_scores import scan_of as scan_behind
+
+    result = load_reconstruction(run)
+    from dataclasses import replace
+
+    with pytest.raises(UserError, match="has changed"):
+        scan_behind(replace(result, scan_digest="0"), run)
+    with pytest.raises(UserError, match="which is not there"):
+        scan_behind(replace(result, scan=tmp_path / "nowhere"), run)
