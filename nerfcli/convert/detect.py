@@ -218,7 +218,8 @@ def _question(
         return Question(name, answers, "none holds", ratio, "most of the evidence contradicts each of them")
     if not (low > 0 and ratio >= LEAST_RATIO):
         noise = (high - low) / 2
-        reason = f"{what}, less than {'noise' if low <= 0 else 'a systematic error could cause'} ({noise:.2g})"
+        too_little = f"less than noise ({noise:.2g})" if low <= 0 else "which a small systematic error could cause"
+        reason = f"{what}, {too_little}"
         return Question(name, answers, "not decidable", ratio, reason)
     return Question(name, answers, "holds", ratio, "")
 
