@@ -39,7 +39,7 @@ def resident_bytes(pid: int) -> int:
 def _resident_by_ps(pid: int) -> int:
     """As `ps` tells it, on systems without /proc."""
     try:
-        told = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
+        text = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
     except OSError:
         return 0
-    return int(told) * 1024 if told.strip().isdigit() else 0
+    return int(text) * 1024 if text.strip().isdigit() else 0

@@ -54,5 +54,5 @@ class Session:
     def say(self, doing: str) -> None:
         """Report the current work and the remaining time."""
         left = max(0.0, self.left)
-        told = f"{left / 60:.0f} min" if left >= 90 else f"{left:.0f} s"
-        self.tell(min(1.0, self.spent / self.budget_seconds), f"{doing}, about {told} left")
+        text = f"{left / 60:.0f} min" if left >= 90 else f"{left:.0f} s"
+        self.tell(min(1.0, self.spent / self.budget_seconds), f"{doing}, about {text} left")

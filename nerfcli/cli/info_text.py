@@ -91,10 +91,10 @@ def _meaning(meaning: dict[str, Any]) -> Iterator[str]:
     if "rounding_max" in bounds:
         yield f"rounding to integers changed depth by at most {bounds.pop('rounding_max'):.3g}"
     if bounds:
-        told = bounds.pop("meaning", "a bound on the rendering, not on the accuracy of the field")
+        text = bounds.pop("meaning", "a bound on the rendering, not on the accuracy of the field")
         listed = ", ".join(f"{name} {_number(value)}" for name, value in bounds.items())
         yield from _folded(f"error of the rendering: {listed}")
-        yield from _folded(told)
+        yield from _folded(text)
     yield from _camera(meaning.get("view", {}))
     made = {**meaning.get("provenance", {})}
     if made or meaning.get("nerfcli"):

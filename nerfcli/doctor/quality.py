@@ -132,7 +132,7 @@ def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
         for photo in photos
         if photo.exif.exposure_seconds and photo.exif.iso
     ]
-    told = f"; EXIF: {np.ptp(settings):.1f} stops in time and ISO" if len(settings) > 1 else ""
+    text = f"; EXIF: {np.ptp(settings):.1f} stops in time and ISO" if len(settings) > 1 else ""
     off = [i for i in np.argsort(-np.abs(np.nan_to_num(lighter))) if known[i] and abs(lighter[i]) > STOPS_LOOK / 2]
     verdict = verdict_above(spread, look=STOPS_LOOK, bad=STOPS_BAD) if known.any() else GOOD
     if not known.any() and len(settings) > 1:
@@ -154,7 +154,7 @@ def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
     return Finding(
         "exposure",
         verdict,
-        seen + told,
+        seen + text,
         spread,
         f"look from {STOPS_LOOK:g} stop, bad from {STOPS_BAD:g}",
         "" if verdict == GOOD else advice,

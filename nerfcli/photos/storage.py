@@ -140,12 +140,12 @@ def storage_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[Photo
             "raise --memory, reduce the photos with --downscale 4, or use fewer --threads",
             OUT_OF_MEMORY,
         )
-    told = (
+    text = (
         f"memory: about {_gigabytes(total)} needed, limit {_gigabytes(limit)}: the photos ({_gigabytes(needs.photos)}"
         f") are kept in temporary files in {folder}"
     )
     # Room for the pages that a step brings back: the system maps 16 of them around each pixel that is looked at.
-    return InFiles(folder, limit - (limit - needs.rest) // 2), told
+    return InFiles(folder, limit - (limit - needs.rest) // 2), text
 
 
 def _gigabytes(count: int) -> str:

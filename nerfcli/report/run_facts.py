@@ -114,8 +114,8 @@ def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
 def _of_poses(poses: dict[str, Any]) -> Iterator[tuple[str, str]]:
     left_out = [image for image in poses.get("images", []) if not image.get("registered")]
     if left_out:
-        told = _listed([f"{image['name']} ({image.get('reason') or 'unknown reason'})" for image in left_out])
-        yield "poses", f"{len(left_out)} photos have no pose: {told}"
+        text = _listed([f"{image['name']} ({image.get('reason') or 'unknown reason'})" for image in left_out])
+        yield "poses", f"{len(left_out)} photos have no pose: {text}"
     for failure in poses.get("verdict", {}).get("failures", []):
         yield "poses", str(failure)
     attempts = poses.get("attempts", [])

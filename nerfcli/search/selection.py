@@ -252,7 +252,7 @@ def select(
     """
     budget = SearchBudget(seconds, steps)
     first_steps = MOST_START_STEPS if seconds is not None else round(START_SHARE * (steps or 0))
-    model, told = with_points(requested, facts)
+    model, decided = with_points(requested, facts)
     start = trials.begin(
         _without_poses(model),
         steps=min(first_steps, MOST_START_STEPS),
@@ -260,19 +260,19 @@ def select(
         fewest=FEWEST_STEPS,
     )
     if start is None:
-        return Selection(model, tuple(told), budget.spent)
+        return Selection(model, tuple(decided), budget.spent)
     budget.charge(start.steps)
-    if told:
+    if decided:
         without = trials.begin(_without_poses(requested), steps=start.steps)
         assert without is not None  # it has no fewest steps
         budget.charge(without.steps)
-        change = (told[0].component, told[0].value)
-        told = [judge_supported([without.trial], change, [start.trial], by_time=budget.is_time)]
-        if not told[0].kept:
+        change = (decided[0].component, decided[0].value)
+        decided = [judge_supported([without.trial], change, [start.trial], by_time=budget.is_time)]
+        if not decided[0].kept:
             model, start = requested, without
     candidates, declined = proposals(model, start.signs, facts)
     race = Race(trials, start, budget, _without_poses(model))
     race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
     chosen = replace(model, **dict(race.kept))
     gains = race.log_gains if chosen.exposure == "learned" else None
-    return Selection(chosen, (*told, *race.decisions.values(), *declined), budget.spent, gains)
+    return Selection(chosen, (*decided, *race.decisions.values(), *declined), budget.spent, gains)

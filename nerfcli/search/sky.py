@@ -58,6 +58,6 @@ def explained_by_direction(directions: Tensor, colours: Tensor, photos: Tensor) 
         background.logits.data += torch.logit(one.clamp(DARKEST, BRIGHTEST))[:, None, None, None]
         paint(background, lambda: (directions[tells], colours[tells]))
     with torch.no_grad():
-        told = (one, background(directions[~tells]))
-    one_psnr, painted = (psnr_of(float((c - colours[~tells]).square().mean())) for c in told)
+        predictions = (one, background(directions[~tells]))
+    one_psnr, painted = (psnr_of(float((c - colours[~tells]).square().mean())) for c in predictions)
     return one_psnr, painted

@@ -126,8 +126,8 @@ def prepare(
     first = scene.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)
     needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
-    storage, told = storage_for(needs, memory_bytes, folder=run)
-    notify(told)
+    storage, text = storage_for(needs, memory_bytes, folder=run)
+    notify(text)
     masks = settings.components.masks
     album = load_album(scene.train_frames, factor=factor, threads=settings.threads, storage=storage, masks=masks)
     shared = Shared(scene, album.photos, threads=settings.threads)

@@ -109,18 +109,18 @@ class Sentinel:
         if deterministic:
             for fraction in self._shares[: done - 1]:
                 fitting.advance(fraction)
-        path, told = self._keep(self._shares[done - 1], bad)
+        path, text = self._keep(self._shares[done - 1], bad)
         self._go_back()
         if fitting.rollbacks == MOST_ROLLBACKS:
             raise UserError(
-                f"{told}, despite {MOST_ROLLBACKS} retries with smaller steps",
+                f"{text}, despite {MOST_ROLLBACKS} retries with smaller steps",
                 f"the last checkpoint is kept; {path} has the state before the failure (nerfcli info repeats the "
                 "step); try another --seed",
                 NON_FINITE,
             )
         fitting.smaller_steps()
         self._notify(
-            f"{told}; continuing from step {fitting.step} with {fitting.rate_factor:g} of the learning rate ("
+            f"{text}; continuing from step {fitting.step} with {fitting.rate_factor:g} of the learning rate ("
             f"{fitting.rollbacks} of {MOST_ROLLBACKS} retries); {path} has the state before the failure"
         )
         self._description = fitting.state()[1]  # a later failure goes back to these smaller steps
@@ -141,15 +141,15 @@ class Sentinel:
             "after_draw": fitting.generator.get_state(),
         }
         pixels = [self._pool.place(int(drawn.numbers[ray])) for ray in bad.rays[:PIXELS_NAMED]]
-        told = f"{bad.name} is not finite at step {fitting.step + 1}: {bad.count} of {bad.total} numbers"
+        text = f"{bad.name} is not finite at step {fitting.step + 1}: {bad.count} of {bad.total} numbers"
         if pixels:
             name, x, y = pixels[0]
             more = f" and {len(bad.rays) - 1} more pixels" if len(bad.rays) > 1 else ""
-            told += f", in {name} at pixel ({x}, {y}){more}"
+            text += f", in {name} at pixel ({x}, {y}){more}"
         path = self._run / f"failure-{fitting.step + 1}.safetensors"
         content = {
             "format": FAILURE_FORMAT,
-            "told": told,
+            "told": text,
             "tensor": bad.name,
             "share": fraction,
             "pixels": [list(pixel) for pixel in pixels],
@@ -159,7 +159,7 @@ class Sentinel:
             "state": description,
         }
         save_tensors(path, {**before, **{f"batch.{name}": value for name, value in batch.items()}}, content)
-        return path, told
+        return path, text
 
 
 class _SavedBatch:
