@@ -108,7 +108,7 @@ def test_a_place_that_the_photos_own_matches_contradict_is_not_kept(tmp_path: Pa
     with pycolmap.Database.open(str(job.database)) as database:
         database.write_two_view_geometry(4, LAST, geometry)
     grown, (attempt,) = localise(model, job, image_ids=[LAST])
-    assert attempt.refused == "40 verified matches contradict its place"
+    assert attempt.refused == "40 verified matches contradict its pose"
     assert LAST not in grown.reg_image_ids()
 
 

@@ -185,9 +185,7 @@ def test_photos_without_overlap_are_too_few_and_leave_no_scene(tmp_path: Path):
             progress=lambda stage, done, total: told.append(stage),
         )
     # What was tried is told while the work goes on, not after it.
-    announced = next(
-        number for number, note in enumerate(told) if note.startswith("next: more features from full-size photos")
-    )
+    announced = next(number for number, note in enumerate(told) if note.startswith("next: more features from"))
     assert told.index("default thresholds: none of 5 photos registered") < announced
     assert "match" in told[announced:]
     assert caught.value.exit_code == TOO_FEW_PHOTOS
