@@ -28,7 +28,7 @@ from nerfcli.surface.grid import Grid
 from nerfcli.surface.marching import Mesh, mesh_of, surface_of, without_small_pieces
 from nerfcli.surface.simplify import simplified
 from nerfcli.surface.views import depth_views
-from nerfcli.surface.volume import sample_volume
+from nerfcli.surface.volume import density_at
 
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "truth"
 THRESHOLDS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
@@ -130,7 +130,8 @@ def main(
             seconds = {"simplify_s": round(time.perf_counter() - began, 1)}
             _tell("the same, at most 100,000 faces", small, truth, seconds)
     began = time.perf_counter()
-    density = sample_volume(model, grid)["density"]
+    layers = (np.indices((1, *grid.shape[1:])).reshape(3, -1).T + np.array([x, 0, 0]) for x in range(grid.shape[0]))
+    density = np.concatenate([density_at(model, grid.centres(layer)) for layer in layers]).reshape(grid.shape)
     meshes = []
     for threshold in THRESHOLDS:
         vertices, faces, _, _ = marching_cubes(density, threshold, gradient_direction="ascent")

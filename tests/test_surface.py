@@ -261,7 +261,7 @@ def ball_mesh() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 def test_a_ply_comes_back_and_says_what_it_is(tmp_path):
     vertices, faces, _, _ = ball_mesh()
-    described = {"unit": "metre", "unit_source": "gps", "frame": "of the scene"}
+    described = {"format": "nerfcli geometry 1", "unit": "metre", "unit_source": "gps", "frame": "of the scene"}
     write_ply(tmp_path / "a.ply", dict(zip("xyz", vertices.T, strict=True)), faces=faces, description=described)
     again, triangles = read_ply_mesh(tmp_path / "a.ply")
     np.testing.assert_array_equal(again, vertices)
@@ -271,6 +271,7 @@ def test_a_ply_comes_back_and_says_what_it_is(tmp_path):
     assert "frame of the scene" in comments
     facts = describe(tmp_path / "a.ply")
     assert (facts["kind"], facts["vertices"], facts["faces"], facts["unit"]) == ("mesh", 4, 4, "metre")
+    assert facts["format"] == "PLY"
     assert facts["high"] == [1.25, 1.25, 1.25]
 
 

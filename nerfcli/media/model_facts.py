@@ -62,7 +62,7 @@ def _ply_facts(path: Path) -> dict[str, Any]:
             file.seek(start)
             table = np.frombuffer(file.read(count * dtype.itemsize), dtype)
         facts |= _corners(np.stack([table[axis] for axis in "xyz"], axis=-1))
-    return facts | _described(comments)
+    return _described(comments) | facts
 
 
 def _glb_facts(path: Path) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def _glb_facts(path: Path) -> dict[str, Any]:
     except (KeyError, IndexError, TypeError):  # another program's: it may hold anything
         facts["note"] = "its first mesh has no list of triangles"
     extras = content.get("asset", {}).get("extras") or {}
-    return facts | (extras if extras else {"note": NOT_STATED})
+    return (extras if extras else {"note": NOT_STATED}) | facts
 
 
 def _obj_facts(path: Path) -> dict[str, Any]:
@@ -90,7 +90,8 @@ def _obj_facts(path: Path) -> dict[str, Any]:
                 counts[word] += 1
             elif word == "#":
                 comments.append(line[1:].strip())
-    return {"kind": "mesh", "format": "OBJ", "vertices": counts["v"], "faces": counts["f"]} | _described(comments)
+    facts = {"kind": "mesh", "format": "OBJ", "vertices": counts["v"], "faces": counts["f"]}
+    return _described(comments) | facts
 
 
 def _volume_facts(volume: Volume, form: str) -> dict[str, Any]:
@@ -102,7 +103,10 @@ def _volume_facts(volume: Volume, form: str) -> dict[str, Any]:
         known = values[np.isfinite(values)] if values.dtype.kind == "f" else values
         span = f", {known.min():.6g} to {known.max():.6g}" if known.size else ", no numbers"
         facts[name] = f"{values.dtype}{span}, {100 * known.size / values.size:.1f} % known"
-    return facts | dict(volume.description or {"note": NOT_STATED})
+    # A map's own name may be a word of the description, which says what its numbers are.
+    described = dict(volume.description or {"note": NOT_STATED})
+    meanings = {f"{name}_is": described.pop(name) for name in volume.maps if name in described}
+    return described | facts | meanings
 
 
 def _corners(points: np.ndarray) -> dict[str, Any]:

@@ -163,7 +163,7 @@ class Page {
     const [low, high] = state.range, unit = map === "opacity" ? "" : ` ${this.unit}`;
     $("ticks").replaceChildren(...[0, 0.25, 0.5, 0.75, 1].map(share => {
       const tick = document.createElement("span");
-      tick.textContent = `${(low + share * (high - low)).toPrecision(3)}${unit}`;
+      tick.textContent = `${(low + share * (high - low)).toPrecision(3)}${share === 1 ? unit : ""}`;
       return tick;
     }));
     const axis = map === "opacity" ? "" : state.axis === "z" ? ", along the optical axis" : ", along the ray";
