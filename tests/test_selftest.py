@@ -18,6 +18,7 @@ from nerfcli.kernels.reference import compositing, depth
 from nerfcli.selftest import suite, textbook
 from nerfcli.selftest.cases import Ray, Segments
 from nerfcli.selftest.measure import MET, NOT_MET, Errors, Precision, Row, by_formula, largest_error
+from nerfcli.selftest.table import checks, row_of
 
 SINGLE = Precision("float32", torch.float32, "cpu")
 COMPILED = Precision("compiled", torch.float32, "cpu", compiled=True)
@@ -99,7 +100,7 @@ def test_a_gradient_of_expm1_by_its_value_is_caught(monkeypatch):
 def test_a_broken_compiled_kernel_is_caught(monkeypatch):
     monkeypatch.setattr(numba_cpu, "composite", textbook.composite)
     assert failed(light.rows((COMPILED,))) == {"composite"}
-    assert failed(suite.rows("cpu", lambda text: None)) == {"composite"}
+    assert failed(row_of(check, COMPILED) for check in checks() if check.operation == "composite") == {"composite"}
 
 
 def test_depth_at_midpoints_and_distortion_by_differences_are_caught(monkeypatch):

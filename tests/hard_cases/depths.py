@@ -238,11 +238,10 @@ def _before_row(precision: Precision) -> Row:
     slope = _by_density(got, density, upstream)
     seconds = time.perf_counter() - start
     plain = textbook.optical_depth_before(density, lengths, offsets=offsets)
-    slopes = [
-        length * sum((j % 3 + 1) / 4 for j in range(k + 1, len(ray.lengths)))
-        for ray in rays
-        for k, length in enumerate(ray.lengths)
-    ]
+    slopes = []
+    for ray in rays:
+        behind = list(itertools.accumulate(((k % 3 + 1) / 4 for k in reversed(range(len(ray.lengths)))), initial=0.0))
+        slopes += [length * upstream for length, upstream in zip(ray.lengths, behind[-2::-1], strict=True)]
 
     def errors(values: Tensor, slope: Tensor | None) -> Errors:
         tiny = precision.tiny

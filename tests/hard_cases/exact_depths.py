@@ -4,6 +4,7 @@ Letters: interval k has the density sigma_k, the length L_k, the weight w_k, the
 x = sigma_k L_k; T_k is what passes the first k intervals, W the sum of all weights.
 """
 
+import functools
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from itertools import pairwise
@@ -65,9 +66,28 @@ class _Interval:
 
 def light_ends(ray: Ray) -> LightEnds:
     """Every depth of a ray and its gradient; the numbers of the ray are taken as they are."""
+    return _light_ends(_Numbers(ray))
+
+
+class _Numbers:
+    """A ray by its numbers, whatever it is called: each is looked at in several precisions and tests."""
+
+    def __init__(self, ray: Ray):
+        self.ray, self._key = ray, (tuple(ray.density), tuple(ray.starts), tuple(ray.ends))
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Numbers) and self._key == other._key
+
+
+@functools.cache
+def _light_ends(numbers: _Numbers) -> LightEnds:
+    ray = numbers.ray
     with localcontext() as context:
         context.prec = DIGITS
-        intervals = _intervals(ray)
+        intervals = _intervals(_Numbers(ray))
         tau = sum((one.depth for one in intervals), Decimal(0))
         left = (-tau).exp()
         slopes = [one.length * left for one in intervals]
@@ -99,7 +119,7 @@ def is_settled(ray: Ray, share: float, *, within: float) -> bool:
     interval or the end of all light jumps there."""
     with localcontext() as context:
         context.prec = DIGITS
-        intervals, target = _intervals(ray), _target(share)
+        intervals, target = _intervals(_Numbers(ray)), _target(share)
         least, most = (_crossed(intervals, target * (1 + Decimal(x))) for x in (-within, within))
         if least is None or most is None:
             return least is most
@@ -107,7 +127,9 @@ def is_settled(ray: Ray, share: float, *, within: float) -> bool:
         return gapless and len({one.sigma for one in intervals[least : most + 1]}) == 1
 
 
-def _intervals(ray: Ray) -> list[_Interval]:
+@functools.cache
+def _intervals(numbers: _Numbers) -> list[_Interval]:
+    ray = numbers.ray
     tau, found = Decimal(0), []
     for sigma, start, end in zip(
         *(map(Decimal, values) for values in (ray.density, ray.starts, ray.ends)), strict=True
