@@ -192,6 +192,12 @@ def test_sums_along_rays_are_those_of_a_double_loop(dtype):
 UNEVEN = torch.linspace(0.55, 2.0, 40, dtype=torch.float64).square()
 
 
+def wide(rays: Rays) -> Rays:
+    """The rays with pixels wider than the cells of the grids."""
+    assert rays.cones is not None
+    return rays._replace(cones=30 * rays.cones)
+
+
 @torch.no_grad()
 def samples_by_hand(field: Field, rays: Rays, march: March) -> list[list[tuple[float, float]]]:
     """Of each ray the intervals that light gets to, one after the other, in float64."""
@@ -248,7 +254,7 @@ def test_rays_of_a_training_are_single_operations_one_after_the_other(name, near
     field = field_of(name, torch.float64, "reference")
     rays, march = rays_and_march(4, torch.float64)
     rays, march = (
-        rays._replace(origins=rays.origins + 1.2 * rays.directions),
+        wide(rays)._replace(origins=rays.origins + 1.2 * rays.directions),
         march._replace(edges=UNEVEN, max_optical_depth=0.4),
     )
     background = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
@@ -297,7 +303,7 @@ def test_rays_of_a_picture_are_single_operations_one_after_the_other(name):
     """Colours that are not asked for are grey, and the bound says what that and the early stop may change."""
     field = field_of(name, torch.float64, "reference")
     rays, march = rays_and_march(6, torch.float64)
-    march, negligible = march._replace(edges=UNEVEN, max_optical_depth=0.4), 0.3
+    rays, march, negligible = wide(rays), march._replace(edges=UNEVEN, max_optical_depth=0.4), 0.3
     background = torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     seen = field.backend.trace_rays(rays, march, field.medium(), background=background, negligible=negligible)
     with torch.no_grad():
