@@ -57,7 +57,6 @@ def test_a_training_keeps_what_its_photos_tell_of_the_held_out_ones_which_it_doe
     settings = TrainSettings(
         budget_seconds=None,
         steps=150,
-        levels=2,
         log2_rows=8,
         first_samples_per_step=2**10,
         samples_per_step=2**10,
