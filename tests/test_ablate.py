@@ -12,6 +12,7 @@ from nerfcli.ablate.results import MeasuredTraining, half_interval, rows_of
 from nerfcli.ablate.variants import CHOSEN, CaptureTraits, Variant, variants
 from nerfcli.cli import app
 from nerfcli.runs.components import CHOICES, Components
+from nerfcli.workflows import evaluate as evaluate_workflow
 
 ALL = CaptureTraits(has_alpha=False, has_points=True, has_exif=True)
 
@@ -65,6 +66,8 @@ def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
     """Killed before its third training, the same command trains what is left, and no model twice."""
     from nerfcli.train import loop
 
+    # How a field compares with billboards has its own tests; here it would be computed four times.
+    monkeypatch.setattr(evaluate_workflow, "training_billboards", lambda run, *, notify: None)
     trained, real = [], loop.train
 
     def train(scene, run, settings, **rest):

@@ -53,18 +53,25 @@ def rays_and_march(count: int, dtype: torch.dtype, *, empty: bool = False) -> tu
     return rays, March(edges, occupied, "l2", 7.0)
 
 
+def wide(rays: Rays) -> Rays:
+    """The rays with pixels wider than the cells of the grids."""
+    assert rays.cones is not None
+    return rays._replace(cones=30 * rays.cones)
+
+
 def learned(
     name: str, wanted: str, count: int, *, dtype: torch.dtype, targets: Targets, with_sink: bool
 ) -> dict[str, Tensor]:
     """What a training gets of some rays, and the gradients of a random weighting of it."""
     field = field_of(name, dtype, wanted)
     rays, march = rays_and_march(count, dtype)
-    rays = rays._replace(origins=rays.origins.requires_grad_(), directions=rays.directions.requires_grad_())
+    rays = wide(rays)._replace(origins=rays.origins.requires_grad_(), directions=rays.directions.requires_grad_())
     g = torch.Generator().manual_seed(9)
     background = torch.rand(count, 3, generator=g).to(dtype)
     rows = field.rows()
     assert rows is not None
-    sink = torch.zeros_like(rows, requires_grad=False) if with_sink else None
+    # What is in it stays: gradients are added.
+    sink = torch.ones_like(rows, requires_grad=False) if with_sink else None
     distances = None if targets.distances is None else targets.distances[:count].to(dtype)
     seen = field.backend.render_rays(
         rays, march, field.medium(), targets._replace(distances=distances), background=background, sink=sink
@@ -76,7 +83,7 @@ def learned(
     assert (rows.grad is None) == with_sink or not len(rays.origins)
     gradients = {f"gradient of {key}": value.grad for key, value in field.named_parameters() if value is not rows}
     gradients |= {"gradient of origins": rays.origins.grad, "gradient of directions": rays.directions.grad}
-    gradients["gradient of rows"] = rows.grad if sink is None else sink
+    gradients["gradient of rows"] = rows.grad if sink is None else sink - 1.0
     return {**seen._asdict(), **{key: value for key, value in gradients.items() if value is not None}}
 
 
@@ -190,12 +197,6 @@ def test_sums_along_rays_are_those_of_a_double_loop(dtype):
 
 
 UNEVEN = torch.linspace(0.55, 2.0, 40, dtype=torch.float64).square()
-
-
-def wide(rays: Rays) -> Rays:
-    """The rays with pixels wider than the cells of the grids."""
-    assert rays.cones is not None
-    return rays._replace(cones=30 * rays.cones)
 
 
 @torch.no_grad()
@@ -387,12 +388,12 @@ def test_without_numba_the_reference_is_taken_with_one_warning(without_numba, re
     names = [kernels.backend_for(CPU, torch.float32).name for _ in range(3)]
     assert names == ["reference"] * 3
     (warning,) = recwarn
-    assert "Numba does not work here" in str(warning.message)
+    assert "Numba does not work on this machine" in str(warning.message)
 
 
-@pytest.mark.filterwarnings("ignore:Numba does not work here")
+@pytest.mark.filterwarnings("ignore:Numba does not work on this machine")
 def test_a_backend_that_is_wanted_by_name_and_does_not_work_is_an_error(without_numba):
-    with pytest.raises(UserError, match="numba_cpu cannot be used: Numba does not work here"):
+    with pytest.raises(UserError, match="numba_cpu cannot be used: Numba does not work on this machine"):
         kernels.backend_for(CPU, torch.float32, wanted="numba_cpu")
 
 
