@@ -133,7 +133,7 @@ def test_a_run_that_was_moved_without_its_photos_says_which_and_how_to_mend_it(f
     assert result.exit_code == BAD_INPUT
     error, hint = error_of(result)
     missing = moved.parent / "spheres" / "test" / "r_000.png"
-    assert error == f"Error: the photo {missing} is not there"
+    assert error == f"Error: photo not found: {missing}"
     assert "put a link to the photo folder there" in hint
     (moved.parent / "spheres").symlink_to(capture)  # as it says
     assert nerfcli("evaluate", moved).exit_code == 0

@@ -241,7 +241,7 @@ class TestPoses:
         position, rotation_deg = errors(capture, folder / "scene")
         assert position < 0.02
         assert rotation_deg < 0.5
-        assert sum("an object turns" in note for note in notes) == 1
+        assert sum("an object moves in front" in note for note in notes) == 1
 
     def test_report_has_the_numbers(self, capture: Turntable, made: tuple[Path, dict, list[str]]) -> None:
         found = made[1]["moving_foreground"]

@@ -96,7 +96,7 @@ def _read_frames(path: Path, *, given: bool) -> RunCameras:
             f"{run} is not a run folder: it has no {CAMERAS}", "give a run folder written by nerfcli train"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"cannot read {path}: {error}", MEND) from error
+        raise UserError(f"{path} cannot be read: {error}", MEND) from error
     return RunCameras(train, test)
 
 
