@@ -319,7 +319,7 @@ def test_a_line_that_a_kill_cut_short_is_left_out_and_not_continued(tmp_path):
 
 def test_another_bench_and_other_files_are_not_touched(tmp_path):
     opened(tmp_path / "bench", {"source": "a"})
-    with pytest.raises(UserError, match="another source"):
+    with pytest.raises(UserError, match="a different source"):
         opened(tmp_path / "bench", {"source": "b"})
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
