@@ -303,6 +303,18 @@ def test_what_is_left_is_right_within_a_half_from_a_quarter_on(planned: tuple[in
         began = now
 
 
+def test_another_attempt_is_measured_from_its_own_start():
+    """The mapper took 100 s to get stuck at 60 of 100 photos, and starts anew from two photos, as it did then."""
+    now = 0.0
+    outlook = Outlook(Plan(100, 1600, 4096, "exhaustive", 45, {"map": 120.0}), clock=lambda: now)
+    outlook.update("map", 2, 100)
+    now = 100.0
+    outlook.update("map", 60, 100)
+    outlook.update("map", 2, 100)
+    now = 101.0
+    assert 60.0 < outlook.update("map", 3, 100)[1] < 300.0
+
+
 def test_another_attempt_lowers_the_share():
     """Mapping begins again after the checks: the work is not at its end."""
     now = 0.0

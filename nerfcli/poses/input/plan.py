@@ -105,6 +105,7 @@ class Outlook:
         self._start = clock()
         self._stage = ""
         self._began = (0.0, 0.0)
+        self._ratio = 0.0
         self._stretches: list[float] = []  # of the stages before: their seconds, over what the plan has for that work
         self._latest = (0.0, 0.0)  # of the stage at hand: its seconds, and what the plan has for that work
         self._seconds = dict(plan.seconds)
@@ -118,11 +119,12 @@ class Outlook:
         ratio = (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
         if self._begins_again(stage, ratio):
             self._share = 0.0
-        if stage != self._stage or ratio < self._began[1]:
+        if stage != self._stage or ratio < self._ratio:
             took, of_plan = self._latest
             if of_plan > _TELLING * self._seconds.get(self._stage, 0.0):
                 self._stretches.append(took / of_plan)
             self._stage, self._began, self._latest = stage, (now, ratio), (0.0, 0.0)
+        self._ratio = ratio
         planned = self._seconds.get(stage, 0.0)
         began, ratio_before = self._began
         took, of_plan = now - began, planned * (ratio - ratio_before)
@@ -147,7 +149,7 @@ class Outlook:
         """Whether the work goes back, for another attempt. Stages without a plan come last."""
         order = list(self._seconds)
         new, old = (order.index(name) if name in order else len(order) for name in (stage, self._stage))
-        return bool(self._stage) and (new < old or (new == old and ratio < self._began[1]))
+        return bool(self._stage) and (new < old or (new == old and ratio < self._ratio))
 
     def _plan_enlarging(self, photos: int) -> None:
         """Put the second search for features after the first."""
