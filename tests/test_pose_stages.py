@@ -265,7 +265,7 @@ def test_without_its_database_a_scene_is_still_a_scene(photos: Path, again: Path
 
 
 def test_two_calls_on_one_scene_do_not_meet(photos: Path, tmp_path: Path):
-    with workspace(tmp_path / "scene"), pytest.raises(UserError, match="another nerfcli poses is at work on"):
+    with workspace(tmp_path / "scene"), pytest.raises(UserError, match="another nerfcli poses is working on"):
         estimate(photos, tmp_path / "scene")
 
 
