@@ -23,7 +23,7 @@ STRENGTHS = (1.0, 0.3, 3.0, 0.1, 10.0)
 FAR_BETTER = 0.25
 # Every how many training views one is left out of the trial.
 LEFT_OUT_EVERY = 5
-TRIAL_PASSES = 12
+TRIAL_PASSES = 10
 # Rows of the detector that a trial looks at. Pixels and voxels keep their size: larger ones are wrong by more than
 # noise, and ask for another weight.
 TRIAL_ROWS = 12
@@ -49,7 +49,7 @@ def choose_strength(
     geometry: ScanGeometry,
     grid: VoxelGrid,
     *,
-    most_seconds: float,
+    most_seconds: float | None,
     progress: Callable[[float, str], None] | None = None,
 ) -> StrengthTrial:
     """Try strengths on the middle rows of the detector, and take the usual one unless another predicts far better.
@@ -58,7 +58,8 @@ def choose_strength(
         scan: of whose training views every fifth is predicted.
         geometry: of all views, corrected.
         grid: of the reconstruction.
-        most_seconds: for all trials together; the first two are always done.
+        most_seconds: for all trials together, of which each gets a quarter at most; None tries the usual strength
+            alone, so that the result does not depend on the machine.
         progress: takes the share done and a few words.
     """
     views = scan.training_views
@@ -71,19 +72,20 @@ def choose_strength(
     projector, judge = Projector(part.geometry.select(left), layers), likelihood_of(part, left)
     every = np.arange(len(left))
     error = 0.0
+    quarter = None if most_seconds is None else most_seconds / 4
     fit = start(problem)
     if isinstance(judge, Poisson) and isinstance(problem.likelihood, Poisson):
-        fit = reconstruct(problem, fit, strength=STRENGTHS[0], passes=TRIAL_PASSES)
+        fit = reconstruct(problem, fit, strength=STRENGTHS[0], passes=TRIAL_PASSES, seconds=quarter)
         error = judge.found_model_error(projector.forward(fit.volume, every), torch.from_numpy(every))
         judge = judge.with_model_error(error)
         problem = replace(problem, likelihood=problem.likelihood.with_model_error(error))
     deviances = []
-    for number, strength in enumerate(STRENGTHS):
-        if number > 1 and fit.seconds * (number + 2) / (number + 1) > most_seconds:
+    for number, strength in enumerate(STRENGTHS if most_seconds is not None else STRENGTHS[:1]):
+        if number > 0 and most_seconds is not None and fit.seconds * (number + 2) / (number + 1) > most_seconds:
             break
         if progress is not None:
             progress(number / len(STRENGTHS), f"total variation {strength:g}")
-        fit = reconstruct(problem, fit, strength=strength, passes=TRIAL_PASSES)
+        fit = reconstruct(problem, fit, strength=strength, passes=TRIAL_PASSES, seconds=quarter)
         deviance = judge.deviance(projector.forward(fit.volume, every), torch.from_numpy(every))
         deviances.append(np.nanmean(deviance.numpy(), axis=1))
     means = [float(np.mean(d)) for d in deviances]

@@ -84,7 +84,7 @@ def train_scan(
             raise UserError(
                 f"{run} holds another reconstruction", "name another folder with --output, or replace it by --overwrite"
             )
-    elif run.exists() and any(run.iterdir()) and not (overwrite and is_reconstruction(run)):
+    elif _holds_something(run) and not (overwrite and is_reconstruction(run)):
         raise UserError(f"{run} is there and holds no reconstruction", "name another folder with --output")
     with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
         clear_leftovers(run)
@@ -105,6 +105,11 @@ def corrected_by(geometry: ScanGeometry, centre: float, tilt: float) -> ScanGeom
     """The geometry with its centre moved by some columns and its detector turned."""
     shifted = geometry.shifted(centre) if centre else geometry
     return shifted.tilted(tilt) if tilt else shifted
+
+
+def _holds_something(run: Path) -> bool:
+    """Whether a folder has more in it than what an interrupted reconstruction leaves."""
+    return run.is_dir() and any(not path.name.startswith(".") for path in run.iterdir())
 
 
 def _wanted(settings: ReconstructionSettings) -> ReconstructionSettings:
@@ -131,7 +136,7 @@ def _fit(
     if earlier is not None:
         strength, model_error = float(earlier.used["strength"]), float(earlier.used["model_error"])
     else:
-        most = STRENGTH_SHARE * (settings.budget_seconds or float("inf"))
+        most = None if settings.budget_seconds is None else STRENGTH_SHARE * settings.budget_seconds
         trial = choose_strength(scan, geometry, grid, most_seconds=most, progress=progress)
         strength, model_error = trial.strength, trial.model_error
         if settings.strength is None:
