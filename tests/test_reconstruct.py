@@ -160,6 +160,22 @@ def test_chi_square_of_the_truth_is_one(scan: Scan) -> None:
     assert float(logs.deviance(flat, every).mean()) == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.parametrize(("rows", "columns", "factor"), [(24, 40, 2), (2, 64, 6), (1, 40, 3), (7, 41, 5)])
+def test_larger_pixels_see_what_their_parts_see(rows: int, columns: int, factor: int) -> None:
+    """The centre of a larger pixel is the mean of the centres of its parts, and likelihoods have as many pixels."""
+    geometry = circular_parallel([0.3, 1.1], pixel_width=0.5, pixel_height=0.4, rows=rows, columns=columns)
+    coarse = geometry.binned(factor)
+    scan = Scan(geometry, "transmission", np.full((2, rows, columns), 0.5, np.float32), photons_per_value=100.0)
+    likelihood = likelihood_of(scan, np.arange(2), binning=factor)
+    assert isinstance(likelihood, Poisson)
+    assert likelihood.counts.shape == (2, coarse.rows * coarse.columns)
+    row_factor = factor if rows >= factor else 1
+    assert float(likelihood.counts[0, 0]) == pytest.approx(50 * factor * row_factor)
+    origins, _ = geometry.rays()
+    parts = origins[:, :row_factor, :factor].mean((1, 2))
+    np.testing.assert_allclose(coarse.rays()[0][:, 0, 0], parts, atol=1e-12)
+
+
 def test_photons_are_found_from_the_noise() -> None:
     """Flat pictures of known photon numbers behind detector values of any scale."""
     rng = np.random.default_rng(0)

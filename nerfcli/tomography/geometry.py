@@ -66,10 +66,12 @@ class ScanGeometry:
         )
 
     def binned(self, factor: int) -> "ScanGeometry":
-        """The detector with pixels `factor` times as large; pixels that fill no larger one are cut off at the end."""
-        rows, columns = self.rows // factor, self.columns // factor
-        rows, columns = max(rows, 1), max(columns, 1)
+        """The detector with pixels `factor` times as large; pixels that fill no larger one are cut off at the end.
+
+        Rows are kept as they are where there are fewer of them than `factor`.
+        """
         row_factor = factor if self.rows >= factor else 1
+        rows, columns = self.rows // row_factor, max(self.columns // factor, 1)
         # The centre moves when the last rows and columns are cut off.
         moved_rows = (rows * row_factor - self.rows) / 2
         moved_columns = (columns * factor - self.columns) / 2
