@@ -320,7 +320,7 @@ def test_fields_of_the_format_before_contractions_are_read(tmp_path, unbounded, 
 def test_model_of_another_format_is_named(tmp_path):
     path = tmp_path / "state.safetensors"
     save_tensors(path, {"a": torch.zeros(1)}, {"format": "another field 9"})
-    with pytest.raises(UserError, match="holds 'another field 9', expected 'nerfcli field 2'"):
+    with pytest.raises(UserError, match="is of format 'another field 9', expected 'nerfcli field 2'"):
         load_model(path, "cpu")
 
 

@@ -60,7 +60,7 @@ def test_a_held_out_photo_is_placed_and_moves_nothing_by_a_bit(solved):
 def test_the_scene_knows_what_was_held_out_and_how(solved):
     photos, scene_dir, settings, report = solved
     images = {image.name: image for image in report.images}
-    assert images["wall.png"].reason == "matches too few points of the training photos (0 agree of 0)"
+    assert images["wall.png"].reason == "matches too few points of the training photos (0 inliers of 0)"
     assert (report.registered, report.total) == (7, 9)
     loaded = scene.load(scene_dir)
     assert loaded.test_names == {NAMES[HELD_OUT]}
