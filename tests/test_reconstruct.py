@@ -292,7 +292,7 @@ def test_scan_folder_round_trip(scan: Scan, tmp_path: Path) -> None:
     assert back.digest == scan.digest
     assert back.held_out == scan.held_out
     (tmp_path / "bean" / "values.npy").write_bytes(b"\x93NUMPY")
-    with pytest.raises(UserError, match="no scan that can be read"):
+    with pytest.raises(UserError, match="cannot be read as a scan"):
         load_scan(tmp_path / "bean")
     values = scan.values.copy()
     values[0, 0, 0] += 1

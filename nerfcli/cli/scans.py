@@ -38,7 +38,7 @@ def reconstruction_settings(
     from nerfcli.tomography.result import FIELDS, ReconstructionSettings
 
     if field is not None and field not in FIELDS:
-        raise UserError(f"no {field} field for scans", f"choose {' or '.join(FIELDS)} with --field")
+        raise UserError(f"scans cannot use --field {field}", f"choose {' or '.join(FIELDS)}")
     values: dict[str, float | bool | None] = {"tv": None, "centre": None, "tilt": None, "air": None}
     for text in exclude or ():
         values.update({_component(text, "--without"): 0.0 if text != "air" else False})
@@ -131,7 +131,7 @@ def _projection_cells(projections: dict) -> tuple[str, str, str]:
 
 def _component(name: str, option: str) -> str:
     if name not in ("tv", "centre", "tilt", "air"):
-        raise UserError(f"scans have no component {name!r} for {option}", f"choose from {_COMPONENTS}")
+        raise UserError(f"{option} {name}: unknown component for scans", f"choose from {_COMPONENTS}")
     return name
 
 
@@ -139,4 +139,4 @@ def _number(text: str, value: str) -> float:
     try:
         return float(value)
     except ValueError as error:
-        raise UserError(f"--with {text}: a number is missing", f"write {_COMPONENTS}") from error
+        raise UserError(f"--with {text}: expected a number", f"write {_COMPONENTS}") from error

@@ -132,7 +132,7 @@ def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson
     """The likelihood of some views of a scan, by what it measured.
 
     Transmissions are counts of an open beam of 1 in photons. Where nobody knows how many photons a value stands for,
-    it is told from the noise between neighbouring pixels, see `photons_per_value`.
+    it is estimated from the noise between neighbouring pixels, see `photons_per_value`.
 
     Args:
         scan: the scan.

@@ -55,12 +55,14 @@ class ReconstructionSettings:
 
     def __post_init__(self) -> None:
         if self.budget_seconds is None and self.passes is None:
-            raise UserError("no end of the reconstruction is given", "give --budget 2m or --steps 30")
+            raise UserError(
+                "no stopping criterion: neither --budget nor --steps is given", "give --budget 2m or --steps 30"
+            )
         if self.voxel_size is not None and not self.voxel_size > 0:
-            raise UserError(f"voxels of {self.voxel_size:g} cannot be", "give --voxel-size a length above 0")
+            raise UserError(f"invalid voxel size {self.voxel_size:g}", "give --voxel-size a length above 0")
         if self.strength is not None and not 0 <= self.strength < float("inf"):
             raise UserError(
-                f"total variation cannot weigh {self.strength:g}", "give a number of 0 or more, or leave it out"
+                f"invalid weight of total variation: {self.strength:g}", "give a number of 0 or more, or leave it out"
             )
 
 
@@ -172,4 +174,4 @@ def load_reconstruction(run: Path) -> Reconstruction:
             content["versions"],
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{run} is no reconstruction that can be read: {error}", "train the scan again") from error
+        raise UserError(f"{run} cannot be read as a reconstruction: {error}", "train the scan again") from error

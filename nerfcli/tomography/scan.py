@@ -199,7 +199,7 @@ def load_scan(folder: Path) -> Scan:
             content["history"],
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} is no scan that can be read: {error}", "convert the scan again") from error
+        raise UserError(f"{path} cannot be read as a scan: {error}", "convert the scan again") from error
 
 
 def held_out_views(views: int, every: int = HELD_OUT_EVERY) -> tuple[int, ...]:

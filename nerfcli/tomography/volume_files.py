@@ -73,10 +73,10 @@ def read_volume(path: Path) -> VolumeFile:
     try:
         return readers[path.suffix.lower()](path)
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}", "give a volume's file") from error
+        raise UserError(f"cannot read {path}: {error.strerror or error}", "give a volume file") from error
     except (KeyError, ValueError, IndexError, struct.error, tifffile.TiffFileError) as error:
         raise UserError(
-            f"{path} is damaged, or no volume that nerfcli wrote: {error}", "export the volume again"
+            f"{path} is damaged or not a volume written by nerfcli: {error}", "export the volume again"
         ) from error
 
 
@@ -89,7 +89,7 @@ def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
         ".tiff": _write_tiff,
     }
     if path.suffix.lower() not in writers:
-        raise UserError(f"{path.name}: no format of volumes has this suffix", "choose .nrrd, .mha, .nii or .tif")
+        raise UserError(f"{path.name}: unknown volume format", "choose .nrrd, .mha, .nii or .tif")
     return writers[path.suffix.lower()]
 
 

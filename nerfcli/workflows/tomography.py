@@ -78,15 +78,15 @@ def train_scan(
     if earlier is not None:
         same = earlier.scan_digest == loaded.digest and _wanted(earlier.settings) == _wanted(settings)
         if same and not resume:
-            notify(f"{run} is kept: it was fitted with these settings; --overwrite fits again")
+            notify(f"{run} is kept: it is complete and has these settings; add --overwrite to fit again")
             return earlier
         if not (same or (resume and earlier.scan_digest == loaded.digest)):
             raise UserError(
-                f"{run} holds another reconstruction", "name another folder with --output, or replace it by --overwrite"
+                f"{run} holds another reconstruction", "choose another folder with --output, or add --overwrite"
             )
     elif _holds_something(run) and not (overwrite and is_reconstruction(run)):
-        raise UserError(f"{run} is there and holds no reconstruction", "name another folder with --output")
-    with exclusive(run / LOCK, f"nerfcli train is at work on {run}"):
+        raise UserError(f"{run} exists and is not a reconstruction", "choose another folder with --output")
+    with exclusive(run / LOCK, f"another nerfcli train is writing {run}"):
         clear_leftovers(run)
         (run / METRICS).unlink(missing_ok=True)
         _warn_of(loaded, warn)
@@ -141,11 +141,11 @@ def _fit(
         strength, model_error = trial.strength, trial.model_error
         if settings.strength is None:
             tried = ", ".join(f"{value:g}: {deviance:.3f}" for value, deviance in sorted(trial.tried))
-            decisions.append(f"total variation {strength:g}: chi-square of views that were not fitted {tried}")
+            decisions.append(f"total variation {strength:g}: chi-square of left-out views at {tried}")
         else:
             strength = settings.strength
         if model_error > 0:
-            decisions.append(f"line integrals of the model are off by {model_error:.2g} beside the noise of photons")
+            decisions.append(f"model error: line integrals are uncertain by {model_error:.2g} beyond photon noise")
     likelihood = likelihood_of(scan, views)
     factors = None
     if earlier is not None:
@@ -216,16 +216,16 @@ def _geometry(
         centre = found.value if found.holds else 0.0
         if found.holds:
             decisions.append(
-                f"centre of rotation {found.value:+.2f} columns from where the scan says: chi-square of views that "
-                f"were not fitted falls by {found.gain:.3g} ± {found.error:.2g}"
+                f"centre of rotation: shifted by {found.value:+.2f} columns, which lowers chi-square of left-out views "
+                f"by {found.gain:.3g} ± {found.error:.2g}"
             )
     if tilt is None:
         found = detector_tilt(replace(scan, geometry=scan.geometry.shifted(centre)))
         tilt = found.value if found.holds else 0.0
         if found.holds:
             decisions.append(
-                f"detector turned by {np.rad2deg(found.value):+.2f} degrees in its plane: chi-square of views that "
-                f"were not fitted falls by {found.gain:.3g} ± {found.error:.2g}"
+                f"detector tilt: {np.rad2deg(found.value):+.2f} degrees, which lowers chi-square of left-out views "
+                f"by {found.gain:.3g} ± {found.error:.2g}"
             )
     return centre, tilt
 
@@ -257,8 +257,8 @@ def _air(
     if not forced and spread <= DRIFT * error:
         return None
     decisions.append(
-        f"open beam of each view from the pixels beside the object: it varies by {100 * spread:.2f} % between views, "
-        f"where noise would give {100 * error:.2f} %"
+        f"open beam: corrected per view; it varies by {100 * spread:.2f} % between views, of which noise explains "
+        f"{100 * error:.2f} %"
     )
     return [float(f) for f in factors]
 
@@ -302,11 +302,11 @@ def _fits_memory(grid: VoxelGrid) -> None:
     if limit is not None and needed > limit:
         size = " x ".join(str(count) for count in reversed(grid.shape))
         raise UserError(
-            f"{size} voxels need {needed / 1e9:.1f} GB of memory, where {limit / 1e9:.1f} GB may be used",
-            f"take larger voxels with --voxel-size, now {grid.size:.3g}",
+            f"{size} voxels need {needed / 1e9:.1f} GB of memory; the limit is {limit / 1e9:.1f} GB",
+            f"choose larger voxels with --voxel-size (now {grid.size:.3g})",
         )
 
 
 def _warn_of(scan: Scan, warn: Notify) -> None:
     if scan.kind != "line_integral" and scan.photons_per_value is None:
-        warn("nobody says how many photons a value stands for: it is told from the noise of neighbouring pixels")
+        warn("photons per detector value not given: estimated from the noise of neighbouring pixels")

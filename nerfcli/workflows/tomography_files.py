@@ -64,7 +64,7 @@ def render_scan(
     scan = scan_of(result, run)
     chosen = np.array(scan.held_out, dtype=int) if views == "test" else scan.training_views
     if len(chosen) == 0:
-        raise UserError(f"{run} has no held-out views", "render the fitted ones with --cameras train")
+        raise UserError(f"{run} has no held-out views", "render the training views with --cameras train")
     geometry = corrected(scan.geometry, result).select(chosen)
     projector, likelihood = Projector(geometry, result.grid), likelihood_of(scan, chosen)
     volume = torch.from_numpy(np.array(result.volume))
@@ -136,8 +136,8 @@ def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
     half = grid.size / 2
     if not positions[0] - half <= at <= positions[-1] + half:
         raise UserError(
-            f"no slice at {axis}={at:g}: the volume goes from {positions[0]:.4g} to {positions[-1]:.4g} {result.unit}",
-            "choose a position in between",
+            f"{axis}={at:g} is outside the volume ({positions[0]:.4g} to {positions[-1]:.4g} {result.unit})",
+            "choose a position in this range",
         )
     place = float(np.clip((at - positions[0]) / grid.size, 0, len(positions) - 1))
     low = min(int(place), max(len(positions) - 2, 0))
@@ -179,4 +179,4 @@ def _write_picture(path: Path, values: np.ndarray, low: float, high: float, *, o
 
 def _refuse_existing(path: Path, *, overwrite: bool) -> None:
     if path.exists() and not overwrite:
-        raise UserError(f"{path} is there already", "name another place with --output, or replace it by --overwrite")
+        raise UserError(f"{path} exists already", "choose another place with --output, or add --overwrite")

@@ -68,7 +68,7 @@ def evaluate_scan(
     if path.exists() and not overwrite:
         kept = read_json(path, needed=("methods",), hint="measure again with --overwrite")
         if kept.get("scan_digest") == result.scan_digest and kept.get("passes") == result.passes:
-            notify(f"{path} is kept; --overwrite measures again")
+            notify(f"{path} is kept; add --overwrite to measure again")
             return ScanEvaluation(path, kept, True)
     scan = scan_of(result, run)
     geometry = corrected(scan.geometry, result)
@@ -123,8 +123,8 @@ def scan_of(result: Reconstruction, run: Path) -> Scan:
     """
     if not result.scan.exists():
         raise UserError(
-            f"the scan of {run} should be in {result.scan}, which is not there",
-            "call it from the folder that the run was trained from, or train again",
+            f"the scan {result.scan} of {run} does not exist",
+            "run the command from the folder that train was run in, or train again",
         )
     scan = load_scan(result.scan)
     if scan.digest != result.scan_digest:
