@@ -97,6 +97,25 @@ def test_render_writes_projections_residuals_and_slices(bean_run: Path, tmp_path
     assert call("render", bean_run, "--slices", "w=1")[0] == 2
 
 
+def test_info_reads_reconstructions_and_their_nrrd(bean_run: Path, tmp_path: Path) -> None:
+    code, out, err = call("info", bean_run, "--json")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert (facts["kind"], facts["unit"]) == ("reconstruction", "mm")
+    assert facts["decisions"] == list(load_reconstruction(bean_run).decisions)
+    export_scan(bean_run, tmp_path / "bean.nrrd")
+    code, out, err = call("info", tmp_path / "bean.nrrd", "--json")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert (facts["kind"], facts["unit"], facts["quantity"]) == ("volume", "mm", "1/mm")
+
+
+def test_commands_for_photos_name_a_scan(bean_run: Path) -> None:
+    code, _, err = call("ablate", bean_run.with_name("bean"), "--budget", "5s")
+    assert code == 3
+    assert "is an X-ray scan, not a scene of photos" in err
+
+
 def test_sign_of_residuals(bean_run: Path) -> None:
     """More photons than predicted: the measured line integral is smaller, the residual negative; closed form."""
     import torch

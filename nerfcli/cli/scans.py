@@ -81,8 +81,7 @@ def slices_of(texts: list[str]) -> tuple[tuple[str, float], ...]:
 
 def is_of_scan(run: str, *, outputs: str | None, slices: list[str] | None) -> bool:
     """Whether the options of render, or the only run it gets, are those of a scan."""
-    from nerfcli.tomography.result import is_reconstruction
-    from nerfcli.workflows.tomography_files import OUTPUTS
+    from nerfcli.tomography.result import OUTPUTS, is_reconstruction
 
     if slices or (outputs is not None and set(outputs.split(",")) & set(OUTPUTS)):
         return True
@@ -95,7 +94,8 @@ def scan_pictures(outputs: str | None, slices: list[str] | None, *, views: str) 
     Raises:
         typer.BadParameter: the options do not fit scans.
     """
-    from nerfcli.workflows.tomography_files import OUTPUTS, render_scan
+    from nerfcli.tomography.result import OUTPUTS
+    from nerfcli.workflows.tomography_files import render_scan
 
     chosen = some_of(outputs or "projection", OUTPUTS, "--outputs")
     one_of(views, ("test", "train"), "--cameras")

@@ -59,7 +59,7 @@ def write_nrrd(volume: Volume, name: str, path: Path) -> None:
     Source: Definition of NRRD File Format, teem.sourceforge.net/nrrd/format.html.
     """
     values = volume.maps[name]
-    unit = {"metre": "m"}.get(str(volume.description.get("unit")), "arbitrary")
+    unit = {"metre": "m", "mm": "mm", "um": "um"}.get(str(volume.description.get("unit")), "arbitrary")
     size = f"{volume.voxel_size:.17g}"
     lines = [
         "NRRD0005",
@@ -103,10 +103,12 @@ def read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
     try:
         shape = tuple(int(size) for size in fields["sizes"].split())
         if not data.startswith(b"NRRD") or fields["encoding"] != "gzip":
-            raise ValueError("it is not one of nerfcli's")
+            raise ValueError("it is not a gzip NRRD")
         values = np.frombuffer(zlib.decompress(body, 31), types[fields["type"]]).reshape(shape[::-1])
     except (KeyError, ValueError, zlib.error) as error:
-        raise UserError(f"{path} cannot be read: {error}", "give an NRRD file that nerfcli export wrote") from error
+        raise UserError(
+            f"{path} is damaged or not an NRRD file by nerfcli, and cannot be read: {error}", "export the volume again"
+        ) from error
     return values.transpose(2, 1, 0), fields
 
 

@@ -22,6 +22,8 @@ VOLUME = "volume.npy"
 MARKS = "marks.npy"
 
 FIELDS = ("voxels",)
+# What is rendered of a reconstruction.
+OUTPUTS = ("projection", "transmission", "residual")
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """Volumes as files of other programs: NRRD, MetaImage, NIfTI-1, and TIFF stacks as ImageJ reads them.
 
-All are float32 (or uint8 for marks), little-endian, uncompressed, x fastest, with spacing, origin and unit. The frame
+All are float32 (or uint8 for marks), little-endian, x fastest, with spacing, origin and unit. The frame
 is the one of the scan: x and y across the rotation axis, z along it.
 """
 
+import json
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,12 +15,13 @@ import tifffile
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
+from nerfcli.media.volume_files import KEY, Volume, read_nrrd, write_nrrd
 from nerfcli.tomography.grid import VoxelGrid
 
 _NIFTI_HEADER = 352
 _NIFTI_UNITS = {"m": 1, "mm": 2, "um": 3}
 _NIFTI_TYPES = {np.dtype(np.uint8): (2, 8), np.dtype(np.float32): (16, 32)}
-_WORDS = {np.dtype(np.uint8): ("uchar", "MET_UCHAR"), np.dtype(np.float32): ("float", "MET_FLOAT")}
+_WORDS = {np.dtype(np.uint8): "MET_UCHAR", np.dtype(np.float32): "MET_FLOAT"}
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def read_volume(path: Path) -> VolumeFile:
     """Read what `write_volume` wrote.
 
     Raises:
-        UserError: it is missing, damaged, or of another program's making in a way that is not read here.
+        UserError: it is missing, damaged, or was not written by nerfcli.
     """
     readers: dict[str, Callable[[Path], VolumeFile]] = {
         ".nrrd": _read_nrrd,
@@ -94,44 +96,21 @@ def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
 
 
 def _write_nrrd(path: Path, volume: VolumeFile) -> None:
-    z, y, x = volume.grid.shape
-    size, first = volume.grid.size, volume.grid.first
-    word = _WORDS[volume.values.dtype][0]
-    lines = [
-        "NRRD0005",
-        f"type: {word}",
-        "dimension: 3",
-        "space dimension: 3",
-        f"sizes: {x} {y} {z}",
-        f"space directions: ({size!r},0,0) (0,{size!r},0) (0,0,{size!r})",
-        "kinds: domain domain domain",
-        "endian: little",
-        "encoding: raw",
-        f"space origin: ({first[0]!r},{first[1]!r},{first[2]!r})",
-        f'space units: "{volume.unit}" "{volume.unit}" "{volume.unit}"',
-        f"quantity:={volume.quantity}",
-    ]
-    with path.open("wb") as file:
-        file.write(("\n".join(lines) + "\n\n").encode("ascii"))
-        file.write(np.ascontiguousarray(volume.values).tobytes())
+    name = "marks" if volume.values.dtype == np.uint8 else "attenuation"
+    description = {"unit": volume.unit, "quantity": volume.quantity}
+    values = np.ascontiguousarray(volume.values).transpose(2, 1, 0)
+    write_nrrd(Volume({name: values}, np.array(volume.grid.first), volume.grid.size, description), name, path)
 
 
 def _read_nrrd(path: Path) -> VolumeFile:
-    content = path.read_bytes()
-    if not content.startswith(b"NRRD"):
-        raise ValueError("it does not begin with NRRD")
-    head, data = content.split(b"\n\n", 1)
-    fields = {}
-    for line in head.decode("ascii").splitlines()[1:]:
-        key, _, value = line.partition(":")
-        fields[key] = value.lstrip("= ")
-    kind = {"uchar": np.dtype(np.uint8), "float": np.dtype("<f4")}[fields["type"]]
-    x, y, z = (int(n) for n in fields["sizes"].split())
-    first = tuple(float(v) for v in fields["space origin"].strip("()").split(","))
+    values, fields = read_nrrd(path)
+    description = json.loads(fields[KEY])
+    first = [float(v) for v in fields["space origin"].strip("()").split(",")]
     size = float(fields["space directions"].split(",")[0].strip("("))
-    unit = fields["space units"].split('"')[1]
-    values = np.frombuffer(data, kind).reshape(z, y, x)
-    return VolumeFile(values, VoxelGrid((z, y, x), (first[0], first[1], first[2]), size), unit, fields["quantity"])
+    values = values.transpose(2, 1, 0)
+    z, y, x = values.shape
+    grid = VoxelGrid((z, y, x), (first[0], first[1], first[2]), size)
+    return VolumeFile(values, grid, description["unit"], description["quantity"])
 
 
 def _write_mha(path: Path, volume: VolumeFile) -> None:
@@ -148,7 +127,7 @@ def _write_mha(path: Path, volume: VolumeFile) -> None:
         f"Offset = {first[0]!r} {first[1]!r} {first[2]!r}",
         f"ElementSpacing = {size!r} {size!r} {size!r}",
         f"DimSize = {x} {y} {z}",
-        f"ElementType = {_WORDS[volume.values.dtype][1]}",
+        f"ElementType = {_WORDS[volume.values.dtype]}",
         "ElementDataFile = LOCAL",
     ]
     with path.open("wb") as file:

@@ -10,6 +10,7 @@ from nerfcli.errors import UserError
 from nerfcli.media.file_facts import RENDERS, file_facts, renders_facts
 from nerfcli.media.model_facts import SUFFIXES as MODEL_SUFFIXES
 from nerfcli.media.model_facts import model_facts
+from nerfcli.tomography.result import is_reconstruction, load_reconstruction
 
 
 def describe(path: str | Path) -> dict[str, Any]:
@@ -27,6 +28,8 @@ def describe(path: str | Path) -> dict[str, Any]:
         from nerfcli.workflows.scans import describe_scan
 
         return describe_scan(folder)
+    if is_reconstruction(folder):
+        return _describe_reconstruction(folder)
     if folder.is_file() and folder.suffix == ".safetensors":
         from nerfcli.workflows.describe_run import describe_tensors
 
@@ -56,6 +59,21 @@ def _is_scan_to_describe(path: Path) -> bool:
     from nerfcli.tomography.formats.read import recognise
 
     return recognise(path) is not None
+
+
+def _describe_reconstruction(run: Path) -> dict[str, Any]:
+    result = load_reconstruction(run)
+    return {
+        "kind": "reconstruction",
+        "scan": str(result.scan),
+        "voxels": "x".join(str(count) for count in reversed(result.grid.shape)),
+        "voxel_size": result.grid.size,
+        "unit": result.unit,
+        "passes": result.passes,
+        "seconds": round(result.seconds, 1),
+        "settled": result.settled,
+        "decisions": list(result.decisions),
+    }
 
 
 def _describe_scene(folder: Path) -> dict[str, Any]:

@@ -18,9 +18,6 @@ from nerfcli.workflows.machine import thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.tomography_scores import corrected, scan_of
 
-OUTPUTS = ("projection", "transmission", "residual")
-FORMATS = ("nrrd", "mha", "nii", "tif")
-RENDERS = "renders"
 # Residuals are shown from so many standard deviations of the noise below to so many above.
 RESIDUAL_RANGE = 4.0
 

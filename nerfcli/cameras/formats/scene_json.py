@@ -84,6 +84,11 @@ def read_description(root: Path) -> Description:
     """
     path = root / SCENE_FILE
     content = read_json_object(path)
+    if content.get("measurement") == "transmission":
+        raise UserError(
+            f"{root} is an X-ray scan, not a scene of photos",
+            "use convert, doctor, info or train with it, and evaluate, render or export with its run",
+        )
     if content.get("version") != SCENE_VERSION:
         raise UserError(
             f"{path}: unknown version {content.get('version')!r}, expected {SCENE_VERSION}",
