@@ -68,10 +68,10 @@ def _advice(advice: Mapping[str, Any]) -> str:
     if advice["point"] is None:
         return f"<div>{head}<b>none of the measured settings</b></div>"
     unit = "s per picture" if advice["part"] == "rendering" else "s of training"
-    told = f"{advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
+    text = f"{advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
     if advice["against"] != advice["point"]:
-        told += f" ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"
-    what = f"<b>{escape(advice['point'])}</b><p>{escape(told)}</p>"
+        text += f" ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"
+    what = f"<b>{escape(advice['point'])}</b><p>{escape(text)}</p>"
     return f"<div>{head}{what}<code>{escape(command_of(advice))}</code></div>"
 
 
@@ -109,14 +109,14 @@ _PARTS = {"rendering": _rendering, "training": _training}
 
 def _notes(content: Mapping[str, Any]) -> list[str]:
     machine = content["machine"]
-    told = [
+    remarks = [
         f"{machine['processor']}, {machine['processors']} processors, {machine['threads']} used; {machine['system']}; "
         f"Python {machine['python']}, torch {machine['torch']}, nerfcli {content['nerfcli']}.",
         *sentences(content),
     ]
     if rendering := content["rendering"]:
         size = f" at 1/{rendering['factor']:.2g} of their size, to save time" if rendering["factor"] > 1.0 else ""
-        told += [
+        remarks += [
             f"Rendering: whole held-out photos ({', '.join(rendering['photos'])}){size}, a first round for pictures "
             f"and warm-up, then {rendering['rounds']} rounds through all settings in changing order, all in one "
             "process; the time per picture is the median of the rounds.",
@@ -125,17 +125,17 @@ def _notes(content: Mapping[str, Any]) -> list[str]:
             f"field: the converged rendering reaches {rendering['converged_psnr']:.2f} dB.",
         ]
         if rendering["float64_levels"] is not None:
-            told.append(
+            remarks.append(
                 f"The converged rendering differs by {rendering['float64_levels']:.2g} levels from one in float64 "
                 "with half the step, on a sample of pixels."
             )
     if content["training"]:
-        told.append(
+        remarks.append(
             f"Training: one process per point, to measure its peak memory; PSNR on the same {SAMPLED_PIXELS} random "
             "pixels of all held-out photos (mean over photos, 8 bit). All settings train for the same time, not the "
             "same number of steps; longer trainings may favour larger fields."
         )
-    return told
+    return remarks
 
 
 _BODY = Template("""\

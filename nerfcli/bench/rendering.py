@@ -132,10 +132,10 @@ def _cost(setting: RenderSetting) -> float:
 
 def _converged(model: Model, photos: Sequence[HeldOutPhoto], *, session: Session) -> tuple[np.ndarray, ...]:
     """The photos' views as the field says them: steps `FINER` times as fine, next to nothing left out."""
-    pictures, told = [], {entry["photo"] for entry in session.records.of_kind("converged")}
+    pictures, measured = [], {entry["photo"] for entry in session.records.of_kind("converged")}
     for photo in photos:
         path = session.folder / WORK / f"{slug(photo.frame.name)}.npy"
-        if not path.exists() or photo.frame.name not in told:
+        if not path.exists() or photo.frame.name not in measured:
             session.say("rendering the converged pictures")
             background = background_of(model, photo)
             fine = render_picture(

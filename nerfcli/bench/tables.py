@@ -69,16 +69,16 @@ def training_rows(training: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def sentences(content: Mapping[str, Any]) -> list[str]:
     """Return the recommendations, and the noise level of differences."""
-    told = [_advice_in_words(advice) for advice in content["recommendations"]]
+    remarks = [_advice_in_words(advice) for advice in content["recommendations"]]
     training = content["training"]
     if training and training["noise_db"] is not None:
-        told.append(
+        remarks.append(
             f"Trainings that differ only in their seed: {', '.join(f'{psnr:.2f}' for psnr in training['seed_psnr'])}"
             f" dB; two trainings must differ by {training['noise_db']:.2f} dB to be significant (95 %)."
         )
     elif training:
-        told.append("There was time for only one seed, so the spread between seeds is unknown.")
-    return told
+        remarks.append("There was time for only one seed, so the spread between seeds is unknown.")
+    return remarks
 
 
 def write_csv(content: Mapping[str, Any], path: Path) -> None:
@@ -129,10 +129,10 @@ def _advice_in_words(advice: Mapping[str, Any]) -> str:
     if advice["point"] is None:
         return f"{head}none of the measured settings is fast enough."
     unit = "s per picture" if advice["part"] == "rendering" else "s of training"
-    told = f"{head}{advice['point']}, {advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
+    text = f"{head}{advice['point']}, {advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
     if advice["against"] != advice["point"]:
-        told += f" ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"
-    return f"{told}: {command_of(advice)}"
+        text += f" ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"
+    return f"{text}: {command_of(advice)}"
 
 
 def _megabytes(count: int | None) -> str:

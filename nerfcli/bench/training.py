@@ -98,10 +98,10 @@ def _train(
         }
         job.write_text(json.dumps(content), encoding="utf-8")
         session.say(f"{title}: {setting.name}")
-        told = _run_worker(job, lambda detail: session.say(f"{title}: {setting.name}, {detail}"))
-        if "result" in told and setting.name == trainings.kept:
+        reply = _run_worker(job, lambda detail: session.say(f"{title}: {setting.name}, {detail}"))
+        if "result" in reply and setting.name == trainings.kept:
             os.replace(run / FIELD, session.folder / KEPT_FIELD)
-    return told
+    return reply
 
 
 def _run_worker(job: Path, say: Callable[[str], None]) -> dict[str, Any]:

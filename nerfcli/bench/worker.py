@@ -1,8 +1,8 @@
 """The child process of one training: run as `python -m nerfcli.bench.worker JOB.json`.
 
 A process of its own, so that its peak memory is that of this training alone. It leaves pictures where the job says, and
-tells lines of JSON on stdout: {"share", "detail"} while it works, {"result"} at the end, {"error"} where the user can
-mend something.
+tells lines of JSON on stdout: {"share", "detail"} while it works, {"result"} at the end, {"error"} for what the
+user can fix.
 """
 
 import json

@@ -41,10 +41,10 @@ _FAR = 1000.0
 def comments_of(description: Mapping[str, Any]) -> list[str]:
     """Lines that say what a file holds: for people, then for programs."""
     unit, source = description.get("unit"), description.get("unit_source")
-    told = {"metre": "metre", "arbitrary": "arbitrary, the scale of the scene is not known"}.get(str(unit), str(unit))
+    stated = {"metre": "metre", "arbitrary": "arbitrary, the scale of the scene is not known"}.get(str(unit), str(unit))
     return [
         "written by nerfcli",
-        f"unit {told}{f' ({source})' if source else ''}",
+        f"unit {stated}{f' ({source})' if source else ''}",
         f"frame {description.get('frame')}",
         f"{KEY} {json.dumps(dict(description), ensure_ascii=True, allow_nan=False)}",
     ]

@@ -61,7 +61,7 @@ def projection(camera: Camera) -> str:
 
 
 def lost_to_pinhole(camera: Camera) -> list[str]:
-    """List what of a camera is lost if only one focal length and the size are kept, with a centred principal point."""
+    """List what is lost when a camera keeps one focal length and its size, with a centred principal point."""
     if camera.is_spherical:
         return ["the spherical projection"]
     lost = ["the fisheye projection"] if projection(camera) == "fisheye" else []

@@ -46,8 +46,8 @@ def hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...], wid
         ValueError: the table does not have one level per resolution, or T is not a power of two.
 
     Differentiable in the table, and in points inside the cells: the gradient is that of the piecewise trilinear
-    function. It jumps where a point crosses a face of a cell of any level, and is there that of the upper cell; outside
-    [0, 1] it is 0.
+    function. It jumps where a point crosses a face of a cell of any level, where it takes the value of the upper cell;
+    outside [0, 1] it is 0.
     Source: Müller et al. 2022, Instant NGP, arXiv:2201.05989, section 3; for the widths Barron et al. 2023, Zip-NeRF,
     arXiv:2304.06706, eq. 3, with a cheaper function that falls off alike.
     """
