@@ -7,7 +7,7 @@ from decimal import Decimal, getcontext
 
 import pytest
 import torch
-from hard_cases import depths, exact, exact_depths, learning, light, lookup, space
+from hard_cases import depths, exact, exact_depths, learning, light, lookup, space, volumes
 from hard_cases import suite as strict
 from typer.testing import CliRunner
 
@@ -70,7 +70,7 @@ def test_every_textbook_formula_breaks_a_bound_somewhere(all_rows, own_rows):
 def test_every_kernel_has_rows_in_every_arithmetic_that_it_is_made_for(all_rows):
     tried = {(row.operation, row.precision) for row in all_rows}
     depths = ("light_ends", "optical_depth_before", "mixture_quantile")
-    for operation in ("composite", "distortion", "hash_encode", "pixel_rays", "visible_samples", *depths):
+    for operation in ("composite", "distortion", "hash_encode", "pixel_rays", "project", "visible_samples", *depths):
         assert {(operation, name) for name in ("float64", "float32", "compiled")} <= tried
     assert {("hash_encode", "float16"), ("composite", "bfloat16")} <= tried
     assert {(operation, "bfloat16") for operation in ("hash_encode", *depths)} <= tried
@@ -156,6 +156,21 @@ def test_optical_depth_by_subtraction_and_half_precision_are_caught(monkeypatch)
     monkeypatch.setattr(reference, "hash_encode", in_half)
     monkeypatch.setattr(reference, "pixel_rays", lambda chosen, pixels: pixel_rays(chosen.float().long(), pixels))
     assert failed(lookup.rows((SINGLE,))) == {"hash_encode", "pixel_rays"}
+
+
+def test_a_projector_and_a_transpose_that_do_not_fit_are_caught(monkeypatch):
+    """Joseph's step without the slope of the line, and a transpose of another grid."""
+    project, back_project = reference.project, reference.back_project
+    monkeypatch.setattr(reference, "project", lambda v, o, d, **grid: project(v, o, d, **grid) / d.norm(dim=1))
+    assert failed(volumes.rows((SINGLE,))) == {"project"}
+    monkeypatch.setattr(reference, "project", project)
+    moved = {"first": (-2.0, -1.5, -1.2), "size": 0.5}
+    monkeypatch.setattr(
+        reference, "back_project", lambda v, o, d, *, shape, **grid: back_project(v, o, d, shape=shape, **moved)
+    )
+    assert {row.case.split(",")[0] for row in volumes.rows((SINGLE,)) if row.verdict == NOT_MET} == {
+        "projector and transpose"
+    }
 
 
 def test_other_textbook_formulas_are_caught(monkeypatch):

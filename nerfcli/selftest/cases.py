@@ -217,3 +217,23 @@ CONTRACTED = (
 # Numbers of bfloat16, to beyond where exp overflows in every precision.
 LOGARITHMS = (-1000.0, -89.0, -15.0, -1.0, 2.0**-20, 1.0, 14.5, 15.0, 16.0, 89.0, 720.0, 3e38)
 GRADIENTS = tuple(10.0**e for e in (-17, -15, -12, -8, -4, 0, 4, 10))
+
+# Largest line integrals of a small volume: thin ones have all their digits, thick ones do not overflow.
+THICKNESSES = (1e-12, 1e-6, 1e-3, 1.0, 1e3, 1e6)
+VOLUME_SHAPE, VOLUME_FIRST, VOXEL = (6, 7, 9), (-2.0, -1.5, -1.25), 0.5
+# Points on lines and their directions: along axes, through centres and between them, oblique, past the volume, and from
+# a source 4e6 voxels away, whose place float32 holds to a quarter of a voxel.
+LINES: tuple[tuple[Point, Point], ...] = (
+    *(((0.0, 0.0, 0.0), d) for d in ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 2.0))),
+    *(((0.125, -0.25, 0.375), d) for d in ((1.0, 0.25, -0.125), (0.5, -1.0, 0.75), (-0.25, 0.125, -1.0))),
+    *(((0.25, 9.0, 0.25), (1.0, 0.0, 0.0)), ((-2.0, -1.5, -1.25), (1.0, 1.0, 1.0))),
+    ((0.1 - 2e6, 0.2 + 0.3 * 2e6, 0.3 - 0.1 * 2e6), (1.0, -0.3, 0.1)),
+)
+
+
+def attenuations(thickness: float) -> list[list[list[float]]]:
+    """A volume (Z, Y, X) whose line integrals are at most about a thickness."""
+    z, y, x = VOLUME_SHAPE
+    largest = thickness / (x * VOXEL)
+    values = [((3 * i + 5 * j + 7 * k) % 13 + 1) / 13 for k in range(z) for j in range(y) for i in range(x)]
+    return torch.tensor(values, dtype=torch.float64).mul(largest).view(VOLUME_SHAPE).tolist()

@@ -370,3 +370,30 @@ def chords(module: ModuleType, given: Inputs) -> Outcome:
     march = March(given["edges"], given["occupied"], "none", 1e9)
     samples = module.visible_samples(rays, march, HashGrid(origins.new_zeros(8, 16, 4), (2,) * 8, _layers(origins)))
     return Outcome((reference.sum_along_rays(samples.ends - samples.starts, samples.offsets),))
+
+
+def volume_inputs(thickness: float, precision: Precision) -> Inputs:
+    """A volume, lines in float64, and what the loss gains by each line integral."""
+    lines = torch.tensor(cases.LINES, dtype=torch.float64, device=precision.device)
+    return {
+        "volume": precision.tensor(cases.attenuations(thickness)),
+        "origins": lines[:, 0].contiguous(),
+        "directions": lines[:, 1].contiguous(),
+        "gains": precision.tensor([(k % 4 + 1) / 4 for k in range(len(lines))]),
+    }
+
+
+def project(module: ModuleType, given: Inputs) -> Outcome:
+    """Line integrals, and the transpose, by the gradient and by its own operation."""
+    volume, lines = given["volume"].detach().requires_grad_(), (given["origins"], given["directions"])
+    grid = {"first": cases.VOLUME_FIRST, "size": cases.VOXEL}
+    integrals = module.project(volume, *lines, **grid)
+    (gradient,) = torch.autograd.grad((integrals * given["gains"]).sum(), volume)
+    back = module.back_project(given["gains"], *lines, shape=cases.VOLUME_SHAPE, **grid)
+    largest = gradient.abs().max().expand_as(gradient)
+    return Outcome((integrals.detach(), back), (gradient,), (largest,), (integrals.detach(), largest))
+
+
+def project_in_single(given: Inputs) -> Outcome:
+    """The same with lines in float32."""
+    return project(reference, {name: values.float() for name, values in given.items()})

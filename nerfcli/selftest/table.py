@@ -214,3 +214,16 @@ def checks() -> Iterator[Check]:
             "exact: steps of 2^-7 are kept or not by their middles; nothing is divided by a direction",
             (SINGLE, COMPILED),
         )
+    planes = max(cases.VOLUME_SHAPE)
+    for thickness in cases.THICKNESSES:
+        yield Check(
+            f"line integrals up to {thickness:g} and their transpose, source near and 4e6 voxels away",
+            "project",
+            functools.partial(operations.volume_inputs, thickness),
+            operations.project,
+            lambda precision: operations.both(4 if precision.compiled else 4 * planes + 4, precision),
+            "(4 n + 4) u: sums over n planes of 4 voxels, all positive; compiled 4 u: sums in float64",
+            (SINGLE, COMPILED),
+            formula="lines in float32",
+            textbook=operations.project_in_single,
+        )

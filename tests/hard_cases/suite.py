@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 
 import torch
 
-from hard_cases import depths, learning, light, lookup, space, views
+from hard_cases import depths, learning, light, lookup, space, views, volumes
 from nerfcli import kernels
 from nerfcli.selftest.measure import Precision, Row
 
@@ -29,3 +29,4 @@ def rows(device: str, notify: Callable[[str], None]) -> Iterator[Row]:
     yield from learning.rows(tried)
     yield from space.rows(tried)
     yield from views.rows()
+    yield from volumes.rows(tried)
