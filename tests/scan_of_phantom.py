@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from phantom import Ellipsoid, bean, line_integrals
+from ellipsoids import Ellipsoid, bean, line_integrals
 
 from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.geometry import Beam

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from phantom import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals, sphere
+from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals, sphere
 
 
 @pytest.mark.parametrize("distance", [0.0, 1.0, 1.999999, 2.0, 2.5])

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from conftest import TOLERANCE
+from ellipsoids import line_integrals, sphere
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
-from phantom import line_integrals, sphere
 
 from nerfcli.kernels import numba_cpu, reference
 from nerfcli.tomography.geometry import circular_cone, circular_parallel

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from phantom import attenuation_of_voxels, bean, line_integrals
+from ellipsoids import attenuation_of_voxels, bean, line_integrals
 from scipy.ndimage import binary_erosion
 
 from nerfcli.errors import UserError
@@ -90,7 +90,7 @@ def test_fit_beats_the_baselines_with_the_same_views(scan: Scan, grid: VoxelGrid
 @pytest.mark.parametrize("beam", ["cone", "parallel", "half"])
 def test_filtered_back_projection_has_the_right_scale(beam: str) -> None:
     """Closed form: inside a homogeneous ball the reconstruction is its attenuation."""
-    from phantom import sphere
+    from ellipsoids import sphere
 
     angles = np.arange(180) * (np.pi if beam == "half" else 2 * np.pi) / 180
     if beam == "cone":

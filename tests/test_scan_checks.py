@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import error_of, nerfcli
-from phantom import Ellipsoid
+from ellipsoids import Ellipsoid
 from scan_of_phantom import phantom_circle, scan_of_phantom
 
 from nerfcli.errors import GATE_NOT_MET

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from phantom import attenuation_of_voxels, bean
+from ellipsoids import attenuation_of_voxels, bean
 from test_reconstruct import cone, scan_of
 from typer.testing import CliRunner
 
