@@ -15,8 +15,8 @@ from nerfcli.tomography.calibrate import air_factors, centre_of_rotation, detect
 from nerfcli.tomography.geometry import ScanGeometry, circular_cone, circular_parallel
 from nerfcli.tomography.grid import VoxelGrid, centred_grid
 from nerfcli.tomography.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
-from nerfcli.tomography.marks import TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
-from nerfcli.tomography.reconstruct import Problem, reconstruct, start
+from nerfcli.tomography.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
+from nerfcli.tomography.reconstruct import Problem, mean_attenuation, reconstruct, start
 from nerfcli.tomography.scan import Scan, held_out_views, load_scan, save_scan
 from nerfcli.tomography.scores import resampled, score_volume
 from nerfcli.tomography.strength import STRENGTHS, choose_strength
@@ -276,7 +276,7 @@ def test_marks_of_truncation_wedge_and_blind_voxels() -> None:
     radius = np.hypot(x, y)
     middle = found[5]
     assert (middle[radius < 9.0] == 0).all()
-    assert (middle[(radius > 11.5) & (radius < 19)] == TRUNCATED).all()
+    assert (middle[(radius > 11.5) & (radius < 19)] == OUTSIDE).all()
     assert (found[0] == UNSEEN).all()  # above the detector
     assert missing_wedge_deg(geometry) == 0
     limited = circular_parallel(angles[:20], pixel_width=1.0, pixel_height=1.0, rows=6, columns=60)
@@ -318,3 +318,20 @@ def test_resampling_and_held_out_views() -> None:
     np.testing.assert_allclose(resampled(linear, grid, finer)[2, 3], 2 * finer.axis("x"), atol=1e-6)
     assert held_out_views(13) == (0, 6, 12)
     assert held_out_views(6) == ()
+def test_marks_of_cone_ends_and_of_a_detector_beside_the_middle() -> None:
+    """Closed form: the cone's rays leave the top at a height of h (D - r) / D; a full turn sees both halves."""
+    angles = np.arange(120) * 2 * np.pi / 120
+    sides = {"pixel_width": 1.0, "pixel_height": 1.0, "rows": 20, "columns": 60}
+    geometry = circular_cone(angles, source_origin=100, source_detector=100, **sides)  # type: ignore[arg-type]
+    grid = centred_grid((20.0, 20.0, 20.0), 1.0)
+    found = marks(geometry, grid)
+    z, y, x = np.meshgrid(*(grid.axis(name) for name in "zyx"), indexing="ij")
+    least = 10.5 * (1 - np.hypot(x, y) / 100)  # half a pixel beyond the last row
+    assert (found[np.abs(z) < least - 0.1] == 0).all()
+    assert (found[np.abs(z) > least + 0.1] == TRUNCATED).all()
+    half = circular_parallel(angles, **sides).shifted(25)  # type: ignore[arg-type]
+    wide = centred_grid((80.0, 80.0, 4.0), 2.0)
+    y, x = np.meshgrid(wide.axis("y"), wide.axis("x"), indexing="ij")
+    assert (marks(half, wide)[0][np.hypot(x, y) < 45] == 0).all()  # each line is seen from one of its ends
+
+

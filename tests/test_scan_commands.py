@@ -97,17 +97,43 @@ def test_render_writes_projections_residuals_and_slices(bean_run: Path, tmp_path
     assert call("render", bean_run, "--slices", "w=1")[0] == 2
 
 
-def test_info_reads_reconstructions_and_their_nrrd(bean_run: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii", ".tif"])
+def test_info_reads_reconstructions_and_their_volumes(bean_run: Path, tmp_path: Path, suffix: str) -> None:
     code, out, err = call("info", bean_run, "--json")
     assert code == 0, err
     facts = json.loads(out)
     assert (facts["kind"], facts["unit"]) == ("reconstruction", "mm")
     assert facts["decisions"] == list(load_reconstruction(bean_run).decisions)
-    export_scan(bean_run, tmp_path / "bean.nrrd")
-    code, out, err = call("info", tmp_path / "bean.nrrd", "--json")
+    export_scan(bean_run, tmp_path / f"bean{suffix}")
+    code, out, err = call("info", tmp_path / f"bean{suffix}", "--json")
     assert code == 0, err
     facts = json.loads(out)
     assert (facts["kind"], facts["unit"], facts["quantity"]) == ("volume", "mm", "1/mm")
+    assert facts["voxels"] == "x".join(str(count) for count in reversed(load_reconstruction(bean_run).grid.shape))
+    assert facts["attenuation"].startswith("float32, ")
+
+
+def test_commands_for_runs_of_photos_name_what_works(bean_run: Path) -> None:
+    from nerfcli.runs.files import RECONSTRUCTION
+    from nerfcli.tomography.result import DESCRIPTION
+
+    assert RECONSTRUCTION == DESCRIPTION
+    for command in (("report",), ("bench",), ("export", "--to", "mesh")):
+        code, _, err = call(*command, bean_run)
+        assert code in (2, 3)
+        assert "is the reconstruction of an X-ray scan" in err or "choose volume" in err, err
+        assert len([line for line in err.strip().splitlines() if line.strip()]) <= 8
+
+
+def test_lists_of_runs_on_standard_input(bean_run: Path, tmp_path: Path) -> None:
+    """Reconstructions between other paths: each is worked on, and what is no run is reported."""
+    lines = f"{bean_run}\n{tmp_path}\n"
+    for arguments, suffix in ((("render",), ".tif"), (("export", "--to", "volume"), ".nrrd")):
+        result = CliRunner().invoke(app, [*arguments, "-", "-o", str(tmp_path / "out")], input=lines)
+        assert result.exit_code == 3, result.stderr
+        assert "is not a run folder" in result.stderr
+        assert result.stdout.splitlines()
+        assert all(line.endswith(suffix) and Path(line).is_file() for line in result.stdout.splitlines())
 
 
 def test_commands_for_photos_name_a_scan(bean_run: Path) -> None:

@@ -10,7 +10,7 @@ from nerfcli.errors import UserError
 from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.render.model import Model
-from nerfcli.runs.files import CONFIG
+from nerfcli.runs.files import CONFIG, RECONSTRUCTION
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
@@ -64,7 +64,7 @@ def find_subject(path: Path, *, device: str, threads: int, seed: int) -> Benched
     """
     if not path.exists():
         raise UserError(f"{path} does not exist", "give a run folder, or a scene folder")
-    if (path / CONFIG).exists():
+    if (path / CONFIG).exists() or (path / RECONSTRUCTION).exists():
         subject = _run_at(path, device=device, threads=threads, seed=seed)
     else:
         subject = _scene_at(path, device=device, threads=threads, seed=seed)

@@ -75,13 +75,18 @@ def export(
     from nerfcli.workflows.export import TARGETS, default_target, export_run
 
     console = Console(quiet=quiet, json_lines=json)
-    if run != STDIN and is_reconstruction(Path(run)):
+
+    def export_one_scan(folder: Path, one_of_many: bool) -> None:
         from nerfcli.workflows.tomography_files import export_scan
 
         one_of(to, ("volume",), "--to")
-        target = output or Path(run).with_name(f"{Path(run).name}-volume.nrrd")
-        for path in export_scan(run, target, water=water, overwrite=overwrite, notify=console.note):
+        usual = folder.with_name(f"{folder.name}-volume.nrrd")
+        target = usual if output is None else output / usual.name if one_of_many else output
+        for path in export_scan(folder, target, water=water, overwrite=overwrite, notify=console.note):
             console.result(path)
+
+    if run != STDIN and is_reconstruction(Path(run)):
+        export_one_scan(Path(run), False)
         return
     one_of(to, tuple(TARGETS), "--to")
     suffix = None if form is None else f".{form.lstrip('.').lower()}"
@@ -95,6 +100,9 @@ def export(
     )
 
     def work(folder: Path, one_of_many: bool) -> None:
+        if is_reconstruction(folder):
+            export_one_scan(folder, one_of_many)
+            return
         target = output
         if output is None or one_of_many:
             usual = default_target(folder, to, suffix)

@@ -194,27 +194,28 @@ def render(
     from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.render.pictures import Quality
     from nerfcli.runs.run import Run
+    from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.render import RENDERS, folder_name, render_run
     from nerfcli.workflows.views import Views, chosen_frames, file_fps, write_frames
 
     console = Console(quiet=quiet, json_lines=json)
-    if is_of_scan(run, outputs=outputs, slices=slices):
+
+    def render_one_scan(folder: Path, one_of_many: bool) -> None:
         pictures = scan_pictures(outputs, slices, views=cameras)
+        target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
+        with console.progress("render") as update:
+            for path in pictures(
+                folder,
+                target,
+                threads=thread_count(threads),
+                overwrite=overwrite,
+                notify=console.note,
+                progress=update,
+            ):
+                console.result(path)
 
-        def render_scan_of(folder: Path, one_of_many: bool) -> None:
-            target = folder / RENDERS if output is None else output / folder.name if one_of_many else output
-            with console.progress("render") as update:
-                for path in pictures(
-                    folder,
-                    target,
-                    threads=thread_count(threads),
-                    overwrite=overwrite,
-                    notify=console.note,
-                    progress=update,
-                ):
-                    console.result(path)
-
-        for_each_input(run, render_scan_of)
+    if is_of_scan(run, outputs=outputs, slices=slices):
+        for_each_input(run, render_one_scan)
         return
     chosen = some_of(outputs or "rgb,depth,opacity", OUTPUTS, "--outputs")
     if not is_convention(depth):
@@ -261,6 +262,9 @@ def render(
     views = Views(cameras, count, through, nerfstudio_frame, max_size, look)
 
     def work(folder: Path, one_of_many: bool) -> None:
+        if is_reconstruction(folder):
+            render_one_scan(folder, one_of_many)
+            return
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
         target = folder / RENDERS / name
         if output is not None:

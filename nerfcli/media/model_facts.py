@@ -38,10 +38,10 @@ def model_facts(path: Path) -> dict[str, Any] | None:
             size = float(fields["space directions"].split(",")[0].lstrip("("))
             described = json.loads(fields.get(KEY, "{}"))
             name = described.pop("map", "values")
-            return _volume_facts(Volume({name: values}, origin, size, described), "NRRD")
+            return volume_facts(Volume({name: values}, origin, size, described), "NRRD")
         case _:
             volume = read_volume_npz(path)
-            return None if volume is None else _volume_facts(volume, "NPZ")
+            return None if volume is None else volume_facts(volume, "NPZ")
 
 
 def _ply_facts(path: Path) -> dict[str, Any]:
@@ -94,7 +94,8 @@ def _obj_facts(path: Path) -> dict[str, Any]:
     return _described(comments) | facts
 
 
-def _volume_facts(volume: Volume, form: str) -> dict[str, Any]:
+def volume_facts(volume: Volume, form: str) -> dict[str, Any]:
+    """The facts of a volume, whatever its file."""
     facts: dict[str, Any] = {"kind": "volume", "format": form, "voxel_size": volume.voxel_size}
     shape = next(iter(volume.maps.values())).shape[:3]
     facts |= {"voxels": "x".join(map(str, shape)), "first_centre": volume.origin.tolist()}

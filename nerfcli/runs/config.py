@@ -14,7 +14,7 @@ from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.errors import UserError
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
-from nerfcli.runs.files import CONFIG
+from nerfcli.runs.files import CONFIG, RECONSTRUCTION
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, fingerprint, is_scene
 from nerfcli.sealed import read_sealed, write_sealed
@@ -174,6 +174,11 @@ def no_run(path: Path) -> UserError:
         return UserError(f"{path} does not exist", hint)
     if is_scene(path):
         return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {path}")
+    if (path / RECONSTRUCTION).exists():
+        return UserError(
+            f"{path} is the reconstruction of an X-ray scan, not a run of photos",
+            "evaluate, render, export and info work with it",
+        )
     return UserError(f"{path} is not a run folder: it has no {CONFIG}", hint)
 
 

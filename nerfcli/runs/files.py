@@ -9,5 +9,7 @@ LOG = "log.jsonl"
 METRICS = "metrics.json"
 REPORT = "report.html"
 LOCK = ".train.lock"
+# Of a reconstruction from an X-ray scan; tomography writes and reads it.
+RECONSTRUCTION = "reconstruction.json"
 
-__all__ = ["CAMERAS", "CONFIG", "FIELD", "LOCK", "LOG", "METRICS", "REPORT", "STATE"]
+__all__ = ["CAMERAS", "CONFIG", "FIELD", "LOCK", "LOG", "METRICS", "RECONSTRUCTION", "REPORT", "STATE"]

@@ -1,7 +1,8 @@
-"""What the views of a scan cannot determine, voxel by voxel: values there are a guess of the regularisation.
+"""What the views of a scan cannot determine, voxel by voxel: values there come from the regularisation.
 
-A mark is the sum of `UNSEEN` (no view looks there), `TRUNCATED` (some views do not: the region is seen from one side
-only, and its values hold up to a smooth offset) and `WEDGE` (directions are missing: edges across them are not seen).
+A mark is a sum: `UNSEEN` (no view sees the voxel), `TRUNCATED` (above or below the detector in some views: its value
+holds up to a smooth offset), `WEDGE` (directions are missing from the scan: edges along them are not seen) and
+`OUTSIDE` (beside the detector in some views, so that directions are missing there: the corners of the grid).
 """
 
 import numpy as np
@@ -9,13 +10,19 @@ import numpy as np
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
 
-UNSEEN = 1
-TRUNCATED = 2
-WEDGE = 4
+UNSEEN, TRUNCATED, WEDGE, OUTSIDE = 1, 2, 4, 8
+MEANINGS = {
+    UNSEEN: "no view",
+    TRUNCATED: "above or below the detector in some views",
+    WEDGE: "missing wedge",
+    OUTSIDE: "beside the detector in some views",
+}
 
 # A gap between directions counts as a wedge when it is this many times the usual step, and this many degrees.
 WEDGE_STEPS = 4
 WEDGE_DEG = 10.0
+# Directions over half a turn are told apart in so many bins, one for each bit of an integer.
+_BINS = 60
 
 
 def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
@@ -28,31 +35,56 @@ def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
         geometry: of the views that were fitted.
         grid: of the volume.
     """
-    seen = np.zeros(grid.shape, dtype=np.int32)
+    seen, beside = np.zeros(grid.shape, dtype=np.int32), np.zeros(grid.shape, dtype=np.int32)
     y, x = np.meshgrid(grid.axis("y"), grid.axis("x"), indexing="ij")
     ends = grid.axis("z")[[0, -1]]
+    all_directions, directions = np.zeros(x.shape, dtype=np.int64), np.zeros(x.shape, dtype=np.int64)
     for view in range(geometry.views):
         # Columns and rows of a voxel are linear in z, as detectors are flat and lines straight: for a detector along
-        # the axis exactly, else nearly; both ends of each vertical line are asked, and the layers between.
+        # the axis exactly, else nearly; both ends of each vertical line are computed, and the layers between.
         layers = [
             geometry.pixel_of(view, np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], axis=1)).reshape(*x.shape, 2)
             for z in ends
         ]
-        share = np.linspace(0, 1, grid.shape[0])
-        for k, s in enumerate(share):
-            pixel = (1 - s) * layers[0] + s * layers[1]
+        across = np.zeros(x.shape, dtype=bool)
+        for k, share in enumerate(np.linspace(0, 1, grid.shape[0])):
+            pixel = (1 - share) * layers[0] + share * layers[1]
             # A voxel whose centre is half a pixel beyond the last pixel's centre is still met by its rays.
             with np.errstate(invalid="ignore"):
-                inside = (pixel[..., 0] > -1) & (pixel[..., 0] < geometry.columns)
-                if geometry.rows > 1:
-                    inside &= (pixel[..., 1] > -1) & (pixel[..., 1] < geometry.rows)
-            seen[k] += inside
+                across = (pixel[..., 0] > -1) & (pixel[..., 0] < geometry.columns)
+                along = (pixel[..., 1] > -1) & (pixel[..., 1] < geometry.rows) | (geometry.rows == 1)
+            seen[k] += across & along
+            beside[k] += ~across
+        # The bin of a direction, and the two that it lies between: the same direction may be rounded otherwise.
+        place = _directions(geometry, view, x, y)
+        low = np.floor(place)
+        all_directions |= _bit(np.rint(place))
+        directions |= np.where(across, _bit(low) | _bit(low + 1), 0)
     out = np.zeros(grid.shape, dtype=np.uint8)
     out[seen == 0] = UNSEEN
-    out[(seen > 0) & (seen < geometry.views)] = TRUNCATED
+    out[(seen > 0) & (seen + beside < geometry.views)] |= TRUNCATED
+    out[(seen > 0) & (all_directions & ~directions != 0)] |= OUTSIDE
     if missing_wedge_deg(geometry) > 0:
         out[seen > 0] |= WEDGE
     return out
+
+
+def marks_in_words(found: np.ndarray, chosen: tuple[int, ...] = tuple(MEANINGS)) -> list[str]:
+    """The share of the voxels of each kind that there are."""
+    shares = {mark: 100 * float(((found & mark) > 0).mean()) for mark in chosen}
+    return [f"{share:.3g} % of the voxels: {MEANINGS[mark]}" for mark, share in shares.items() if share > 0]
+
+
+def _directions(geometry: ScanGeometry, view: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Directions of the rays through points, as lines, in bins: rays from both ends are the same."""
+    emitter = geometry.emitter[view]
+    if geometry.beam == "parallel":
+        return np.full(x.shape, np.arctan2(emitter[1], emitter[0]) / np.pi * _BINS)
+    return np.arctan2(y - emitter[1], x - emitter[0]) / np.pi * _BINS
+
+
+def _bit(place: np.ndarray) -> np.ndarray:
+    return np.int64(1) << np.mod(place, _BINS).astype(np.int64)
 
 
 def missing_wedge_deg(geometry: ScanGeometry) -> float:

@@ -108,6 +108,11 @@ class Projector:
 
 def start(problem: Problem) -> Fit:
     """A volume of one value, with which line integrals have the mean that the data suggest."""
+    return Fit(torch.full(problem.grid.shape, mean_attenuation(problem)), torch.zeros(3, *problem.grid.shape))
+
+
+def mean_attenuation(problem: Problem) -> float:
+    """Sum of the line integrals that the data suggest over the sum of chords, >= 0."""
     views = torch.arange(problem.geometry.views)
     projector = Projector(problem.geometry, problem.grid)
     ones = torch.ones(problem.grid.shape)
@@ -117,8 +122,7 @@ def start(problem: Problem) -> Fit:
         chord = projector.forward(ones, view[None].numpy())
         met = torch.isfinite(suggested) & (chord > 0)
         total, length = total + float(suggested[met].sum()), length + float(chord[met].sum())
-    value = max(total / length, 0.0) if length > 0 else 0.0
-    return Fit(ones * value, torch.zeros(3, *problem.grid.shape))
+    return max(total / length, 0.0) if length > 0 else 0.0
 
 
 def finer(fit: Fit, grid: VoxelGrid) -> Fit:
@@ -156,7 +160,7 @@ def reconstruct(
     projector = Projector(problem.geometry, problem.grid)
     count = problem.geometry.views
     subsets = _subsets(count)
-    curvature, beta = _metric(problem, projector, strength)
+    curvature, beta = curvature_bound(problem, strength)
     threshold = beta / curvature
     backend = kernels.backend_for(torch.device("cpu"), torch.float32)
     volume, dual = fit.volume.clone(), fit.dual.clone()
@@ -198,8 +202,9 @@ def reconstruct(
     return Fit(volume, dual, fit.passes + done, fit.seconds + time.perf_counter() - begun, settled)
 
 
-def _metric(problem: Problem, projector: Projector, strength: float) -> tuple[Tensor, float]:
+def curvature_bound(problem: Problem, strength: float) -> tuple[Tensor, float]:
     """A bound on the curvature along each voxel (Z, Y, X), and beta."""
+    projector = Projector(problem.geometry, problem.grid)
     ones = torch.ones(problem.grid.shape)
     bound, diagonal = torch.zeros(problem.grid.shape), torch.zeros(problem.grid.shape)
     for views in _subsets(problem.geometry.views):

@@ -95,11 +95,28 @@ def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
     return writers[path.suffix.lower()]
 
 
-def _write_nrrd(path: Path, volume: VolumeFile) -> None:
+def is_volume_file(path: Path) -> bool:
+    """Whether a file is a MetaImage or a NIfTI, or a TIFF stack that `write_volume` wrote."""
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return path.suffix.lower() in (".mha", ".nii") and path.is_file()
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            return {"first", "spacing"} <= set(tiff.imagej_metadata or {})
+    except (OSError, ValueError, IndexError, tifffile.TiffFileError):
+        return False
+
+
+def map_of(volume: VolumeFile) -> Volume:
+    """The volume indexed [x, y, z], under the name of what it is."""
     name = "marks" if volume.values.dtype == np.uint8 else "attenuation"
     description = {"unit": volume.unit, "quantity": volume.quantity}
     values = np.ascontiguousarray(volume.values).transpose(2, 1, 0)
-    write_nrrd(Volume({name: values}, np.array(volume.grid.first), volume.grid.size, description), name, path)
+    return Volume({name: values}, np.array(volume.grid.first), volume.grid.size, description)
+
+
+def _write_nrrd(path: Path, volume: VolumeFile) -> None:
+    own = map_of(volume)
+    write_nrrd(own, next(iter(own.maps)), path)
 
 
 def _read_nrrd(path: Path) -> VolumeFile:

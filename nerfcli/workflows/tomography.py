@@ -20,8 +20,8 @@ from nerfcli.tomography.calibrate import air_factors, centre_of_rotation, detect
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid, grid_of_scan
 from nerfcli.tomography.likelihood import Poisson, likelihood_of
-from nerfcli.tomography.marks import TRUNCATED, UNSEEN, marks, missing_wedge_deg
-from nerfcli.tomography.reconstruct import Fit, Problem, Projector, finer, reconstruct, start
+from nerfcli.tomography.marks import TRUNCATED, UNSEEN, marks, marks_in_words, missing_wedge_deg
+from nerfcli.tomography.reconstruct import Fit, Problem, Projector, finer, mean_attenuation, reconstruct, start
 from nerfcli.tomography.result import (
     Reconstruction,
     ReconstructionSettings,
@@ -176,8 +176,13 @@ def _fit(
         fit = reconstruct(
             problem, fit, strength=strength, passes=passes, seconds=left(), progress=progress, keep=kept.append
         )
-    except KeyboardInterrupt:
-        fit, interrupted = kept[-1], True
+    else:
+        if earlier is not None:
+            fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
+        else:
+            fit = _coarse_start(scan, geometry, grid, factors, (strength, model_error), limit.seconds)
+        fit, interrupted = _fit_voxels(problem, fit, strength, limit, progress=progress)
+        learned = {}
     found = marks(problem.geometry, grid)
     for sentence in _told_marks(found, missing_wedge_deg(problem.geometry)):
         decisions.append(sentence)
@@ -189,7 +194,7 @@ def _fit(
         folder,
         scan.digest,
         settings,
-        {"strength": strength, "model_error": model_error, "centre": centre, "tilt": tilt, "air": factors},
+        used,
         tuple(decisions),
         fit.passes,
         time.perf_counter() - begun,
@@ -197,6 +202,79 @@ def _fit(
         missing_wedge_deg(problem.geometry),
         {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
     )
+@dataclass(frozen=True)
+class Limit:
+    """When a fit ends.
+
+    Args:
+        total_passes, total_seconds: of everything; None for no limit.
+        begun: when the clock started.
+        done: passes of an earlier run.
+    """
+
+    total_passes: int | None
+    total_seconds: float | None
+    begun: float
+    done: int
+
+    @property
+    def passes(self) -> int | None:
+        """Passes that are left, at least one."""
+        return None if self.total_passes is None else max(self.total_passes - self.done, 1)
+
+    @property
+    def seconds(self) -> float | None:
+        """Seconds that are left."""
+        if self.total_seconds is None:
+            return None
+        return max(self.total_seconds - (time.perf_counter() - self.begun), 0.0)
+
+
+def _fit_voxels(problem: Problem, fit: Fit, strength: float, limit: Limit, *, progress: Progress) -> tuple[Fit, bool]:
+    kept = deque([fit], maxlen=1)
+    try:
+        fitted = reconstruct(
+            problem,
+            fit,
+            strength=strength,
+            passes=limit.passes or MOST_PASSES,
+            seconds=limit.seconds,
+            progress=progress,
+            keep=kept.append,
+        )
+        return fitted, False
+    except KeyboardInterrupt:
+        return kept[-1], True
+
+
+def _fit_hash(
+    problem: Problem,
+    used: Mapping[str, Any],
+    limit: Limit,
+    *,
+    earlier: Reconstruction | None,
+    seed: int,
+    progress: Progress,
+) -> tuple[Fit, dict[str, np.ndarray], bool]:
+    """The volume at the centres of voxels, what the hash grid has learned, and whether it was interrupted."""
+    learned = new_arrays(seed) if earlier is None else earlier.learned
+    volume = hash_volume(problem.grid, used["start"], learned, passes=limit.done)
+    interrupted = False
+    try:
+        fit_hash(
+            problem,
+            volume,
+            strength=used["strength"],
+            seed=seed + limit.done,
+            passes=limit.passes,
+            seconds=limit.seconds,
+            progress=progress,
+        )
+    except KeyboardInterrupt:
+        interrupted = True
+    return Fit(volume.on_grid(problem.grid), torch.zeros(0), math.ceil(volume.passes)), volume.arrays, interrupted
+
+
     return result, interrupted
 
 
@@ -282,19 +360,6 @@ def _coarse_start(
     problem = Problem(geometry.binned(2).select(views), likelihood, small)
     limit = None if seconds is None else COARSE_SHARE * seconds
     return finer(reconstruct(problem, start(problem), strength=strength, passes=COARSE_PASSES, seconds=limit), grid)
-
-
-def _told_marks(found: np.ndarray, wedge: float) -> list[str]:
-    sentences = []
-    for mark, what in ((UNSEEN, "no view sees"), (TRUNCATED, "some views miss (values hold up to a smooth offset)")):
-        share = float(np.mean((found & mark) > 0))
-        if share > 0:
-            sentences.append(f"{100 * share:.1f} % of the voxels: {what}; they are marked")
-    if wedge > 0:
-        sentences.append(
-            f"no ray lies in a wedge of {wedge:.0f} degrees: edges along its directions are not determined"
-        )
-    return sentences
 
 
 def _fits_memory(grid: VoxelGrid) -> None:

@@ -10,7 +10,7 @@ from nerfcli.media.images import write_png
 from nerfcli.media.preview import coloured
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.likelihood import Likelihood, likelihood_of
-from nerfcli.tomography.marks import UNSEEN
+from nerfcli.tomography.marks import MEANINGS, UNSEEN, marks_in_words
 from nerfcli.tomography.reconstruct import Projector
 from nerfcli.tomography.result import Reconstruction, load_reconstruction
 from nerfcli.tomography.volume_files import VolumeFile, write_volume
@@ -115,10 +115,11 @@ def export_scan(
     write_volume(target, VolumeFile(values, result.grid, result.unit, quantity))
     written = [target]
     if marks.any():
-        quantity = "marks: 1 no view, 2 some views, 4 missing wedge"
+        quantity = "marks: " + ", ".join(f"{mark} {meaning}" for mark, meaning in MEANINGS.items())
         write_volume(beside, VolumeFile(marks, result.grid, result.unit, quantity))
         written.append(beside)
-        notify(f"{100 * float((marks > 0).mean()):.0f} % of the voxels are marked in {beside.name}")
+        for words in marks_in_words(marks):
+            notify(f"{beside.name}: {words}")
     return written
 
 
