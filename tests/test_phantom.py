@@ -1,8 +1,20 @@
 """The phantom itself: its chords beside quadrature, and beside the closed form of a sphere."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import make_phantom
 import numpy as np
 import pytest
+import tifffile
+import torch
 from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals, sphere
+
+from nerfcli.tomography.formats.read import read_scan
+from nerfcli.tomography.likelihood import likelihood_of
+from nerfcli.tomography.truth import load_truth
+
+PHANTOM = Path(__file__).parent.parent / "sample_scenes" / "phantom"
 
 
 @pytest.mark.parametrize("distance", [0.0, 1.0, 1.999999, 2.0, 2.5])
@@ -31,3 +43,35 @@ def test_mass_of_voxels_is_the_volume_of_the_ellipsoid() -> None:
     axis = (np.arange(28) - 13.5) * 0.25
     voxels = attenuation_of_voxels([solid], x=axis, y=axis, z=axis, samples=2)
     assert voxels.sum() * 0.25**3 == pytest.approx(0.7 * 4 / 3 * np.pi * 3 * 2 * 2.5, rel=0.01)
+
+
+def test_the_sample_scan_follows_its_statement(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Chords along the rays that the program reads from scan.json explain the counts as noise alone; the script's own
+    geometry is written without the program. Its files are those that it writes again.
+    """
+    scan = read_scan(PHANTOM)
+    assert (scan.geometry.views, scan.geometry.rows, scan.geometry.columns) == (48, 48, 64)
+    every, n = np.arange(scan.geometry.views), make_phantom.SUBPIXELS
+    fine = replace(
+        scan.geometry,
+        column_step=scan.geometry.column_step / n,
+        row_step=scan.geometry.row_step / n,
+        rows=48 * n,
+        columns=64 * n,
+    )
+    passed = np.exp(-line_integrals(bean(), *fine.rays())).reshape(48, 48, n, 64, n).mean((2, 4))
+    integrals = torch.from_numpy(-np.log(passed).reshape(len(every), -1)).float()
+    deviance = likelihood_of(scan, every).deviance(integrals, torch.from_numpy(every))
+    # The flats are counts, too: their mean adds its own variance, in proportion to what passes.
+    assert float(deviance.mean()) == pytest.approx(1 + passed.mean() / make_phantom.FLATS, abs=0.02)
+    truth = load_truth(scan.history)
+    assert truth is not None
+    grid, volume = truth
+    mass = sum(p.attenuation * 4 / 3 * np.pi * np.prod(p.semi_axes) for p in bean())
+    assert float(volume.sum()) * grid.size**3 == pytest.approx(mass, rel=2e-3)
+    monkeypatch.setattr("sys.argv", ["make_phantom.py", "--out", str(tmp_path)])
+    make_phantom.main()
+    for name in ("projections.tif", "flats.tif", "darks.tif"):
+        np.testing.assert_array_equal(tifffile.imread(tmp_path / name), tifffile.imread(PHANTOM / name))
+    np.testing.assert_array_equal(np.load(tmp_path / "truth" / "volume.npy"), np.load(PHANTOM / "truth" / "volume.npy"))
+    assert (tmp_path / "scan.json").read_text() == (PHANTOM / "scan.json").read_text()

@@ -299,6 +299,12 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], tuple[str, ...], str]] = {
         "line integrals up to",
     ),
     "held out beyond the end": (lambda f: stack(f, changed={"held_out": [40]}).path, (), "held_out is"),
+    "truth that is not there": (
+        lambda f: stack(f, changed={"truth": {"volume": "v.npy"}}).path,
+        (),
+        "v.npy cannot be read",
+    ),
+    "truth without a size": (lambda f: stack(f, changed={"truth": 1}).path, (), "truth is 1"),
     "unit of no length": (lambda f: stack(f, changed={"unit": "kg"}).path, (), "'kg' is no unit of length"),
     "vectors of another shape": (lambda f: stack(f, changed={"vectors": [[1, 2]] * VIEWS}).path, (), "vectors"),
     "npy missing": (lambda f: without(r2_gaussian(f).path, "proj_train/0002.npy"), (), "there is no .*0002.npy"),

@@ -21,6 +21,7 @@
 | centre_row | the row that the plane of the source crosses; the middle if it is not given |
 | photons | that an open pixel counts |
 | held_out | list of views, from 0 |
+| truth | of a computed scan: volume (.npy, z x y x x, around the origin), voxel_size, attenuation_per_value |
 | vectors | instead of angles and distances: views x 12 numbers as ASTRA's cone_vec or parallel3d_vec |
 """
 
@@ -45,7 +46,7 @@ _HINT = "a scan.json states projections, kind, beam, pixel_size, unit and angles
 _KEYS = (
     *("projections", "flats", "darks", "white_level", "kind", "beam", "unit", "pixel_size", "source_origin"),
     *("source_detector", "angles_deg", "angles_rad", "direction", "mirrored", "centre_of_rotation", "centre_row"),
-    *("photons", "held_out", "vectors", "note"),
+    *("photons", "held_out", "vectors", "truth", "note"),
 )
 
 
@@ -77,6 +78,7 @@ def read_stated_stack(path: Path, given: Given = Given()) -> Scan:
         beam=beam,
         photons=photons if beam is None else None,
         held_out=_held_out(fields, views),
+        history=_truth(fields, factor),
         stated_mm=factor,
     )
     if photons is not None and given.photons is None and measured != "line_integral":
@@ -178,6 +180,36 @@ def _held_out(fields: Statement, views: int) -> list[int] | None:
     if not isinstance(stated, list) or not all(isinstance(view, int) and 0 <= view < views for view in stated):
         raise UserError(f"{fields.path}: held_out is {stated!r}", f"a list of views from 0 to {views - 1}")
     return stated
+
+
+def _truth(fields: Statement, factor: float) -> dict[str, Any]:
+    """The true volume, attenuation in the inverse of the stated unit, with its middle at the origin."""
+    if "truth" not in fields:
+        return {}
+    given = fields.value("truth")
+    if not isinstance(given, dict):
+        raise UserError(
+            f"{fields.path}: truth is {given!r}", "an object with volume, voxel_size, attenuation_per_value"
+        )
+    stated = Statement(fields.path, given, hint="truth has volume, voxel_size and attenuation_per_value")
+    path = fields.path.parent / stated.text("volume")
+    try:
+        shape = np.load(path, mmap_mode="r", allow_pickle=False).shape
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {error}", f"{fields.path.name} names it as the true volume") from error
+    if len(shape) != 3:
+        raise UserError(f"{path} has shape {shape}", "a volume is z x y x x")
+    size = stated.positive("voxel_size") * factor
+    return {
+        "truth": {
+            "path": str(path.absolute()),
+            "layout": "zyx",
+            "shape": list(shape),
+            "first": [-(count - 1) / 2 * size for count in reversed(shape)],
+            "size": size,
+            "attenuation_per_value": stated.positive("attenuation_per_value") / factor,
+        }
+    }
 
 
 def _one_of(fields: Statement, name: str, choices: tuple[str, ...]) -> str:

@@ -1,0 +1,143 @@
+"""Reconstructions of computed scans: kinds of fields at equal time, numbers of views, seeds of the noise.
+
+    python benchmarks/tomography.py ct_tooth/line_integrals_f32.npy -o tooth --views 60,30,15 --seeds 3
+    python benchmarks/tomography.py sample_scenes/phantom -o phantom --views 40,20,10 --fields voxels,hash
+
+SCAN is any input of `convert` that names its true volume. Line integrals get counting noise of --photons, another one
+for each seed; counts stay what they are. Of the training views every n-th is fitted; the held-out views are always the
+same. Everything else is left to `train`. Writes OUT.csv, prints a table; the runs stay in the folder OUT.
+"""
+
+import csv
+import statistics
+import time
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from nerfcli import kernels
+from nerfcli.tomography.formats.read import read_scan
+from nerfcli.tomography.result import ReconstructionSettings
+from nerfcli.tomography.scan import Scan, save_scan
+from nerfcli.workflows.tomography import train_scan
+from nerfcli.workflows.tomography_scores import evaluate_scan
+
+
+@dataclass(frozen=True)
+class Line:
+    """One reconstruction; the baselines get no time."""
+
+    method: str
+    views: int
+    seed: int
+    volume_db: float
+    ssim: float
+    held_out_rms: float
+    held_out_db: float
+    chi_square: float
+    passes: int
+    settled: bool
+    clock_s: float
+    cpu_s: float
+
+
+def with_noise(scan: Scan, photons: float, seed: int) -> Scan:
+    """Transmissions as counted photons; counts as they are."""
+    if scan.kind != "line_integral":
+        return scan
+    counts = np.random.default_rng(seed).poisson(photons * np.exp(-scan.values.astype(np.float64)))
+    values = (counts / photons).astype(np.float32)
+    return replace(scan, kind="transmission", values=values, photons_per_value=photons)
+
+
+def thinned(scan: Scan, views: int) -> Scan:
+    """The scan with every n-th of its training views, and all held-out ones."""
+    training = scan.training_views
+    chosen = training[:: max(1, len(training) // views)][:views]
+    index = np.sort(np.concatenate([chosen, np.array(scan.held_out, dtype=int)]))
+    arrays = {name: scan.of_views(name, index) for name in ("open_beam", "dark", "usable")}
+    held_out = tuple(int(k) for k in np.flatnonzero(np.isin(index, scan.held_out)))
+    return replace(scan, geometry=scan.geometry.select(index), values=scan.values[index], held_out=held_out, **arrays)
+
+
+def main(
+    scan: Annotated[Path, typer.Argument()],
+    output: Annotated[Path, typer.Option("-o")],
+    views: str = "60,30,15",
+    methods: Annotated[str, typer.Option("--fields")] = "voxels",
+    seeds: int = 1,
+    first_seed: int = 0,
+    seconds: float = 120.0,
+    steps: Annotated[int | None, typer.Option(help="Passes, instead of a time.")] = None,
+    photons: float = 2e4,
+    threads: int = 2,
+    baselines: Annotated[bool, typer.Option(help="Other methods too, for the first seed.")] = True,
+    processor_time: Annotated[
+        bool, typer.Option(help="Budgets count seconds of processor time per thread, for a machine with other work.")
+    ] = False,
+) -> None:
+    """See the module's text."""
+    kernels.prepare(print)
+    clock = time.perf_counter
+    if processor_time:
+        time.perf_counter = lambda: time.process_time() / threads
+    whole = read_scan(scan)
+    output.mkdir(parents=True, exist_ok=True)
+    lines: list[Line] = []
+    with Path(f"{output}.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Line)])
+        writer.writeheader()
+        for count in (int(text) for text in views.split(",")):
+            for seed in range(first_seed, first_seed + seeds):
+                folder = output / f"{count}-views-{seed}"
+                save_scan(folder, thinned(with_noise(whole, photons, seed), count))
+                for method in methods.split(","):
+                    settings = ReconstructionSettings(
+                        None if steps else seconds, steps, field=method, seed=seed, threads=threads
+                    )
+                    run = folder.with_name(f"{folder.name}-{method}")
+                    begun, used = clock(), time.process_time()
+                    result = train_scan(folder, run, settings, overwrite=True, notify=print)
+                    spent = {"clock_s": clock() - begun, "cpu_s": time.process_time() - used}
+                    others = baselines and seed == first_seed and method == methods.split(",")[0]
+                    metrics = evaluate_scan(run, threads=threads, overwrite=True, baselines=others).metrics
+                    for name, found in metrics["methods"].items():
+                        own = name == "nerfcli"
+                        projections, volume = found["projections"], found["volume"]
+                        line = Line(
+                            method if own else name,
+                            *(count, seed, volume["psnr"], volume["ssim"]),
+                            *(projections["rms"], projections["psnr"], projections["chi_square"]),
+                            *((result.passes, result.settled) if own else (0, False)),
+                            **(spent if own else dict.fromkeys(spent, 0.0)),
+                        )
+                        lines.append(line)
+                        writer.writerow(asdict(line))
+                        file.flush()
+                        print(line, flush=True)
+    print_table(lines)
+
+
+def print_table(lines: list[Line]) -> None:
+    """Mean and standard deviation over seeds."""
+    table = Table("method", "views", "seeds", "volume dB", "SSIM", "held-out dB", "chi-square", "s", "CPU s")
+    for method, views in dict.fromkeys((line.method, line.views) for line in lines):
+        own = [line for line in lines if (line.method, line.views) == (method, views)]
+
+        def cell(name: str, digits: int, own: list[Line] = own) -> str:
+            values = [getattr(line, name) for line in own]
+            spread = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
+            return f"{statistics.mean(values):.{digits}f}{spread}"
+
+        numbers = (("volume_db", 2), ("ssim", 3), ("held_out_db", 2), ("chi_square", 3), ("clock_s", 0), ("cpu_s", 0))
+        table.add_row(method, str(views), str(len(own)), *(cell(*number) for number in numbers))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)
