@@ -14,6 +14,8 @@ from nerfcli.tomography.baselines import filtered_back_projection, sart_total_va
 from nerfcli.tomography.calibrate import air_factors, centre_of_rotation, detector_tilt
 from nerfcli.tomography.geometry import ScanGeometry, circular_cone, circular_parallel
 from nerfcli.tomography.grid import VoxelGrid, centred_grid
+from nerfcli.tomography.hash_fit import ARRAYS, fit_hash, hash_volume, new_arrays, total_variation
+from nerfcli.tomography.hash_fit import line_integrals as hash_line_integrals
 from nerfcli.tomography.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
 from nerfcli.tomography.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
 from nerfcli.tomography.reconstruct import Problem, mean_attenuation, reconstruct, start
@@ -85,6 +87,51 @@ def test_fit_beats_the_baselines_with_the_same_views(scan: Scan, grid: VoxelGrid
     psnr = {name: score_volume(volume, grid, true, grid).psnr for name, volume in found.items()}
     assert psnr["fit"] > psnr["sart"] + 0.5
     assert psnr["sart"] > psnr["fdk"] + 1
+
+
+def test_rays_of_pixels_are_those_of_whole_views() -> None:
+    for geometry in (
+        cone(3, rows=4, columns=5),
+        circular_parallel([0.1, 2.0], pixel_width=1, pixel_height=2, rows=3, columns=4),
+    ):
+        count = geometry.views * geometry.rows * geometry.columns
+        for some, whole in zip(geometry.rays_of_pixels(np.arange(count)), geometry.rays(), strict=True):
+            np.testing.assert_array_equal(some, whole.reshape(-1, 3))
+
+
+def test_line_integrals_of_a_constant_hash_grid_are_chords_of_the_box(generator: torch.Generator) -> None:
+    """Closed form: attenuation times the length inside the box, 0 beside it; no total variation."""
+    grid = centred_grid((4.0, 6.0, 3.0), 0.5)
+    learned = {name: np.zeros_like(array) for name, array in new_arrays(0).items()}
+    volume = hash_volume(grid, 0.3, learned)
+    origins = torch.tensor([[0.0, 0, 0], [9, 0, 0], [-7, 1, 1], [0, 50, 0], [0, 0, 0]], dtype=torch.float64)
+    directions = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [1, 0, 0], [1, 0, 0], [0, 0.6, 0.8]], dtype=torch.float64)
+    jitter = torch.rand(7, generator=generator, dtype=torch.float64)
+    found = hash_line_integrals(volume, (origins, directions), grid, jitter=jitter)
+    expected = torch.tensor([1.2, 1.2, 1.2, 0.0, 0.3 * 3.0 / 0.8])
+    torch.testing.assert_close(found.detach(), expected, rtol=1e-5, atol=0)
+    assert total_variation(volume, torch.rand(5, 3, generator=generator), 0.5).item() < 1e-6
+    assert volume.on_grid(grid).shape == grid.shape
+    torch.testing.assert_close(volume.on_grid(grid), torch.full(grid.shape, 0.3))
+
+
+def test_hash_grid_beats_filtered_back_projection_and_repeats(scan: Scan, grid: VoxelGrid) -> None:
+    """Against the phantom's own voxels; equal seeds give equal bits, and another seed others."""
+    problem = problem_of(scan, grid)
+    found = []
+    for seed, passes in ((0, 4), (0, 1), (0, 1), (1, 1)):
+        volume = hash_volume(grid, mean_attenuation(problem), new_arrays(seed))
+        fit_hash(problem, volume, strength=1.0, seed=seed, passes=passes)
+        assert passes <= volume.passes < passes + 0.2
+        found.append(volume.on_grid(grid).numpy())
+    views = scan.training_views
+    integrals = scan.line_integrals(views)
+    filtered = filtered_back_projection(scan.geometry.select(views), integrals, grid).clamp_min(0).numpy()
+    true = truth(grid)
+    assert score_volume(found[0], grid, true, grid).psnr > score_volume(filtered, grid, true, grid).psnr + 1
+    np.testing.assert_array_equal(found[1], found[2])
+    assert not np.array_equal(found[1], found[3])
+    assert set(new_arrays(0)) == set(ARRAYS)
 
 
 @pytest.mark.parametrize("beam", ["cone", "parallel", "half"])
@@ -284,6 +331,23 @@ def test_marks_of_truncation_wedge_and_blind_voxels() -> None:
     assert (marks(limited, grid)[5] == WEDGE).all()
 
 
+def test_marks_of_cone_ends_and_of_a_detector_beside_the_middle() -> None:
+    """Closed form: the cone's rays leave the top at a height of h (D - r) / D; a full turn sees both halves."""
+    angles = np.arange(120) * 2 * np.pi / 120
+    sides = {"pixel_width": 1.0, "pixel_height": 1.0, "rows": 20, "columns": 60}
+    geometry = circular_cone(angles, source_origin=100, source_detector=100, **sides)  # type: ignore[arg-type]
+    grid = centred_grid((20.0, 20.0, 20.0), 1.0)
+    found = marks(geometry, grid)
+    z, y, x = np.meshgrid(*(grid.axis(name) for name in "zyx"), indexing="ij")
+    least = 10.5 * (1 - np.hypot(x, y) / 100)  # half a pixel beyond the last row
+    assert (found[np.abs(z) < least - 0.1] == 0).all()
+    assert (found[np.abs(z) > least + 0.1] == TRUNCATED).all()
+    half = circular_parallel(angles, **sides).shifted(25)  # type: ignore[arg-type]
+    wide = centred_grid((80.0, 80.0, 4.0), 2.0)
+    y, x = np.meshgrid(wide.axis("y"), wide.axis("x"), indexing="ij")
+    assert (marks(half, wide)[0][np.hypot(x, y) < 45] == 0).all()  # each line is seen from one of its ends
+
+
 def test_scan_folder_round_trip(scan: Scan, tmp_path: Path) -> None:
     save_scan(tmp_path / "bean", scan)
     back = load_scan(tmp_path / "bean")
@@ -318,20 +382,3 @@ def test_resampling_and_held_out_views() -> None:
     np.testing.assert_allclose(resampled(linear, grid, finer)[2, 3], 2 * finer.axis("x"), atol=1e-6)
     assert held_out_views(13) == (0, 6, 12)
     assert held_out_views(6) == ()
-def test_marks_of_cone_ends_and_of_a_detector_beside_the_middle() -> None:
-    """Closed form: the cone's rays leave the top at a height of h (D - r) / D; a full turn sees both halves."""
-    angles = np.arange(120) * 2 * np.pi / 120
-    sides = {"pixel_width": 1.0, "pixel_height": 1.0, "rows": 20, "columns": 60}
-    geometry = circular_cone(angles, source_origin=100, source_detector=100, **sides)  # type: ignore[arg-type]
-    grid = centred_grid((20.0, 20.0, 20.0), 1.0)
-    found = marks(geometry, grid)
-    z, y, x = np.meshgrid(*(grid.axis(name) for name in "zyx"), indexing="ij")
-    least = 10.5 * (1 - np.hypot(x, y) / 100)  # half a pixel beyond the last row
-    assert (found[np.abs(z) < least - 0.1] == 0).all()
-    assert (found[np.abs(z) > least + 0.1] == TRUNCATED).all()
-    half = circular_parallel(angles, **sides).shifted(25)  # type: ignore[arg-type]
-    wide = centred_grid((80.0, 80.0, 4.0), 2.0)
-    y, x = np.meshgrid(wide.axis("y"), wide.axis("x"), indexing="ij")
-    assert (marks(half, wide)[0][np.hypot(x, y) < 45] == 0).all()  # each line is seen from one of its ends
-
-

@@ -167,6 +167,29 @@ def test_resume_goes_on_from_the_volume(bean_run: Path, tmp_path: Path) -> None:
     assert load_reconstruction(run).passes > first.passes
 
 
+def test_hash_grids_are_trained_resumed_evaluated_rendered_and_exported(bean_run: Path, tmp_path: Path) -> None:
+    scan, run = bean_run.with_name("bean"), tmp_path / "run"
+    fixed = ("--field", "hash", "--with", "centre=0", "--with", "tilt=0", "--with", "tv=1", "-o", run)
+    code, _, err = call("train", scan, "--steps", "1", *fixed)
+    assert code == 0, err
+    first = load_reconstruction(run)
+    assert "is kept" in call("train", scan, "--steps", "1", *fixed)[2]
+    code, _, err = call("train", scan, "--steps", "3", "--resume", *fixed)
+    assert code == 0, err
+    result = load_reconstruction(run)
+    assert (first.passes, result.passes) == (1, 3)
+    assert set(result.learned) == set(first.learned) == {"table.npy", "first-layer.npy", "last-layer.npy"}
+    code, out, err = call("evaluate", run, "--json")
+    assert code == 0, err
+    methods = json.loads(out.splitlines()[-1])["methods"]
+    assert methods["nerfcli"]["volume"]["psnr"] > 20
+    assert call("render", run, "--slices", "z=0", "-o", tmp_path / "slices")[0] == 0
+    assert call("export", run, "--to", "volume", "-o", tmp_path / "bean.nrrd")[0] == 0
+    code, _, err = call("train", scan, "--steps", "5", "--resume", "-o", run)
+    assert code == 3
+    assert "another reconstruction" in err
+
+
 @pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii", ".tif"])
 def test_volume_files_read_back(bean_run: Path, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"bean{suffix}"
@@ -211,7 +234,7 @@ def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--field", "hash"), "cannot use --field hash"),
+        (("--field", "mlp"), "cannot use --field mlp"),
         (("--with", "exposure=learned"), "--with exposure: unknown component"),
         (("--with", "tv=much"), "expected a number"),
         (("--with", "tv=-1"), "invalid weight"),

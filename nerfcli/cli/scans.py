@@ -28,6 +28,7 @@ def reconstruction_settings(
     voxel_size: float | None,
     include: list[str] | None,
     exclude: list[str] | None,
+    seed: int,
     threads: int,
 ) -> "ReconstructionSettings":
     """The settings of a reconstruction by the options of train.
@@ -56,6 +57,7 @@ def reconstruction_settings(
         centre=values["centre"],
         tilt=None if tilt is None else math.radians(tilt),
         air=None if values["air"] is None else bool(values["air"]),
+        seed=seed if field == "hash" else 0,
         threads=threads,
     )
 

@@ -107,10 +107,11 @@ def train(
     voxels (a dense grid of density and spherical harmonics), mlp (one network on Fourier features: small and slow).
     The resolution of the last two is one pixel's footprint at the centre of the scene.
 
-    A scan by transmission (X-rays), as `nerfcli convert` writes it, is reconstructed as a volume: Poisson likelihood
-    and total variation on voxels of --voxel-size. Its components are tv (the weight of total variation), centre
-    (columns between the centre of rotation and where the scan says), tilt (degrees of the detector in its plane) and
-    air (measured: the brightness of each view from pixels beside the object); the scan decides on all four.
+    An X-ray scan, as `nerfcli convert` writes it, is reconstructed as a volume: Poisson likelihood and total variation,
+    --field voxels (of --voxel-size; the default, and better) or hash. Its components are tv (the weight of total
+    variation), centre (columns between the centre of rotation and where the scan says), tilt (degrees of the detector
+    in its plane) and air (measured: the brightness of each view from pixels beside the object); unless they are set,
+    all four are estimated from the scan.
 
     \b
     Examples:
@@ -147,6 +148,7 @@ def train(
             voxel_size=voxel_size,
             include=include,
             exclude=exclude,
+            seed=seed,
             threads=thread_count(threads),
         )
         with console.progress(f"train {folder.name}") as update:

@@ -113,14 +113,18 @@ class ScanGeometry:
             plane through the frame's origin.
         """
         index = np.arange(self.views) if views is None else np.asarray(views)
-        along = np.arange(self.columns) - (self.columns - 1) / 2
-        down = np.arange(self.rows) - (self.rows - 1) / 2
-        pixels = (
-            self.centre[index][:, None, None]
-            + down[:, None, None] * self.row_step[index][:, None, None]
-            + along[:, None] * self.column_step[index][:, None, None]
-        )  # (views, rows, columns, 3)
-        emitter = np.broadcast_to(self.emitter[index][:, None, None], pixels.shape)
+        return self._through(index[:, None, None], np.arange(self.rows)[:, None], np.arange(self.columns))
+
+    def rays_of_pixels(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and directions (N, 3), as `rays` has them, of pixels (N,) counted through all views, row by row."""
+        line, column = np.divmod(pixels, self.columns)
+        return self._through(*np.divmod(line, self.rows), column)
+
+    def _through(self, view: np.ndarray, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        along = (column - (self.columns - 1) / 2)[..., None]
+        down = (row - (self.rows - 1) / 2)[..., None]
+        pixels = self.centre[view] + down * self.row_step[view] + along * self.column_step[view]
+        emitter = np.broadcast_to(self.emitter[view], pixels.shape)
         if self.beam == "parallel":
             foot = pixels - (pixels * emitter).sum(-1, keepdims=True) * emitter
             return foot, emitter.copy()

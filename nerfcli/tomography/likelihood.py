@@ -36,6 +36,10 @@ class Likelihood(Protocol):
         """Line integrals that the data suggest, for a start; NaN where nothing usable was measured."""
         ...
 
+    def by_ray(self) -> "Likelihood":
+        """The same with each pixel as a view of its own."""
+        ...
+
 
 @dataclass(frozen=True)
 class Poisson:
@@ -82,6 +86,11 @@ class Poisson:
         signal = (self.counts[views] - self.background[views]).clamp_min(0.5)
         return torch.where(self.open_beam[views] > 0, torch.log(self.open_beam[views] / signal), torch.nan)
 
+    def by_ray(self) -> "Poisson":
+        """The same with each pixel as a view of its own."""
+        counts, open_beam, background = (x.reshape(-1, 1) for x in (self.counts, self.open_beam, self.background))
+        return replace(self, counts=counts, open_beam=open_beam, background=background)
+
     def scaled(self, factors: Tensor) -> "Poisson":
         """The same counts behind an open beam that is multiplied by a factor per view (views,)."""
         return replace(self, open_beam=self.open_beam * factors[:, None])
@@ -126,6 +135,10 @@ class Gaussian:
 
     def suggested(self, views: Tensor) -> Tensor:
         return torch.where(self.weight[views] > 0, self.measured[views], torch.nan)
+
+    def by_ray(self) -> "Gaussian":
+        """The same with each pixel as a view of its own."""
+        return Gaussian(self.measured.reshape(-1, 1), self.weight.reshape(-1, 1))
 
 
 def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson | Gaussian:

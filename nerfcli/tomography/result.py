@@ -21,7 +21,7 @@ DESCRIPTION = "reconstruction.json"
 VOLUME = "volume.npy"
 MARKS = "marks.npy"
 
-FIELDS = ("voxels",)
+FIELDS = ("voxels", "hash")
 # What is rendered of a reconstruction.
 OUTPUTS = ("projection", "transmission", "residual")
 
@@ -39,6 +39,7 @@ class ReconstructionSettings:
         centre: columns by which the detector stands off; None to find out.
         tilt: radians by which the detector is turned in its plane; None to find out.
         air: whether the open beam of each view is measured in its pixels beside the object; None to find out.
+        seed: of a hash grid's first values, pixels and samples.
         threads: of the CPU; 0 for all.
 
     Raises:
@@ -53,6 +54,7 @@ class ReconstructionSettings:
     centre: float | None = None
     tilt: float | None = None
     air: bool | None = None
+    seed: int = 0
     threads: int = 0
 
     def __post_init__(self) -> None:
@@ -86,6 +88,7 @@ class Reconstruction:
         settled: whether the last pass changed next to nothing.
         missing_wedge_deg: directions that no ray has, see `missing_wedge_deg`.
         versions: of programs.
+        learned: arrays of a hash grid by the names of their files, of which `volume` holds samples; empty for voxels.
     """
 
     volume: np.ndarray
@@ -102,6 +105,7 @@ class Reconstruction:
     settled: bool = False
     missing_wedge_deg: float = 0.0
     versions: Mapping[str, str] = field(default_factory=dict)
+    learned: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def is_reconstruction(run: Path) -> bool:
@@ -121,7 +125,7 @@ def save_reconstruction(run: Path, result: Reconstruction) -> None:
     from nerfcli.tomography.scan import array_digest
 
     digests = {}
-    for name, array in ((VOLUME, result.volume), (MARKS, result.marks)):
+    for name, array in {VOLUME: result.volume, MARKS: result.marks, **result.learned}.items():
         with atomic_path(run / name) as partial:
             np.save(partial, array, allow_pickle=False)
         digests[name] = array_digest(array)
@@ -160,8 +164,8 @@ def load_reconstruction(run: Path) -> Reconstruction:
         grid = content["grid"]
         shape, first = grid["shape"], grid["first"]
         return Reconstruction(
-            arrays[VOLUME],
-            arrays[MARKS],
+            arrays.pop(VOLUME),
+            arrays.pop(MARKS),
             VoxelGrid((shape[0], shape[1], shape[2]), (first[0], first[1], first[2]), grid["size"]),
             content["unit"],
             Path(content["scan"]),
@@ -174,6 +178,7 @@ def load_reconstruction(run: Path) -> Reconstruction:
             content["settled"],
             content["missing_wedge_deg"],
             content["versions"],
+            arrays,
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{run} cannot be read as a reconstruction: {error}", "train the scan again") from error

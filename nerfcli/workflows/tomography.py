@@ -1,11 +1,14 @@
 """From a scan to a reconstruction and its numbers: what `train`, `evaluate`, `render` and `export` do with scans."""
 
+import math
 import platform
 import time
 from collections import deque
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +22,7 @@ from nerfcli.runs.files import LOCK, METRICS
 from nerfcli.tomography.calibrate import air_factors, centre_of_rotation, detector_tilt
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid, grid_of_scan
+from nerfcli.tomography.hash_fit import fit_hash, hash_volume, new_arrays
 from nerfcli.tomography.likelihood import Poisson, likelihood_of
 from nerfcli.tomography.marks import TRUNCATED, UNSEEN, marks, marks_in_words, missing_wedge_deg
 from nerfcli.tomography.reconstruct import Fit, Problem, Projector, finer, mean_attenuation, reconstruct, start
@@ -80,7 +84,8 @@ def train_scan(
         if same and not resume:
             notify(f"{run} is kept: it is complete and has these settings; add --overwrite to fit again")
             return earlier
-        if not (same or (resume and earlier.scan_digest == loaded.digest)):
+        continued = earlier.scan_digest == loaded.digest and earlier.settings.field == settings.field
+        if not (same or (resume and continued)):
             raise UserError(
                 f"{run} holds another reconstruction", "choose another folder with --output, or add --overwrite"
             )
@@ -158,23 +163,12 @@ def _fit(
         likelihood = likelihood.with_model_error(model_error)
     problem = Problem(geometry.select(views), likelihood, grid)
 
-    def left() -> float | None:
-        if settings.budget_seconds is None:
-            return None
-        return max(settings.budget_seconds - (time.perf_counter() - begun), 0.0)
-
-    if earlier is not None:
-        fit = Fit(torch.from_numpy(np.array(earlier.volume)), torch.zeros(3, *grid.shape), earlier.passes)
-    else:
-        fit = _coarse_start(scan, geometry, grid, factors, (strength, model_error), left())
-    passes = settings.passes if settings.passes is not None else MOST_PASSES
-    if earlier is not None and settings.passes is not None:
-        passes = max(settings.passes - earlier.passes, 1)
-    kept = deque([fit], maxlen=1)
-    interrupted = False
-    try:
-        fit = reconstruct(
-            problem, fit, strength=strength, passes=passes, seconds=left(), progress=progress, keep=kept.append
+    used = {"strength": strength, "model_error": model_error, "centre": centre, "tilt": tilt, "air": factors}
+    limit = Limit(settings.passes, settings.budget_seconds, begun, 0 if earlier is None else earlier.passes)
+    if settings.field == "hash":
+        used["start"] = mean_attenuation(problem) if earlier is None else earlier.used["start"]
+        fit, learned, interrupted = _fit_hash(
+            problem, used, limit, earlier=earlier, seed=settings.seed, progress=progress
         )
     else:
         if earlier is not None:
@@ -184,8 +178,10 @@ def _fit(
         fit, interrupted = _fit_voxels(problem, fit, strength, limit, progress=progress)
         learned = {}
     found = marks(problem.geometry, grid)
-    for sentence in _told_marks(found, missing_wedge_deg(problem.geometry)):
-        decisions.append(sentence)
+    decisions += [f"{words}; they are marked" for words in marks_in_words(found, (UNSEEN, TRUNCATED))]
+    wedge = missing_wedge_deg(problem.geometry)
+    if wedge > 0:
+        decisions.append(f"missing wedge of {wedge:.0f} degrees: edges along its directions are not determined")
     result = Reconstruction(
         fit.volume.numpy(),
         found,
@@ -199,9 +195,13 @@ def _fit(
         fit.passes,
         time.perf_counter() - begun,
         fit.settled,
-        missing_wedge_deg(problem.geometry),
+        wedge,
         {"nerfcli": __version__, "python": platform.python_version(), "torch": version("torch")},
+        learned,
     )
+    return result, interrupted
+
+
 @dataclass(frozen=True)
 class Limit:
     """When a fit ends.
@@ -273,9 +273,6 @@ def _fit_hash(
     except KeyboardInterrupt:
         interrupted = True
     return Fit(volume.on_grid(problem.grid), torch.zeros(0), math.ceil(volume.passes)), volume.arrays, interrupted
-
-
-    return result, interrupted
 
 
 def _geometry(
