@@ -19,7 +19,7 @@ ALL = CaptureTraits(has_alpha=False, has_points=True, has_exif=True)
 
 def test_every_component_is_varied_but_those_that_change_what_is_measured():
     found = variants(Components(), ALL)
-    assert {variant.name.partition("=")[0] for variant in found} == set(CHOICES) - {"masks"}
+    assert {variant.name.partition("=")[0] for variant in found} == set(CHOICES) - {"masks", "stereo"}
     adds = {variant.name: variant.adds for variant in found}
     assert adds["view=0"] is False
     assert adds["near=false"] is False
@@ -29,6 +29,12 @@ def test_every_component_is_varied_but_those_that_change_what_is_measured():
         name = variant.name.partition("=")[0]
         changed = {key for key in CHOICES if getattr(variant.components, key) != getattr(Components(), key)}
         assert changed == {name}
+
+
+def test_stereo_is_varied_beside_points_and_goes_with_them():
+    stereo, points = Components(points=0.1, stereo=True), Components(points=0.1)
+    assert [v.components for v in variants(points, ALL, only=("points", "stereo"))] == [Components(), stereo]
+    assert [v.components for v in variants(stereo, ALL, only=("points", "stereo"))] == [Components(), points]
 
 
 def test_what_the_capture_cannot_have_is_not_tried():

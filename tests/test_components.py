@@ -56,6 +56,12 @@ def test_only_a_grid_of_levels_can_let_them_fade_out():
     assert caught.value.exit_code == 2
 
 
+def test_stereo_without_points_is_refused():
+    with pytest.raises(UserError, match="needs points"):
+        TrainSettings(components=Components(stereo=True))
+    TrainSettings(components=Components(stereo=True), model="auto", fixed=("stereo",))  # points may come
+
+
 def test_components_are_in_the_settings_as_json():
     settings = TrainSettings(components=replace(Components(), view=1)).to_json()
     assert json.loads(json.dumps(settings))["components"] == {**Components().to_json(), "view": 1}

@@ -79,6 +79,7 @@ def is_held_out(name: str, capture: Path) -> bool:
 CASES = {
     "default": ("default", Components()),
     "auto": ("auto", Components()),
+    "stereo": ("default", Components(points=0.1, stereo=True, overlap=True)),
     "exposures": ("default", Components(exposure="learned", masks="empty")),
 }
 

@@ -167,11 +167,11 @@ def test_an_eighth_as_many_known_pixels_are_drawn_as_others(capture):
     pool = pool_of(capture, "empty", similarity=one)
     known = point_depths(tracks_in(capture), pool, one)
     generator = torch.Generator().manual_seed(0)
-    both = PointRays(known, pool).added_to(pool.draw(80, generator), generator)
+    both = PointRays([known], pool).added_to(pool.draw(80, generator), generator)
     assert (len(both.numbers), len(both.distances), len(both.trust)) == (90, 10, 10)
     of_pixel = dict(zip(known.numbers.tolist(), known.distances.tolist(), strict=True))
     assert both.distances.tolist() == [of_pixel[number] for number in both.numbers[-10:].tolist()]
-    assert len(PointRays(known, pool).added_to(pool.draw(3, generator), generator).distances) == 1
+    assert len(PointRays([known], pool).added_to(pool.draw(3, generator), generator).distances) == 1
 
 
 def test_points_fade_out():
@@ -224,7 +224,7 @@ def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=told.append)
     assert prepared.settings.components == Components(points=0.1)
     assert prepared.points is not None
-    assert len(prepared.points.known.numbers) == 3
+    assert [len(known.numbers) for known in prepared.points.known] == [3]
     assert "points=0.1: kept, 3 pixels see a 3D point at a known distance" in told
 
 
@@ -244,7 +244,7 @@ def test_lenses_that_are_to_learn_begin_where_matched_features_say(cameras, capt
     """Of the components that are asked for, without a search; poses alone leave lenses as they are."""
     check = CameraCheck(-0.019, 0.0006, (0.26, 0.14), 900)
     facts = Facts("hash", has_alpha=False, has_exif=False, cameras=check, fixed=("cameras",))
-    monkeypatch.setattr("nerfcli.train.preparation._facts", lambda *asked, **known: (facts, None))
+    monkeypatch.setattr("nerfcli.train.preparation._facts", lambda *asked, **known: facts)
     settings = TrainSettings(budget_seconds=None, steps=10, components=Components(cameras=cameras), model="default")
     told: list[str] = []
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=told.append)

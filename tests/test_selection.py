@@ -30,10 +30,12 @@ from nerfcli.search.selection import (
     Facts,
     is_worth_a_search,
     may_use_points,
+    may_use_stereo,
     proposals,
     removals,
     select,
     with_known_cameras,
+    with_points,
 )
 from nerfcli.search.trials import Trial, TrialStart
 
@@ -524,3 +526,21 @@ def test_what_is_supported_must_not_lose_more_than_its_error():
     for gains, kept in (((0.05, 0.01), True), ((0.03, -0.05), True), ((-0.01, -0.05), False)):
         decision = judge_supported(base, ("cameras", "poses"), [trial(20.0 + gain) for gain in gains], by_time=True)
         assert decision.kept == kept  # mean m and distance d of two seeds: m > -d / 2
+
+
+def test_depths_of_stereo_matching_come_with_points_and_as_the_user_says():
+    facts = replace(FITTED, points=900, stereo=80_000)
+    both = Components(points=0.1, stereo=True)
+    assert with_points(Components(), facts)[0] == both
+    assert [decision.why for decision in with_points(Components(), facts)[1]] == [
+        "900 pixels see a 3D point at a known distance",
+        "several photos agree on the depth of 80000 pixels",
+    ]
+    assert with_points(Components(), replace(facts, stereo=0))[0] == Components(points=0.1)
+    assert with_points(Components(points=0.3), replace(facts, fixed=("points",)))[0] == replace(both, points=0.3)
+    assert with_points(Components(), replace(facts, fixed=("points",)))[0] == Components()
+    assert with_points(Components(), replace(facts, fixed=("stereo",)))[0] == Components(points=0.1)
+    assert may_use_stereo(Components(), facts, has_time=True)
+    assert not may_use_stereo(Components(), facts, has_time=False)
+    assert not may_use_stereo(Components(), replace(facts, points=0), has_time=True)
+    assert may_use_stereo(Components(stereo=True), replace(facts, fixed=("stereo",)), has_time=False)

@@ -51,7 +51,7 @@ def variants(chosen: Components, capture: CaptureTraits, *, only: tuple[str, ...
     for name in CHOICES:
         if name in NOT_COMPARABLE or (only and name not in only):
             continue
-        off, offers = _off(name, chosen), _offers(name, capture)
+        off, offers = _off(name, chosen), _offers(name, chosen, capture)
         now = getattr(chosen, name)
         if now != off:
             found.append(_variant(chosen, name, off, adds=False))
@@ -66,9 +66,11 @@ def _off(name: str, chosen: Components) -> Value:
     return CHOICES[name].off
 
 
-def _offers(name: str, capture: CaptureTraits) -> list[Value]:
+def _offers(name: str, chosen: Components, capture: CaptureTraits) -> list[Value]:
     """Values with which the component may be added."""
     if (name == "background" and capture.has_alpha) or (name == "points" and not capture.has_points):
+        return []
+    if name == "stereo" and not chosen.points:
         return []
     if name == "exposure" and capture.has_exif:
         return ["exif", CHOICES[name].on]
@@ -76,4 +78,7 @@ def _offers(name: str, capture: CaptureTraits) -> list[Value]:
 
 
 def _variant(chosen: Components, name: str, value: Value, *, adds: bool) -> Variant:
-    return Variant(f"{name}={str(value).lower()}", replace(chosen, **{name: value}), adds)
+    changed = {name: value}
+    if name == "points" and not value:
+        changed["stereo"] = False  # it has no effect without
+    return Variant(f"{name}={str(value).lower()}", replace(chosen, **changed), adds)

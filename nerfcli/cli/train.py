@@ -93,13 +93,15 @@ def train(
       cameras     fixed, poses, focal, all: camera parameters optimized together with the field
       masks       ignore, empty: whether black in masks is unknown or empty space
       points      a weight: surfaces at the 3D points of matched features
+      stereo      true, false: with points, also at depths from stereo matching of the training photos
+      overlap     true, false: empty space near a camera that no other photo sees
       entropy     a weight: favour rays that are either opaque or transparent
       near        true, false: smaller gradients near cameras
       distortion  a weight: concentrate the density along each ray
       antialias   true, false: fade out details smaller than a pixel; for photos from near and far
       pixels      anywhere, error: sample more pixels where the error is large
 
-    Unless they are set with --with or --without, points, exposure, cameras, background and view are selected
+    Unless they are set with --with or --without, points, stereo, exposure, cameras, background and view are selected
     automatically: short trainings on up to 15 % of the budget keep a component if it improves PSNR by more than the
     noise, on training pixels left out of these trials. --model default skips the selection.
 

@@ -65,6 +65,7 @@ class Fitting:
         cameras_from: the share of the budget from which on cameras learn.
         points: pixels whose distance is known.
         error_map: where the error is, if pixels are drawn by it.
+        covered: the cells that may be filled, see `coverage.covered_cells`; None for all.
         size: of the field; else `sizes.chosen_size` gives one for the settings and the pool.
     """
 
@@ -80,6 +81,7 @@ class Fitting:
         cameras_from: float = 0.0,
         points: PointRays | None = None,
         error_map: ErrorMap | None = None,
+        covered: Tensor | None = None,
         size: FieldSettings | None = None,
     ):
         device = pool.colours.device
@@ -111,6 +113,7 @@ class Fitting:
         self.parts = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
         self._cameras_from = cameras_from
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
+        self.covered = covered
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
@@ -273,7 +276,8 @@ class Fitting:
         """The cells that rays look into: those that take away more light than the threshold of this step."""
         closed = min(1.0, max(self.step / self.field.closing_steps, self.furthest / CLOSING_SHARE))
         threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
-        return self.occupancy.above(threshold)
+        occupied = self.occupancy.above(threshold)
+        return occupied if self.covered is None else occupied & self.covered
 
     def _check_finite(self, loss: Tensor, drawn: Drawn, watch: Watch) -> None:
         total = loss.detach()

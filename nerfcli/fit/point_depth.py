@@ -1,12 +1,15 @@
 """Depth supervision: 3D points seen by several photos."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nerfcli.cameras.rigid import Similarity, apply, inverse
+from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.multiview.tracks import Tracks, places_of
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.pool import Drawn, PixelPool
@@ -17,6 +20,8 @@ LAST_SHARE = 0.5
 PIXELS_PER_POINT = 8
 # Miss at which a point counts half, in pixels of the training photo.
 HALF_ERROR_PX = 1.0
+# Expected error of a distance at which a pixel of stereo matching counts half, as a part of the distance.
+HALF_ERROR = 0.05
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,11 @@ class PointDepths:
         usable = pool.is_usable(self.numbers)
         return PointDepths(self.numbers[usable], self.distances[usable], self.trust[usable])
 
+    def joined(self, other: "PointDepths") -> "PointDepths":
+        """Return the pixels of both."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return PointDepths(*(torch.cat(pair) for pair in pairs))
+
     def draw(self, count: int, generator: torch.Generator) -> "PointDepths":
         """`count` of them at random, with replacement."""
         chosen = torch.randint(len(self.numbers), (count,), generator=generator, device=self.numbers.device)
@@ -48,17 +58,18 @@ class PointRays:
     """Pixels at known distances that are added to each step.
 
     Args:
-        known: the pixels.
+        known: sets of pixels, one at least; as many are drawn from each, however large it is.
         pool: what they are pixels of.
     """
 
-    def __init__(self, known: PointDepths, pool: PixelPool):
-        self.known = known
+    def __init__(self, known: Sequence[PointDepths], pool: PixelPool):
+        self.known = [depths for depths in known if len(depths.numbers)]
         self._pool = pool
 
     def added_to(self, drawn: Drawn, generator: torch.Generator) -> Drawn:
         """Append pixels at known distances to the sampled ones. Their colours count like all others."""
-        chosen = self.known.draw(max(1, len(drawn.numbers) // PIXELS_PER_POINT), generator)
+        count = max(1, len(drawn.numbers) // PIXELS_PER_POINT // len(self.known))
+        chosen = reduce(PointDepths.joined, [known.draw(count, generator) for known in self.known])
         both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
         weights = drawn.weights
         if len(weights):
@@ -95,6 +106,29 @@ def point_depths(tracks: Tracks, pool: PixelPool, training_from_scene: Similarit
     device = pool.colours.device
     return PointDepths(
         torch.from_numpy(numbers[inside]).to(device),
+        torch.from_numpy(distances).to(device, torch.float32),
+        torch.from_numpy(trust).to(device, torch.float32),
+    ).among(pool)
+
+
+def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_scene: Similarity) -> PointDepths:
+    """Return the usable pixels of a pool whose depth stereo matching tells.
+
+    trust = 1 / (1 + (error / 5 %)^2)
+
+    Args:
+        dense: of each photo of the pool.
+        pool: the training photos.
+        training_from_scene: the normalisation.
+    """
+    widths = [frame.camera.width for frame in pool.frames]
+    firsts = pool.first_pixel.tolist()
+    numbers = [first + depth.pixels @ (1, width) for first, width, depth in zip(firsts, widths, dense, strict=True)]
+    distances = np.concatenate([depth.distances for depth in dense]) * training_from_scene.scale
+    trust = 1.0 / (1.0 + np.square(np.concatenate([depth.errors for depth in dense]) / HALF_ERROR))
+    device = pool.colours.device
+    return PointDepths(
+        torch.from_numpy(np.concatenate(numbers)).to(device),
         torch.from_numpy(distances).to(device, torch.float32),
         torch.from_numpy(trust).to(device, torch.float32),
     ).among(pool)

@@ -39,6 +39,9 @@ class Components:
             lens; "all", both and radial distortion; or nothing, "fixed". See `refinement`.
         masks: what their black means: "ignore", not to be looked at; or "empty", nothing is there, as with alpha.
         points: weight of `kernels.RaySums.off_target`.
+        stereo: whether the points include pixels of training photos whose depth stereo matching tells, see
+            `multiview.stereo`.
+        overlap: whether space near a camera that no other photo looks into stays empty; see `fit.coverage`.
         entropy: weight of `losses.opacity_entropy`.
         near: whether gradients near a camera are scaled down; see `reference.scale_gradients`.
         distortion: weight of `kernels.RaySums.distortion`; 0.05 is best or as good as any on real and synthetic
@@ -53,6 +56,8 @@ class Components:
     cameras: str = "fixed"
     masks: str = "ignore"
     points: float = 0.0
+    stereo: bool = False
+    overlap: bool = False
     entropy: float = 0.0
     near: bool = True
     distortion: float = 0.05
@@ -106,6 +111,8 @@ CHOICES = {
     "cameras": Choice("camera parameters optimized with the field", "fixed", "poses", CAMERAS),
     "masks": Choice("whether black in masks is empty space", "ignore", "empty", MASKS),
     "points": Choice("surfaces at 3D points of matched features, weight", 0.0, 0.1, None),
+    "stereo": Choice("points from stereo matching of photos", False, True, (False, True)),
+    "overlap": Choice("empty space near a camera that no other photo sees", False, True, (False, True)),
     "entropy": Choice("opaque or transparent rays, weight", 0.0, 0.01, None),
     "near": Choice("smaller gradients near cameras", False, True, (False, True)),
     "distortion": Choice("concentrated density along rays, weight", 0.0, 0.05, None),

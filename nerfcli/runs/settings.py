@@ -88,6 +88,10 @@ class TrainSettings:
                 "use --field hash, or remove --with antialias",
                 2,
             )
+        if self.components.stereo and not self.components.points and (self.model != "auto" or "points" in self.fixed):
+            raise UserError(
+                "--with stereo needs points: it adds to their pixels", "add --with points, or remove --with stereo", 2
+            )
         if self.contraction not in (None, *CONTRACTIONS):
             raise UserError(f"unknown contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
 

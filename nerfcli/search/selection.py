@@ -60,6 +60,7 @@ class Facts:
         cameras_known: why the cameras need no doubt, in words; None where they may be wrong.
         cameras: what matched features say of them; None where nothing is known.
         points: how many pixels see a point whose distance is known.
+        stereo: how many pixels have a depth by stereo matching.
         fixed: components that the user has decided on.
     """
 
@@ -69,6 +70,7 @@ class Facts:
     cameras_known: str | None = None
     cameras: CameraCheck | None = None
     points: int = 0
+    stereo: int = 0
     fixed: tuple[str, ...] = ()
 
 
@@ -125,16 +127,25 @@ def may_use_points(requested: Components, facts: Facts) -> bool:
     return fit and requested.cameras == "fixed" and not facts.has_alpha
 
 
+def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bool:
+    """Return whether stereo matching may add to the points: it is as good as the cameras, as they are."""
+    return requested.stereo if "stereo" in facts.fixed else has_time and facts.points > 0
+
+
 def with_points(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
     """The model whose rays end at the points that photos share, where that is not decided; and the decision about it.
 
     It is in the model from the first step on: later, light has ended elsewhere already, and points change little.
     """
-    if facts.points == 0 or "points" in facts.fixed or not may_use_points(requested, facts):
+    if facts.points == 0 or not may_use_points(requested, facts):
         return requested, []
-    value = CHOICES["points"].on
-    reason = f"{facts.points} pixels see a 3D point at a known distance"
-    return replace(requested, points=value), [untried("points", value, reason, kept=True)]
+    wanted: list[tuple[Change, str]] = []
+    if "points" not in facts.fixed:
+        wanted.append((("points", CHOICES["points"].on), f"{facts.points} pixels see a 3D point at a known distance"))
+    if "stereo" not in facts.fixed and facts.stereo:
+        wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
+    model = replace(requested, **dict(change for change, _ in wanted))
+    return model, [untried(*change, reason, kept=True) for change, reason in wanted]
 
 
 def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list[Change], list[Decision]]:
@@ -266,8 +277,10 @@ def select(
         without = trials.begin(_without_poses(requested), steps=start.steps)
         assert without is not None  # it has no fewest steps
         budget.charge(without.steps)
-        change = (decided[0].component, decided[0].value)
-        decided = [judge_supported([without.trial], change, [start.trial], by_time=budget.is_time)]
+        decided = [
+            judge_supported([without.trial], (one.component, one.value), [start.trial], by_time=budget.is_time)
+            for one in decided  # together, as none is tried without the other
+        ]
         if not decided[0].kept:
             model, start = requested, without
     candidates, declined = proposals(model, start.signs, facts)

@@ -104,7 +104,7 @@ class Trials:
         settings: of the training that the trials are for; seed and components are given with each trial.
         exif: (photos,) logarithms of the exposures that EXIF tells, relative to their mean.
         log_focal: see `Fitting`.
-        known: pixels whose distance is known; None where that is not asked for.
+        known: sets of pixels whose distance is known.
         colours, storage: see `PixelPool`.
 
     Raises:
@@ -119,7 +119,7 @@ class Trials:
         settings: TrainSettings,
         exif: np.ndarray,
         log_focal: float = 0.0,
-        known: PointDepths | None = None,
+        known: Sequence[PointDepths] = (),
         colours: np.ndarray | None = None,
         storage: PhotoStorage = IN_MEMORY,
     ):
@@ -138,8 +138,8 @@ class Trials:
         self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
         self._exif = torch.from_numpy(exif).to(torch.float32)[:, None].expand(-1, 3)
         self._log_focal = log_focal
-        usable = None if known is None else known.among(self._pool)
-        self._points = PointRays(usable, self._pool) if usable is not None and len(usable.numbers) else None
+        points = PointRays([depths.among(self._pool) for depths in known], self._pool)
+        self._points = points if points.known else None
         self._room = storage
 
     def begin(

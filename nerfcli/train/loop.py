@@ -81,8 +81,7 @@ def train(
         forget_waypoints(run, after=fitting.step)
         notify(f"resumed at step {fitting.step}, {totals.seconds:.1f} s")
     else:
-        searched = prepared.selection.seconds if prepared.selection is not None else 0.0
-        totals = Totals(seconds=searched, searched=searched)
+        totals = Totals(seconds=prepared.seconds, searched=prepared.seconds)
         _clear(run)
     _describe(scene, run, settings, prepared, resume=resume)
     checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)

@@ -6,6 +6,7 @@ Nothing of held-out photos is read here except the image sizes of their cameras.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,14 @@ import torch
 from torch import Tensor
 
 from nerfcli.errors import UserError, reason_of
+from nerfcli.fit.coverage import covered_cells
 from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
-from nerfcli.fit.fitting import Fitting
-from nerfcli.fit.point_depth import PointDepths, PointRays, point_depths
+from nerfcli.fit.fitting import OCCUPANCY_SIDE, Fitting
+from nerfcli.fit.point_depth import PointDepths, PointRays, point_depths, stereo_depths
 from nerfcli.multiview.camera_check import CameraCheck, check_cameras
 from nerfcli.multiview.correspondences import Shared
+from nerfcli.multiview.stereo import LEAST_SIDE_PX, LONGER_SIDE_PX, affordable_side_px, dense_depths
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.pool import Album, PixelPool, load_album
@@ -33,6 +36,7 @@ from nerfcli.search.selection import (
     Facts,
     is_worth_a_search,
     may_use_points,
+    may_use_stereo,
     select,
     with_known_cameras,
     with_points,
@@ -43,6 +47,8 @@ from nerfcli.search.trials import Trials
 LEAST_SECONDS = 1e-3
 # Of a search, what the comparison of photos may take.
 MATCHING_SHARE = 0.5
+# Of the budget, what stereo matching may take.
+STEREO_SHARE = 0.06
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class Prepared:
             tells; else 0.
         log_focal: logarithm of the factor of focal lengths to start from.
         points: pixels whose distance is known, where the components ask for them.
+        seconds: of the budget that were spent on all this.
     """
 
     settings: TrainSettings
@@ -81,6 +88,7 @@ class Prepared:
     log_gains: Tensor
     log_focal: float
     points: PointRays | None
+    seconds: float
 
     def fitting(self) -> Fitting:
         """Return the training at its first step."""
@@ -93,7 +101,15 @@ class Prepared:
             log_focal=self.log_focal,
             points=self.points,
             error_map=ErrorMap(self.pool) if self.settings.components.pixels == "error" else None,
+            covered=self.covered(),
         )
+
+    def covered(self) -> Tensor | None:
+        """Return the cells that may be filled; None for all."""
+        if not self.settings.components.overlap:
+            return None
+        known = reduce(PointDepths.joined, self.points.known) if self.points is not None else None
+        return covered_cells(self.pool, OCCUPANCY_SIDE, self.extent.contraction, known)
 
 
 def prepare(
@@ -149,18 +165,19 @@ def prepare(
     )
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
-    selection, known, log_focal = None, None, 0.0
+    evidence = _Evidence(shared, album, pool, extent, settings, notify)
+    selection, log_focal = None, 0.0
     if begun is not None:
         settings = replace(settings, components=begun.components)
     elif settings.model == "auto":
         began = time.perf_counter()
-        facts, known = _facts(scene, album, extent, settings, pool=pool, shared=shared, notify=notify)
+        facts = _facts(scene, album, settings, shared=shared, evidence=evidence, notify=notify)
         selection = _search(
-            scene, album, extent, settings, facts=facts, known=known, storage=storage, began=began, notify=notify
+            scene, album, extent, settings, facts=facts, evidence=evidence, storage=storage, began=began, notify=notify
         )
         settings, log_focal = replace(settings, components=selection.components), selection.log_focal
     elif settings.components.cameras in LEARN_FOCAL:
-        facts, _ = _facts(scene, album, extent, settings, pool=pool, shared=shared, notify=notify)
+        facts = _facts(scene, album, settings, shared=shared, evidence=evidence, notify=notify)
         _, log_focal, decisions = with_known_cameras(settings.components, facts)
         for decision in decisions:
             notify(decision.in_words())
@@ -168,30 +185,81 @@ def prepare(
     reference, gains = _exposures(scene, settings.components, notify=notify)
     if selection is not None and selection.log_gains is not None:
         gains = selection.log_gains
-    points = None
-    if settings.components.points:
-        known = known or point_depths(shared.tracks, pool, extent.training_from_scene)
-        if len(known.numbers) == 0:
-            raise UserError(
-                f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
-                "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
-            )
-        notify(f"points: {len(known.numbers)} pixels see a 3D point at a known distance")
-        points = PointRays(known, pool)
-    return Prepared(settings, factor, storage, extent, pool, selection, reference, gains, log_focal, points)
+    points = _points(scene, settings.components, evidence, pool=pool) if settings.components.points else None
+    seconds = evidence.stereo_seconds if selection is None else selection.seconds
+    return Prepared(settings, factor, storage, extent, pool, selection, reference, gains, log_focal, points, seconds)
+
+
+class _Evidence:
+    """Pixels at known distances, computed on first use."""
+
+    def __init__(
+        self,
+        shared: Shared,
+        album: Album,
+        pool: PixelPool,
+        extent: Extent,
+        settings: TrainSettings,
+        notify: Callable[[str], None],
+    ):
+        self._shared, self._album, self._pool, self._settings = shared, album, pool, settings
+        self._similarity, self.notify = extent.training_from_scene, notify
+        self.stereo_seconds = 0.0
+        budget = settings.budget_seconds
+        self.side_px = LONGER_SIDE_PX
+        if budget is not None:
+            self.side_px = affordable_side_px(album.photos, seconds=STEREO_SHARE * budget, threads=settings.threads)
+
+    @cached_property
+    def of_tracks(self) -> PointDepths:
+        """Of points of structure from motion, or of matched features."""
+        return point_depths(self._shared.tracks, self._pool, self._similarity)
+
+    @cached_property
+    def of_stereo(self) -> PointDepths:
+        """Of stereo matching."""
+        began = time.perf_counter()
+        dense = dense_depths(
+            self._album.photos,
+            self._shared.tracks,
+            longer_side_px=self.side_px or LEAST_SIDE_PX,
+            threads=self._settings.threads,
+        )
+        found = stereo_depths(dense, self._pool, self._similarity)
+        self.stereo_seconds = time.perf_counter() - began
+        self.notify(
+            f"stereo matching: the depth of {len(found.numbers)} pixels of the training photos, "
+            f"{self.stereo_seconds:.1f} s"
+        )
+        return found
+
+    def sets(self, components: Components) -> list[PointDepths]:
+        """Return those that a model with points uses."""
+        return [self.of_tracks, self.of_stereo] if components.stereo else [self.of_tracks]
+
+
+def _points(scene: Scene, components: Components, evidence: _Evidence, *, pool: PixelPool) -> PointRays:
+    """Return the pixels at known distances that are drawn in each step."""
+    points = PointRays(evidence.sets(components), pool)
+    if not points.known:
+        raise UserError(
+            f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
+            "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
+        )
+    evidence.notify(f"points: {len(evidence.of_tracks.numbers)} pixels see a 3D point at a known distance")
+    return points
 
 
 def _facts(
     scene: Scene,
     album: Album,
-    extent: Extent,
     settings: TrainSettings,
     *,
-    pool: PixelPool,
     shared: Shared,
+    evidence: _Evidence,
     notify: Callable[[str], None],
-) -> tuple[Facts, PointDepths | None]:
-    """Collect facts about the scene before training, and the pixels at known distances if they may be used."""
+) -> Facts:
+    """Collect facts about the scene before training."""
     lacks_points = album.fills_frame and len(scene.points) == 0
     budget = settings.budget_seconds
     has_time = is_worth_a_search(budget, settings.steps) and (
@@ -205,15 +273,11 @@ def _facts(
         cameras=_camera_check(album, shared, notify=notify) if lacks_points and has_time else None,
         fixed=settings.fixed,
     )
-    if not may_use_points(settings.components, facts):
-        return facts, None
-    if shared.of_model.count:
-        known = point_depths(shared.of_model, pool, extent.training_from_scene)
-    elif has_time or settings.components.points:
-        known = point_depths(shared.of_matches, pool, extent.training_from_scene)
-    else:
-        return facts, None
-    return replace(facts, points=len(known.numbers)), known
+    if may_use_points(settings.components, facts) and (shared.of_model.count or has_time or settings.components.points):
+        facts = replace(facts, points=len(evidence.of_tracks.numbers))
+        if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
+            facts = replace(facts, stereo=len(evidence.of_stereo.numbers))
+    return facts
 
 
 def _camera_check(album: Album, shared: Shared, *, notify: Callable[[str], None]) -> CameraCheck | None:
@@ -232,7 +296,7 @@ def _search(
     settings: TrainSettings,
     *,
     facts: Facts,
-    known: PointDepths | None,
+    evidence: _Evidence,
     storage: PhotoStorage,
     began: float,
     notify: Callable[[str], None],
@@ -252,7 +316,7 @@ def _search(
         settings=settings,
         exif=_exif(scene),
         log_focal=log_focal,
-        known=known,
+        known=evidence.sets(with_points(requested, facts)[0]) if facts.points else [],
         colours=album.colours,
         storage=storage,
     )
@@ -262,7 +326,7 @@ def _search(
         trials,
         requested,
         facts,
-        seconds=None if budget is None else max(LEAST_SECONDS, SEARCH_SHARE * budget - took),
+        seconds=None if budget is None else max(LEAST_SECONDS, SEARCH_SHARE * budget - took + evidence.stereo_seconds),
         steps=None if steps is None else round(SEARCH_SHARE * steps),
     )
     if not selection.decisions:

@@ -1,0 +1,59 @@
+"""Space that several photos look into, and space that one photo alone does."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.field.contraction import training_points
+from nerfcli.fit.point_depth import PointDepths
+from nerfcli.photos.pool import PixelPool
+
+# Photos that have to look into a cell. One alone may fill it only behind this part of the median distance of what it
+# shows: whatever stands there looks right to that photo, and no other one contradicts.
+LEAST_PHOTOS, OWN_SPACE = 2, 1.0
+
+
+def covered_cells(pool: PixelPool, side: int, contraction: str, known: PointDepths | None) -> Tensor:
+    """Return which cells of a grid over the unit cube photos may fill.
+
+    A cell is covered where the middle lies in the view of two photos, or in that of one and at least `OWN_SPACE` of the
+    median known distance away from it. What hides it from a photo is not considered.
+
+    Args:
+        pool: the training photos.
+        side: cells per axis.
+        contraction: of the field.
+        known: pixels at known distances; without any in a photo, the median of all holds for it.
+
+    Returns:
+        (side, side, side) bool, indexed [z, y, x].
+    """
+    numbers = torch.arange(side**3)
+    place = torch.stack([numbers % side, numbers // side % side, numbers // side**2], dim=-1)
+    points = training_points((place + 0.5) / side, contraction).double().numpy()
+    nearest = _median_distances(pool, known)
+    count = np.zeros(side**3, dtype=np.int64)
+    for camera, pose, own in zip(pool.cameras, pool.poses.double().cpu().numpy(), nearest, strict=True):
+        left = np.flatnonzero(count < LEAST_PHOTOS)
+        seen = apply(inverse(pose), points[left])
+        pixels, valid = camera.project(seen)
+        inside = valid & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+        if not camera.is_spherical:
+            inside &= seen[:, 2] > 0
+        far = np.linalg.norm(seen, axis=1) >= OWN_SPACE * own
+        count[left] += np.where(inside, np.where(far, LEAST_PHOTOS, 1), 0)
+    covered = torch.from_numpy(count >= LEAST_PHOTOS).reshape(side, side, side)
+    return covered.to(pool.colours.device)
+
+
+def _median_distances(pool: PixelPool, known: PointDepths | None) -> np.ndarray:
+    """Return the median known distance of each photo; infinite where none is known at all."""
+    count = len(pool.cameras)
+    if known is None or len(known.numbers) == 0:
+        return np.full(count, np.inf)
+    photos, distances = pool.photo_of(known.numbers).cpu().numpy(), known.distances.cpu().numpy()
+    medians = np.full(count, np.median(distances))
+    for photo in np.unique(photos):
+        medians[photo] = np.median(distances[photos == photo])
+    return medians
