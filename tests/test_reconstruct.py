@@ -11,13 +11,15 @@ from scipy.ndimage import binary_erosion
 
 from nerfcli.errors import UserError
 from nerfcli.tomography.baselines import filtered_back_projection, sart_total_variation
-from nerfcli.tomography.calibrate import air_factors, centre_of_rotation, detector_tilt
+from nerfcli.tomography.calibrate import air_factors, detector_tilt
+from nerfcli.tomography.centre import centre_of
 from nerfcli.tomography.geometry import ScanGeometry, circular_cone, circular_parallel
 from nerfcli.tomography.grid import VoxelGrid, centred_grid
 from nerfcli.tomography.hash_fit import ARRAYS, fit_hash, hash_volume, new_arrays, total_variation
 from nerfcli.tomography.hash_fit import line_integrals as hash_line_integrals
 from nerfcli.tomography.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
 from nerfcli.tomography.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
+from nerfcli.tomography.quick import telling_row
 from nerfcli.tomography.reconstruct import Problem, mean_attenuation, reconstruct, start
 from nerfcli.tomography.scan import Scan, held_out_views, load_scan, save_scan
 from nerfcli.tomography.scores import resampled, score_volume
@@ -280,16 +282,16 @@ def test_centre_of_rotation_is_found(shift: float) -> None:
     told = Scan(
         geometry.shifted(-shift), "counts", scan.values, scan.open_beam, photons_per_value=scan.photons_per_value
     )
-    found = centre_of_rotation(told)
-    assert found.value == pytest.approx(shift, abs=0.15)
-    assert found.holds == (shift != 0)
+    found = centre_of(telling_row(told))
+    assert found.shift == pytest.approx(shift, abs=0.15)
+    assert found.is_off == (shift != 0)
 
 
 def test_centre_of_a_parallel_half_turn_is_found() -> None:
     geometry = circular_parallel(np.arange(90) * np.pi / 90, pixel_width=0.5, pixel_height=0.5, rows=1, columns=48)
     scan = scan_of(geometry)
     told = Scan(geometry.shifted(-2.0), "counts", scan.values, scan.open_beam, photons_per_value=20.0)
-    assert centre_of_rotation(told).value == pytest.approx(2.0, abs=0.15)
+    assert centre_of(telling_row(told)).shift == pytest.approx(2.0, abs=0.15)
 
 
 def test_tilt_of_the_detector_is_found() -> None:

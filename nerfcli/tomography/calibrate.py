@@ -1,7 +1,7 @@
-"""What of a scan's geometry and open beam the measurements themselves correct: the centre of rotation, the detector's
-tilt, and the brightness of each view.
+"""Corrections that a scan's own measurements give: the detector's tilt and the brightness of each view.
 
-Geometry is judged by prediction: a volume fitted to every second view has to explain the others.
+The tilt is judged by prediction: a volume fitted to every second view has to explain the others. See `centre` for the
+centre of rotation.
 """
 
 from collections.abc import Callable
@@ -20,12 +20,8 @@ from nerfcli.tomography.scan import Scan
 # Passes of the trial reconstructions, and the weight of their total variation.
 TRIAL_PASSES = 6
 TRIAL_STRENGTH = 0.3
-# Most views and columns of a trial: more cost time and tell the centre no better than to a tenth of a pixel.
+# Most views of a trial.
 TRIAL_VIEWS = 120
-TRIAL_COLUMNS = 320
-# The centre is looked for within this share of the detector's width on either side, in so many steps.
-CENTRE_RANGE = 0.08
-CENTRE_STEPS = 17
 TILT_RANGE = np.deg2rad(2.0)
 # Standard errors by which the views that were not fitted have to be explained better for a correction to be taken.
 SIGNIFICANT = 3.0
@@ -51,22 +47,6 @@ class Correction:
     def holds(self) -> bool:
         """Whether the views that were not fitted speak for it."""
         return self.gain > SIGNIFICANT * self.error
-
-
-def centre_of_rotation(scan: Scan) -> Correction:
-    """By how many columns the detector stands off from where the geometry says, see `ScanGeometry.shifted`.
-
-    The row next to the plane of the source is fitted as a fan or parallel beam.
-    """
-    row = _middle_row(scan.geometry)
-    one_row = scan.only_rows(row, row + 1)
-    width = scan.geometry.columns
-    binning = max(1, width // TRIAL_COLUMNS)
-
-    def misfit(shift: float) -> np.ndarray:
-        return _prediction(one_row, one_row.geometry.shifted(shift), binning=binning)
-
-    return _search(misfit, bound=CENTRE_RANGE * width, steps=CENTRE_STEPS, precise=0.05)
 
 
 def detector_tilt(scan: Scan) -> Correction:
@@ -131,14 +111,3 @@ def _prediction(scan: Scan, geometry: ScanGeometry, *, binning: int) -> np.ndarr
         projector.forward(fit.volume, every), torch.from_numpy(every)
     )
     return np.nanmean(deviance.numpy(), axis=1)
-
-
-def _middle_row(geometry: ScanGeometry) -> int:
-    """The row in the plane of the source across the axis; the middle one of a parallel beam."""
-    if geometry.beam == "parallel":
-        return geometry.rows // 2
-    straight = -geometry.centre[:, 2] + geometry.emitter[:, 2]
-    row = (geometry.rows - 1) / 2 + np.median(
-        straight / np.where(geometry.row_step[:, 2] == 0, 1, geometry.row_step[:, 2])
-    )
-    return int(np.clip(np.round(row), 0, geometry.rows - 1))

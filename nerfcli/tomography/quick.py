@@ -48,10 +48,15 @@ class Row:
         return Row(self.geometry.select(index), self.integrals[index], self.number)
 
 
-def telling_row(scan: Scan) -> Row:
-    """The row that shows most of the object; of a cone beam among those in the plane of the source."""
-    geometry = scan.geometry
-    views = np.arange(geometry.views)
+def telling_row(scan: Scan, views: np.ndarray | None = None) -> Row:
+    """The row that shows most of the object; of a cone beam among those in the plane of the source.
+
+    Args:
+        scan: the scan.
+        views: indices of those to read; all if not given.
+    """
+    views = np.arange(scan.geometry.views) if views is None else views
+    geometry = scan.geometry.select(views)
     rows = np.arange(geometry.rows)
     if geometry.beam == "cone" and geometry.rows > 1:
         middle = _row_of_source(geometry)

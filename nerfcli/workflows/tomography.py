@@ -19,12 +19,14 @@ from nerfcli.errors import UserError
 from nerfcli.exclusive import exclusive
 from nerfcli.memory import default_memory_limit
 from nerfcli.runs.files import LOCK, METRICS
-from nerfcli.tomography.calibrate import air_factors, centre_of_rotation, detector_tilt
+from nerfcli.tomography.calibrate import air_factors, detector_tilt
+from nerfcli.tomography.centre import FEWEST_VIEWS, centre_of
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid, grid_of_scan
 from nerfcli.tomography.hash_fit import fit_hash, hash_volume, new_arrays
 from nerfcli.tomography.likelihood import Poisson, likelihood_of
 from nerfcli.tomography.marks import TRUNCATED, UNSEEN, marks, marks_in_words, missing_wedge_deg
+from nerfcli.tomography.quick import telling_row
 from nerfcli.tomography.reconstruct import Fit, Problem, Projector, finer, mean_attenuation, reconstruct, start
 from nerfcli.tomography.result import (
     Reconstruction,
@@ -285,15 +287,14 @@ def _geometry(
     if earlier is not None:
         return float(earlier.used["centre"]), float(earlier.used["tilt"])
     centre, tilt = settings.centre, settings.tilt
+    if centre is None and len(scan.training_views) < FEWEST_VIEWS:
+        centre = 0.0
     if centre is None:
         progress(0.0, "centre of rotation")
-        found = centre_of_rotation(scan)
-        centre = found.value if found.holds else 0.0
-        if found.holds:
-            decisions.append(
-                f"centre of rotation: shifted by {found.value:+.2f} columns, which lowers chi-square of left-out views "
-                f"by {found.gain:.3g} ± {found.error:.2g}"
-            )
+        found = centre_of(telling_row(scan, scan.training_views).thinned())
+        centre = found.shift if found.is_off else 0.0
+        if found.is_off:
+            decisions.append(f"centre of rotation: shifted by {found.shift:+.2f} ± {found.error:.2f} columns")
     if tilt is None:
         found = detector_tilt(replace(scan, geometry=scan.geometry.shifted(centre)))
         tilt = found.value if found.holds else 0.0

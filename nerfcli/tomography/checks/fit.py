@@ -3,9 +3,9 @@
 import numpy as np
 
 from nerfcli.findings import BAD, GOOD, LOOK, Finding, verdict_above
+from nerfcli.tomography.centre import FEWEST_VIEWS, FINE, centre_of
 from nerfcli.tomography.checks.sample import Sample
 from nerfcli.tomography.formats.assemble import axis_column
-from nerfcli.tomography.hypotheses import FEWEST_VIEWS, FINE, SIGNIFICANT, centre_of, margin
 from nerfcli.tomography.quick import Row, predicted, reconstructed, telling_row
 
 CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
@@ -25,8 +25,7 @@ def centre(sample: Sample) -> Finding | str:
     stated = axis_column(scan.geometry)
     found = centre_of(row.thinned())
     column = stated - found.shift
-    certain = margin(found.errors, found.at_stated)[0] > SIGNIFICANT
-    number = abs(found.shift) if certain else 0.0
+    number = abs(found.shift) if found.is_off else 0.0
     verdict = verdict_above(number, look=CENTRE_LOOK, bad=CENTRE_BAD)
     pair = mirror_centre(row)
     by_pair = f"; the pair of opposite views says {pair:.1f}" if pair is not None else ""
