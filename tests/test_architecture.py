@@ -112,6 +112,7 @@ NOT_AT_START = (
     "torch",
     "numpy",
     "numba",
+    "triton",
     "scipy",
     "h5py",
     "cv2",

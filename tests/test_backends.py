@@ -406,6 +406,60 @@ def test_a_backend_that_is_wanted_by_name_says_what_it_does_not_work_on(device, 
         kernels.backend_for(torch.device(device), dtype, wanted="abacus")
 
 
+@pytest.fixture
+def with_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A machine with a CUDA device, by what torch says."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    caches = kernels._why_not_triton, kernels._warn_of_slow_gpu
+    for cache in caches:
+        cache.cache_clear()
+    yield
+    for cache in caches:
+        cache.cache_clear()
+
+
+def test_a_gpu_without_working_kernels_takes_the_reference_with_one_warning(with_gpu, monkeypatch, recwarn):
+    monkeypatch.setattr(kernels, "_why_not_triton", lambda index: f"no launch on {index}")
+    for name in ("cuda", "cuda:1", "cuda:1"):
+        assert kernels.backend_for(torch.device(name), torch.float32).name == "reference"
+    assert kernels.backend_for(torch.device("cuda"), torch.float64).name == "reference"  # that is what it is for
+    assert [str(w.message) for w in recwarn] == [
+        f"the GPU kernels cannot be used (no launch on {index}); using plain torch, which is many times slower"
+        for index in (0, 1)
+    ]
+    with pytest.raises(UserError, match="backend triton_cuda cannot be used: no launch on 0"):
+        kernels.backend_for(torch.device("cuda"), torch.float32, wanted="triton_cuda")
+
+
+def test_without_triton_the_reference_is_taken_with_one_warning(with_gpu, monkeypatch, recwarn):
+    monkeypatch.setitem(sys.modules, "nerfcli.kernels.triton_cuda", None)
+    names = [kernels.backend_for(torch.device("cuda"), torch.float32).name for _ in range(3)]
+    assert names == ["reference"] * 3
+    (warning,) = recwarn
+    assert "Triton does not work on this machine" in str(warning.message)
+
+
+def test_a_gpu_with_working_kernels_takes_them(with_gpu, monkeypatch):
+    pytest.importorskip("triton")
+    monkeypatch.setattr(kernels, "_why_not_triton", lambda index: None)
+    backend = kernels.backend_for(torch.device("cuda:1"), torch.float32)
+    assert (backend.name, backend.deterministic) == ("triton_cuda", False)
+    assert kernels.backend_for(CPU, torch.float32).name == "numba_cpu"
+    refusal = r"triton_cuda cannot be used: it supports float32, not bfloat16"
+    with pytest.raises(UserError, match=refusal):
+        kernels.backend_for(torch.device("cuda"), torch.bfloat16, wanted="triton_cuda")
+
+
+def test_without_a_gpu_its_kernels_are_an_error_only_where_they_are_wanted():
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    assert kernels.backend_for(torch.device("cuda"), torch.float32).name == "reference"
+    for device, reason in (("cuda", "torch finds no CUDA device"), ("cpu", "they are for CUDA devices")):
+        with pytest.raises(UserError, match=f"triton_cuda cannot be used: {reason}"):
+            kernels.backend_for(torch.device(device), torch.float32, wanted="triton_cuda")
+
+
 def test_what_repeats_bit_for_bit_says_so():
     def deterministic(backend: Backend) -> bool:
         return backend.deterministic

@@ -51,9 +51,10 @@ __all__ = [
     "ray_indices",
     "spherical_harmonics",
     "sum_along_rays",
+    "why_not_triton",
 ]
 
-BACKENDS = ("auto", "reference", "numba_cpu")
+BACKENDS = ("auto", "reference", "numba_cpu", "triton_cuda")
 
 
 def backend_for(device: torch.device, dtype: torch.dtype, *, wanted: str = "auto") -> Backend:
@@ -70,14 +71,19 @@ def backend_for(device: torch.device, dtype: torch.dtype, *, wanted: str = "auto
     """
     if wanted not in BACKENDS:
         raise ValueError(f"backend must be one of {BACKENDS}, got {wanted!r}")
-    if wanted == "auto" and (device.type != "cpu" or dtype != torch.float32):
-        return ReferenceBackend(device)
-    compiled = _numba_backend() if wanted != "reference" else None
-    if wanted == "numba_cpu":
-        refusal = "Numba does not work on this machine" if compiled is None else compiled.refuses(device, dtype)
-        if refusal is not None:
-            raise UserError(f"the backend numba_cpu cannot be used: {refusal}", "use auto or reference")
-    return compiled or ReferenceBackend(device)
+    fast, why_not = _fast_backend(device, dtype, wanted)
+    if fast is None and wanted in ("numba_cpu", "triton_cuda"):
+        raise UserError(f"the backend {wanted} cannot be used: {why_not}", "use auto or reference")
+    return fast or ReferenceBackend(device)
+
+
+def why_not_triton(device: torch.device) -> str | None:
+    """Return why the GPU kernels do not work on a CUDA device; None if they do."""
+    if device.type != "cuda":
+        return "they are for CUDA devices"
+    if not torch.cuda.is_available():
+        return "torch finds no CUDA device"
+    return _why_not_triton(device.index if device.index is not None else torch.cuda.current_device())
 
 
 def has_compiled() -> bool:
@@ -85,8 +91,16 @@ def has_compiled() -> bool:
     return _numba_cpu() is not None
 
 
-def prepare(notify: Callable[[str], None]) -> None:
-    """Compile what has to be compiled for this machine, so that no clock runs meanwhile; once per machine."""
+def prepare(notify: Callable[[str], None], device: str = "cpu") -> None:
+    """Compile what has to be compiled for a device, so that no clock runs meanwhile; once per machine."""
+    wanted = torch.device(device)
+    if backend_for(wanted, torch.float32).name == "triton_cuda":
+        from nerfcli.kernels.triton_cuda.warm_up import is_compiled, warm_up
+
+        if not is_compiled():
+            notify("compiling the GPU kernels (once per machine, about a minute)")
+        warm_up(wanted)
+        return
     numba_cpu = _numba_cpu()
     if numba_cpu is not None:
         if not numba_cpu.is_compiled():
@@ -94,12 +108,48 @@ def prepare(notify: Callable[[str], None]) -> None:
         numba_cpu.warm_up()
 
 
-def _numba_backend() -> Backend | None:
-    if _numba_cpu() is None:
-        return None
-    from nerfcli.kernels.numba_cpu.backend import NumbaBackend
+def _fast_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tuple[Backend | None, str | None]:
+    """The compiled backend for these numbers, or why there is none."""
+    if wanted == "triton_cuda" or (wanted == "auto" and device.type == "cuda" and dtype == torch.float32):
+        return _triton_backend(device, dtype, wanted)
+    if wanted == "numba_cpu" or (wanted == "auto" and device.type == "cpu" and dtype == torch.float32):
+        if _numba_cpu() is None:
+            return None, "Numba does not work on this machine"
+        from nerfcli.kernels.numba_cpu.backend import NumbaBackend
 
-    return NumbaBackend()
+        numba_backend = NumbaBackend()
+        refusal = numba_backend.refuses(device, dtype)
+        return (numba_backend, None) if refusal is None else (None, refusal)
+    return None, None
+
+
+def _triton_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tuple[Backend | None, str | None]:
+    why_not = why_not_triton(device)
+    if why_not is None and dtype == torch.float32:
+        from nerfcli.kernels.triton_cuda.backend import TritonBackend
+
+        return TritonBackend(device), None
+    if why_not is None:
+        return None, f"it supports float32, not {str(dtype).removeprefix('torch.')}"
+    if wanted == "auto" and torch.cuda.is_available():
+        _warn_of_slow_gpu(why_not)
+    return None, why_not
+
+
+@functools.cache
+def _why_not_triton(index: int) -> str | None:
+    try:
+        from nerfcli.kernels.triton_cuda import launch
+    except ImportError as error:
+        return f"Triton does not work on this machine ({error})"
+    return launch.choose_launcher(torch.device("cuda", index))
+
+
+@functools.cache
+def _warn_of_slow_gpu(reason: str) -> None:
+    warnings.warn(
+        f"the GPU kernels cannot be used ({reason}); using plain torch, which is many times slower", stacklevel=5
+    )
 
 
 @functools.cache

@@ -87,13 +87,12 @@ class ComposedBackend(abc.ABC):
     ) -> RaySums:
         samples = self._visible(rays.detached(), march, medium)
         starts, ends, offsets = samples.starts, samples.ends, samples.offsets
-        index = self.parts.ray_indices(offsets)
+        index = self.parts.ray_indices(offsets) if samples.rays is None else samples.rays
         if torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad):
             samples = samples._replace(coordinates=self._coordinates(rays, samples, march.contraction))
         if isinstance(medium, HashGrid):
             widths = _widths(rays.detached(), samples, index, medium, contraction=march.contraction)
-            encoded = self._encoded(samples, medium, widths=widths, sink=sink)
-            density, rgb = self._networks(encoded, rays.directions, index, medium)
+            density, rgb = self._radiance(samples, rays.directions, index, medium, widths=widths, sink=sink)
         else:
             density, rgb = medium.radiance(samples.coordinates, rays.directions, index, sink=sink)
         if targets.near_scaling and density.requires_grad:
@@ -115,7 +114,7 @@ class ComposedBackend(abc.ABC):
             trace("density of samples", density, index)
             trace("colour of samples", rgb, index)
             trace("weights of samples along rays", weights, index)
-        return RaySums(colour, transmittance, apart, off, offsets[-1])
+        return RaySums(colour, transmittance, apart, off, torch.tensor(len(starts)))
 
     @torch.no_grad()
     def trace_rays(
@@ -132,7 +131,7 @@ class ComposedBackend(abc.ABC):
         starts, ends, density, offsets = samples.starts, samples.ends, samples.density, samples.offsets
         lengths = ends - starts
         weights, _ = self.parts.interval_weights(density, lengths, offsets)
-        index = self.parts.ray_indices(offsets)
+        index = self.parts.ray_indices(offsets) if samples.rays is None else samples.rays
         unseen = weights <= (negligible / offsets.diff().clamp_min(1).to(weights))[index]
         seen = (~unseen).nonzero()[:, 0]
         rgb = torch.full((len(density), 3), UNSEEN, dtype=density.dtype, device=density.device)
@@ -181,6 +180,20 @@ class ComposedBackend(abc.ABC):
     @abc.abstractmethod
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         """Densities and colours of codes, seen along directions (R, 3) of rays `index` (N,)."""
+
+    def _radiance(
+        self,
+        samples: Samples,
+        directions: Tensor,
+        index: Tensor,
+        grid: HashGrid,
+        *,
+        widths: Tensor | None,
+        sink: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Densities and colours of samples, seen along directions (R, 3) of rays `index` (N,), with gradients."""
+        encoded = self._encoded(samples, grid, widths=widths, sink=sink)
+        return self._networks(encoded, directions, index, grid)
 
     def _visible(self, rays: Rays, march: March, medium: HashGrid | Medium) -> Samples:
         if isinstance(medium, HashGrid):

@@ -164,6 +164,7 @@ class Samples(NamedTuple):
         encoded: (N, L * F) what the hash grid gives there; None for another medium.
         coordinates: (N, 3) in the field's unit cube.
         offsets: (R + 1,).
+        rays: (N,) int64, the ray of each sample, where it is there already.
     """
 
     starts: Tensor
@@ -172,6 +173,7 @@ class Samples(NamedTuple):
     encoded: Tensor | None
     coordinates: Tensor
     offsets: Tensor
+    rays: Tensor | None = None
 
 
 class PixelTable(NamedTuple):

@@ -76,7 +76,7 @@ def _run_all() -> None:
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     weights = tuple(torch.zeros(shape, requires_grad=True) for shape in shapes)
     rays, along = Rays(direction, direction, jitter), March(torch.tensor([0.5, 1.0, 1.5, 2.0]), occupied, "l2", 10.0)
-    _, _, _, encoded, points, _ = visible_samples(rays, along, HashGrid(table, (2,) * 8, weights))
+    _, _, _, encoded, points, *_ = visible_samples(rays, along, HashGrid(table, (2,) * 8, weights))
     occupied_samples(rays, along)
     spans = (starts, starts + 1)
     sample_coordinates(direction, direction, *spans, offsets=offsets, contraction="l2", known=None)

@@ -24,7 +24,7 @@ class ReferenceBackend(ComposedBackend):
     def __init__(self, device: torch.device):
         self.deterministic = device.type == "cpu"
 
-    def refuses(self, device: torch.device, dtype: torch.dtype) -> None:
+    def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
         return None
 
     def hash_encode(

@@ -1,0 +1,173 @@
+"""The operations on rays by the GPU kernels: float32 fields, computed in float16 with float32 sums where it is safe.
+
+A hash grid of other sizes than those that the kernels are written for is sampled and asked by the reference, on the
+device; so are mixtures of rays, total variation and projections of scans.
+"""
+
+import weakref
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from nerfcli.kernels import reference
+from nerfcli.kernels.composition import Parts
+from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.reference.backend import ReferenceBackend
+from nerfcli.kernels.triton_cuda import hash_grid, marching, networks, operations, rays
+from nerfcli.kernels.triton_cuda.coordinates import sample_coordinates
+from nerfcli.kernels.triton_cuda.row_adam import adam_rows
+
+
+class HalfCopy:
+    """The float16 copy of a table, made again when the table was changed by others than `adam_rows`."""
+
+    def __init__(self) -> None:
+        self._of: tuple[weakref.ref[Tensor], int, int] | None = None
+        self._half = torch.empty(0)
+
+    def of(self, table: Tensor) -> Tensor:
+        """Return the copy of a table."""
+        now = (table.data_ptr(), table._version)
+        if self._of is None or self._of[0]() is not table or self._of[1:] != now:
+            self._half = table.detach().to(torch.float16).contiguous()
+            self._of = (weakref.ref(table), *now)
+        return self._half
+
+
+class TritonBackend(ReferenceBackend):
+    """`triton_cuda`, composed. Sums are atomic: the same seed gives results that differ in their last digits."""
+
+    name = "triton_cuda"
+    parts: ClassVar[Parts] = operations
+
+    def __init__(self, device: torch.device):
+        super().__init__(device)
+        self.deterministic = False
+        self._half = HalfCopy()
+        self._capacity = marching.Capacity()
+
+    def refuses(self, device: torch.device, dtype: torch.dtype) -> str | None:
+        if device.type == "cuda" and dtype == torch.float32:
+            return None
+        return f"it supports float32 on CUDA only, not {str(dtype).removeprefix('torch.')} on {device.type}"
+
+    def hash_encode(
+        self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
+    ) -> Tensor:
+        if hash_grid.can_hash_encode(table, resolutions):
+            return hash_grid.hash_encode(points, table, resolutions, sink)
+        return super().hash_encode(points, table, resolutions, sink=sink)
+
+    def adam_rows(
+        self,
+        table: Tensor,
+        gradient: Tensor,
+        first: Tensor,
+        second: Tensor,
+        *,
+        step: int,
+        rate: float,
+        betas: tuple[float, float],
+        eps: float,
+    ) -> None:
+        if table.shape[-1] != hash_grid.FEATURES:
+            super().adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
+            return
+        half = self._half.of(table)
+        adam_rows(table, gradient, first, second, half=half, step=step, rate=rate, betas=betas, eps=eps)
+
+    @torch.no_grad()
+    def density(self, coordinates: Tensor, medium: Any) -> Tensor:
+        if not (isinstance(medium, HashGrid) and _fits(medium)):
+            return super().density(coordinates, medium)
+        table = self._half.of(medium.table)
+        code = hash_grid.encode(coordinates.contiguous(), table, medium.resolutions, widths=None, dtype=torch.float16)
+        return networks.density(code, medium.layers)
+
+    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
+        if not _fits(grid):
+            return reference.visible_samples(rays, march, grid)
+        with torch.no_grad():
+            table = self._half.of(grid.table)
+            return marching.visible_samples(rays, march, grid, table=table, capacity=self._capacity)
+
+    def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
+        return sample_coordinates(
+            rays.origins,
+            rays.directions,
+            samples.starts,
+            samples.ends,
+            offsets=samples.offsets,
+            contraction=contraction,
+            known=samples.coordinates,
+        )
+
+    def _radiance(
+        self,
+        samples: Samples,
+        directions: Tensor,
+        index: Tensor,
+        grid: HashGrid,
+        *,
+        widths: Tensor | None,
+        sink: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        if not _fits(grid):
+            return super()._radiance(samples, directions, index, grid, widths=widths, sink=sink)
+        assert samples.encoded is not None
+        return _Radiance.apply(  # type: ignore[return-value]
+            samples.coordinates, directions, grid.table, self._half.of(grid.table), sink, samples.encoded, index,
+            samples.offsets, grid.resolutions, grid.view_degree, widths, *grid.layers,
+        )  # fmt: skip
+
+    def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
+        if not _fits(grid):
+            return super()._networks(encoded, directions, index, grid)
+        return networks.radiance(encoded.half(), directions.contiguous(), index, grid.layers, degree=grid.view_degree)
+
+
+class _Radiance(torch.autograd.Function):
+    """Codes, densities and colours of samples as one step: the gradient between them is float16, and scaled."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: Tensor, directions: Tensor, table: Tensor, half: Tensor, sink: Tensor | None, code: Tensor,
+        index: Tensor, offsets: Tensor, resolutions: tuple[int, ...], degree: int, widths: Tensor | None,
+        *layers: Tensor,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        directions = directions.detach().contiguous()
+        density, rgb = networks.radiance(code, directions, index, layers, degree=degree)
+        ctx.save_for_backward(points, directions, code, index, offsets, density, *layers)
+        ctx.table_shape, ctx.half, ctx.sink, ctx.widths = table.shape, half, sink, widths
+        ctx.resolutions, ctx.degree = resolutions, degree
+        return density, rgb
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        points, directions, code, index, offsets, density, *layers = ctx.saved_tensors
+        by_density, by_rgb = (gradient.contiguous() for gradient in gradients)
+        rays_learn = ctx.needs_input_grad[1]
+        by_code, scale, by_direction, of_layers = networks.radiance_gradients(
+            code, directions, index, tuple(layers), degree=ctx.degree, density=density, by_density=by_density,
+            by_rgb=by_rgb, rays_learn=rays_learn,
+        )  # fmt: skip
+        of_points = of_table = None
+        if ctx.needs_input_grad[0]:
+            of_points = hash_grid.points_gradient(
+                points, ctx.half, by_code, ctx.resolutions, scale=scale, widths=ctx.widths
+            )
+        if ctx.needs_input_grad[2]:
+            of_table = torch.zeros(ctx.table_shape, device=points.device) if ctx.sink is None else ctx.sink
+            hash_grid.add_table_gradient(of_table, points, by_code, ctx.resolutions, scale=scale, widths=ctx.widths)
+        of_directions = rays.sum_along_rays(by_direction, offsets) if rays_learn else None
+        of_table = of_table if ctx.sink is None else None
+        return of_points, of_directions, of_table, *(None,) * 8, *of_layers
+
+
+def _fits(grid: HashGrid) -> bool:
+    """Whether the kernels are written for these sizes."""
+    levels, _, features = grid.table.shape
+    return hash_grid.can_hash_encode(grid.table, grid.resolutions) and networks.can_radiance(
+        levels * features, grid.layers
+    )

@@ -1,0 +1,285 @@
+"""Compositing on a GPU: a program owns some rays, and takes some samples of each at a time, in float32.
+
+Same operations as in `reference`. Sums in front of a sample are over the samples one place before, and sums behind it
+over those one place after: nothing is ever subtracted from a sum, nor divided by a transmittance.
+"""
+
+from typing import Any
+
+import torch
+import triton.language as tl
+from torch import Tensor
+
+from nerfcli.kernels.triton_cuda.launch import jit, launch
+from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, span_of
+
+
+@jit
+def absorbed(x):
+    """1 - exp(-x) with all digits where x is small: below 1/2 its series, whose next term is 1e-8 of it."""
+    y = tl.minimum(x, 0.5)
+    series = 1.0 - y * (0.125 - y * 0.01388888888888889)
+    series = 1.0 - y * 0.16666666666666666 * (1.0 - y * 0.14285714285714285 * series)
+    series = 1.0 - y * 0.25 * (1.0 - y * 0.2 * series)
+    series = y * (1.0 - y * 0.5 * (1.0 - y * 0.3333333333333333 * series))
+    return tl.where(x < 0.5, series, 1.0 - tl.exp(-x))
+
+
+@jit
+def thickness(density, lengths, i, valid):
+    """Optical depths of samples; 0 where they are not valid."""
+    return tl.load(density + i, mask=valid, other=0.0) * tl.load(lengths + i, mask=valid, other=0.0)
+
+
+@jit
+def _depth_before(
+    density, lengths, offsets, out, rays, RAYS: tl.constexpr, STEPS: tl.constexpr
+):  # fmt: skip
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    first, last = span_of(offsets, ray, rays)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    depth = tl.zeros([RAYS], tl.float32)
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        ahead = thickness(density, lengths, i - 1, valid & (i > first[:, None]))
+        tl.store(out + i, depth[:, None] + tl.cumsum(ahead, 1), mask=valid)
+        depth += tl.sum(ahead, 1)
+
+
+@jit
+def _forward(
+    density, rgb, lengths, offsets, background, colour, transmittance, weights,
+    rays, COLOURS: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    there = ray < rays
+    first, last = span_of(offsets, ray, rays)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    depth, total = tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32)
+    red, green, blue = (tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32))
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        own = thickness(density, lengths, i, valid)
+        ahead = thickness(density, lengths, i - 1, valid & (i > first[:, None]))
+        weight = tl.exp(-(depth[:, None] + tl.cumsum(ahead, 1))) * absorbed(own)
+        tl.store(weights + i, weight, mask=valid)
+        if COLOURS:
+            red += tl.sum(weight * tl.load(rgb + i * 3, mask=valid, other=0.0), 1)
+            green += tl.sum(weight * tl.load(rgb + i * 3 + 1, mask=valid, other=0.0), 1)
+            blue += tl.sum(weight * tl.load(rgb + i * 3 + 2, mask=valid, other=0.0), 1)
+        depth += tl.sum(ahead, 1)
+        total += tl.sum(own, 1)
+    left = tl.exp(-total)
+    tl.store(transmittance + ray, left, mask=there)
+    if COLOURS:
+        red += left * tl.load(background + ray * 3, mask=there, other=0.0)
+        green += left * tl.load(background + ray * 3 + 1, mask=there, other=0.0)
+        blue += left * tl.load(background + ray * 3 + 2, mask=there, other=0.0)
+        tl.store(colour + ray * 3, red, mask=there)
+        tl.store(colour + ray * 3 + 1, green, mask=there)
+        tl.store(colour + ray * 3 + 2, blue, mask=there)
+
+
+@jit
+def _worth(rgb, by_weight, i, valid, red, green, blue):
+    """What the loss gains per unit of weight of samples."""
+    value = tl.load(by_weight + i, mask=valid, other=0.0)
+    value += red * tl.load(rgb + i * 3, mask=valid, other=0.0)
+    value += green * tl.load(rgb + i * 3 + 1, mask=valid, other=0.0)
+    return value + blue * tl.load(rgb + i * 3 + 2, mask=valid, other=0.0)
+
+
+@jit
+def _backward(
+    density, rgb, lengths, offsets, background, transmittance, weights,
+    by_colour, by_transmittance, by_weight, by_density, by_rgb, rays,
+    RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    there = ray < rays
+    first, last = span_of(offsets, ray, rays)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    red = tl.load(by_colour + ray * 3, mask=there, other=0.0)
+    green = tl.load(by_colour + ray * 3 + 1, mask=there, other=0.0)
+    blue = tl.load(by_colour + ray * 3 + 2, mask=there, other=0.0)
+    # What the loss gains per unit of light that passes: d loss / d T behind the last sample, times that T.
+    behind = tl.load(by_transmittance + ray, mask=there, other=0.0)
+    behind += red * tl.load(background + ray * 3, mask=there, other=0.0)
+    behind += green * tl.load(background + ray * 3 + 1, mask=there, other=0.0)
+    behind += blue * tl.load(background + ray * 3 + 2, mask=there, other=0.0)
+    behind *= tl.load(transmittance + ray, mask=there, other=0.0)
+    depth = tl.zeros([RAYS], tl.float32)
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        own = thickness(density, lengths, i, valid)
+        # The transmittance behind the sample, until its gradient comes.
+        tl.store(by_density + i, tl.exp(-(depth[:, None] + tl.cumsum(own, 1))), mask=valid)
+        depth += tl.sum(own, 1)
+    tl.debug_barrier()
+    blocks = tl.cdiv(longest, STEPS)
+    for block in range(blocks):
+        i = first[:, None] + (blocks - 1 - block) * STEPS + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        value = _worth(rgb, by_weight, i, valid, red[:, None], green[:, None], blue[:, None])
+        weight = tl.load(weights + i, mask=valid, other=0.0)
+        further = valid & (i + 1 < last[:, None])
+        gained = _worth(rgb, by_weight, i + 1, further, red[:, None], green[:, None], blue[:, None])
+        gained *= tl.load(weights + i + 1, mask=further, other=0.0)
+        after = behind[:, None] + tl.cumsum(gained, 1, reverse=True)
+        length = tl.load(lengths + i, mask=valid, other=0.0)
+        passing = tl.load(by_density + i, mask=valid, other=0.0)
+        tl.store(by_density + i, length * (passing * value - after), mask=valid)
+        tl.store(by_rgb + i * 3, weight * red[:, None], mask=valid)
+        tl.store(by_rgb + i * 3 + 1, weight * green[:, None], mask=valid)
+        tl.store(by_rgb + i * 3 + 2, weight * blue[:, None], mask=valid)
+        behind += tl.sum(gained, 1)
+
+
+@jit
+def _gaps(starts, ends, i, valid):
+    """Between the middles of samples and those one place before; differences first, which are exact far away."""
+    near = tl.load(starts + i, mask=valid, other=0.0) - tl.load(starts + i - 1, mask=valid, other=0.0)
+    return (near + (tl.load(ends + i, mask=valid, other=0.0) - tl.load(ends + i - 1, mask=valid, other=0.0))) * 0.5
+
+
+@jit
+def _distortion(
+    weights, starts, ends, offsets, ahead_out, out, rays, RAYS: tl.constexpr,
+    STEPS: tl.constexpr,
+):  # fmt: skip
+    """2 sum_i w_i D_i + ..., with D_i = sum_(j<i) w_j (m_i - m_j) = D_(i-1) + (m_i - m_(i-1)) sum_(j<i) w_j."""
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    first, last = span_of(offsets, ray, rays)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    mass, apart = tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32)
+    total = tl.zeros([RAYS], tl.float32)
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        later = valid & (i > first[:, None])
+        ahead = tl.load(weights + i - 1, mask=later, other=0.0)
+        gap = _gaps(starts, ends, i, later)
+        terms = gap * (mass[:, None] + tl.cumsum(ahead, 1))
+        distances = apart[:, None] + tl.cumsum(terms, 1)
+        tl.store(ahead_out + i, distances, mask=valid)
+        weight = tl.load(weights + i, mask=valid, other=0.0)
+        length = tl.load(ends + i, mask=valid, other=0.0) - tl.load(starts + i, mask=valid, other=0.0)
+        total += tl.sum(weight * (2.0 * distances + weight * length / 3.0), 1)
+        mass += tl.sum(ahead, 1)
+        apart += tl.sum(terms, 1)
+    tl.store(out + ray, total, mask=ray < rays)
+
+
+@jit
+def _distortion_backward(
+    weights, starts, ends, offsets, ahead, gradient, out, rays,
+    RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    """2 (D_i + D'_i) + ..., with D' as D from the other end."""
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    first, last = span_of(offsets, ray, rays)
+    blocks = tl.cdiv(tl.max(last - first, 0).to(tl.int32), STEPS)
+    g = tl.load(gradient + ray, mask=ray < rays, other=0.0)[:, None] * 2.0
+    mass, apart = tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32)
+    for block in range(blocks):
+        i = first[:, None] + (blocks - 1 - block) * STEPS + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        further = valid & (i + 1 < last[:, None])
+        behind = tl.load(weights + i + 1, mask=further, other=0.0)
+        gap = _gaps(starts, ends, i + 1, further)
+        terms = gap * (mass[:, None] + tl.cumsum(behind, 1, reverse=True))
+        distances = apart[:, None] + tl.cumsum(terms, 1, reverse=True)
+        distances += tl.load(ahead + i, mask=valid, other=0.0)
+        length = tl.load(ends + i, mask=valid, other=0.0) - tl.load(starts + i, mask=valid, other=0.0)
+        own = tl.load(weights + i, mask=valid, other=0.0) * length / 3.0
+        tl.store(out + i, g * (distances + own), mask=valid)
+        mass += tl.sum(behind, 1)
+        apart += tl.sum(terms, 1)
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, density: Tensor, rgb: Tensor, lengths: Tensor, offsets: Tensor, background: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        density, rgb, lengths = (x.detach().contiguous() for x in (density, rgb, lengths))
+        rays, device = len(offsets) - 1, density.device
+        background = background.detach().expand(rays, 3).contiguous()
+        colour, transmittance = torch.empty(rays, 3, device=device), torch.empty(rays, device=device)
+        weights = torch.empty_like(density)
+        launch(
+            _forward, blocks_of(rays), density, rgb, lengths, offsets, background, colour, transmittance, weights, rays,
+            COLOURS=True, RAYS=RAYS, STEPS=STEPS,
+        )  # fmt: skip
+        ctx.save_for_backward(density, rgb, lengths, offsets, background, transmittance, weights)
+        return colour, transmittance, weights
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        density, rgb = ctx.saved_tensors[:2]
+        out = torch.empty_like(density), torch.empty_like(rgb)
+        rays = len(ctx.saved_tensors[3]) - 1
+        launch(
+            _backward, blocks_of(rays), *ctx.saved_tensors, *(g.contiguous() for g in gradients), *out, rays,
+            RAYS=RAYS, STEPS=STEPS,
+        )  # fmt: skip
+        return *out, None, None, None
+
+
+class _Distortion(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+        weights, starts, ends = (x.detach().contiguous() for x in (weights, starts, ends))
+        rays = len(offsets) - 1
+        ahead, out = torch.empty_like(weights), torch.empty(rays, device=weights.device)
+        launch(
+            _distortion, blocks_of(rays), weights, starts, ends, offsets, ahead, out, rays, RAYS=RAYS, STEPS=STEPS
+        )  # fmt: skip
+        ctx.save_for_backward(weights, starts, ends, offsets, ahead)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        out = torch.empty_like(ctx.saved_tensors[0])
+        rays = len(ctx.saved_tensors[3]) - 1
+        launch(
+            _distortion_backward, blocks_of(rays), *ctx.saved_tensors, gradients[0].contiguous(), out, rays,
+            RAYS=RAYS, STEPS=STEPS,
+        )  # fmt: skip
+        return out, None, None, None
+
+
+def composite(
+    density: Tensor, rgb: Tensor, lengths: Tensor, *, offsets: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """See `reference.composite`; float32, differentiable in density and rgb."""
+    return _Composite.apply(density, rgb, lengths, offsets, background)  # type: ignore[return-value]
+
+
+def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.distortion`; float32, differentiable in the weights."""
+    return _Distortion.apply(weights, starts, ends, offsets)  # type: ignore[return-value]
+
+
+def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:
+    """See `reference.optical_depth_before`; float32, without gradients."""
+    out, rays = torch.empty_like(density), len(offsets) - 1
+    launch(
+        _depth_before, blocks_of(rays), density.detach().contiguous(), lengths.contiguous(), offsets, out, rays,
+        RAYS=RAYS, STEPS=STEPS,
+    )  # fmt: skip
+    return out
+
+
+def interval_weights(density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+    """See `reference.interval_weights`; float32, without gradients."""
+    density, rays = density.detach().contiguous(), len(offsets) - 1
+    weights, transmittance = torch.empty_like(density), torch.empty(rays, device=density.device)
+    launch(
+        _forward, blocks_of(rays), density, density, lengths.contiguous(), offsets, density, density, transmittance,
+        weights, rays, COLOURS=False, RAYS=RAYS, STEPS=STEPS,
+    )  # fmt: skip
+    return weights, transmittance

@@ -1,0 +1,122 @@
+"""Gradients of the coordinates of samples to their rays: what cameras learn from.
+
+Same operation as `reference.sample_coordinates`, of coordinates that marching has computed.
+"""
+
+from typing import Any
+
+import torch
+import triton.language as tl
+from torch import Tensor
+
+from nerfcli.kernels.contraction import CONTRACTIONS
+from nerfcli.kernels.triton_cuda.launch import jit, launch
+from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, contracted_norm, span_of
+
+
+@jit
+def _back_from_cube(x, y, z, a, b, c, CONTRACTION: tl.constexpr):
+    """The transposed Jacobian of `rays.cube` at (x, y, z), times (a, b, c).
+
+    cube(p) = s(m) p / 4 + 1/2 with s(m) = (2 - 1/m) / m and m the norm, at least 1: the Jacobian is
+    (s + s'(m) p grad(m)^T) / 4, where grad(m) is 0 inside.
+    """
+    if CONTRACTION == 0:
+        return a * 0.5, b * 0.5, c * 0.5
+    else:
+        norm = contracted_norm(x, y, z, CONTRACTION)
+        inverse = 1.0 / norm
+        scale = (2.0 - inverse) * inverse
+        # In units of the norm, as squares of what is far away would overflow.
+        u, v, w = x * inverse, y * inverse, z * inverse
+        along = 2.0 * inverse * (inverse - 1.0) * (u * a + v * b + w * c)
+        if CONTRACTION == 2:  # the gradient of the largest component is its sign
+            first = tl.abs(x) >= norm
+            second = (tl.abs(y) >= norm) & (first == 0)
+            third = (tl.abs(z) >= norm) & (first == 0) & (second == 0)
+            u = tl.where(first, tl.where(x > 0.0, 1.0, -1.0), 0.0)
+            v = tl.where(second, tl.where(y > 0.0, 1.0, -1.0), 0.0)
+            w = tl.where(third, tl.where(z > 0.0, 1.0, -1.0), 0.0)
+        return (scale * a + along * u) * 0.25, (scale * b + along * v) * 0.25, (scale * c + along * w) * 0.25
+
+
+@jit
+def _backward(
+    origins, directions, starts, ends, offsets, gradient, by_origin,
+    by_direction, rays, CONTRACTION: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    there = ray < rays
+    first, last = span_of(offsets, ray, rays)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    ox = tl.load(origins + ray * 3, mask=there, other=0.0)[:, None]
+    oy = tl.load(origins + ray * 3 + 1, mask=there, other=0.0)[:, None]
+    oz = tl.load(origins + ray * 3 + 2, mask=there, other=0.0)[:, None]
+    dx = tl.load(directions + ray * 3, mask=there, other=0.0)[:, None]
+    dy = tl.load(directions + ray * 3 + 1, mask=there, other=0.0)[:, None]
+    dz = tl.load(directions + ray * 3 + 2, mask=there, other=0.0)[:, None]
+    ax, ay, az = (tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32))
+    bx, by, bz = (tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32))
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        t = (tl.load(starts + i, mask=valid, other=0.0) + tl.load(ends + i, mask=valid, other=0.0)) * 0.5
+        a, b, c = _back_from_cube(
+            ox + dx * t, oy + dy * t, oz + dz * t,
+            tl.load(gradient + i * 3, mask=valid, other=0.0),
+            tl.load(gradient + i * 3 + 1, mask=valid, other=0.0),
+            tl.load(gradient + i * 3 + 2, mask=valid, other=0.0),
+            CONTRACTION,
+        )  # fmt: skip
+        ax += tl.sum(a, 1)
+        ay += tl.sum(b, 1)
+        az += tl.sum(c, 1)
+        bx += tl.sum(a * t, 1)
+        by += tl.sum(b * t, 1)
+        bz += tl.sum(c * t, 1)
+    tl.store(by_origin + ray * 3, ax, mask=there)
+    tl.store(by_origin + ray * 3 + 1, ay, mask=there)
+    tl.store(by_origin + ray * 3 + 2, az, mask=there)
+    tl.store(by_direction + ray * 3, bx, mask=there)
+    tl.store(by_direction + ray * 3 + 1, by, mask=there)
+    tl.store(by_direction + ray * 3 + 2, bz, mask=there)
+
+
+class _SampleCoordinates(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor, contraction: int,
+        known: Tensor,
+    ) -> Tensor:  # fmt: skip
+        ctx.save_for_backward(*(t.detach().contiguous() for t in (origins, directions, starts, ends, offsets)))
+        ctx.contraction = contraction
+        return known.view_as(known)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        origins = ctx.saved_tensors[0]
+        by_origin, by_direction = torch.empty_like(origins), torch.empty_like(origins)
+        launch(
+            _backward, blocks_of(len(origins)), *ctx.saved_tensors, gradients[0].contiguous(), by_origin, by_direction,
+            len(origins), CONTRACTION=ctx.contraction, RAYS=RAYS, STEPS=STEPS,
+        )  # fmt: skip
+        return by_origin, by_direction, None, None, None, None, None
+
+
+def sample_coordinates(
+    origins: Tensor,
+    directions: Tensor,
+    starts: Tensor,
+    ends: Tensor,
+    *,
+    offsets: Tensor,
+    contraction: str,
+    known: Tensor,
+) -> Tensor:
+    """See `reference.sample_coordinates`; float32, differentiable in origins and directions.
+
+    Args:
+        known: (N, 3), the answer, which has been computed before without gradients.
+    """
+    number = CONTRACTIONS.index(contraction)
+    return _SampleCoordinates.apply(origins, directions, starts, ends, offsets, number, known)  # type: ignore[return-value]

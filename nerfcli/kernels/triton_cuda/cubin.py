@@ -1,0 +1,145 @@
+"""Machine code of kernels: compiled by Triton with the ptxas in its package, and kept on disk.
+
+The cache is in the user's cache folder, or in NERFCLI_KERNEL_CACHE. A file is named by a digest of the sources of all
+kernels, the versions of Triton and Python, the variant and the architecture, so that nothing outdated is ever loaded.
+"""
+
+import functools
+import hashlib
+import json
+import os
+import platform
+import re
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import triton
+
+from nerfcli.atomic import atomic_path
+from nerfcli.errors import UserError
+
+if TYPE_CHECKING:
+    from nerfcli.kernels.triton_cuda.launch import Variant
+
+
+@dataclass(frozen=True)
+class Cubin:
+    """A compiled kernel.
+
+    Args:
+        name: of the entry in the machine code.
+        code: for the driver.
+        ptx: what it was assembled from.
+        formats: of the parameters, as letters of `struct`, those that Triton adds among them; these are 0.
+        warps: per program.
+        shared_bytes: dynamic shared memory per program.
+    """
+
+    name: str
+    code: bytes
+    ptx: str
+    formats: str
+    warps: int
+    shared_bytes: int
+
+
+class UnexpectedCodeError(Exception):
+    """What Triton compiled cannot be launched from here."""
+
+
+# Parameters in PTX and as letters of `struct`.
+_FORMATS = {"u64": "Q", "b64": "Q", "u32": "I", "b32": "I", "f32": "f"}
+_OF_TYPES = {"i32": "i", "i64": "q", "fp32": "f"}
+# What Triton appends: pointers to scratch memory, unused.
+_MOST_EXTRA = 3
+
+
+def compiled(variant: "Variant", capability: int) -> Cubin:
+    """Return the machine code of a variant for a compute capability such as 90, from the disk where it is there.
+
+    Raises:
+        UnexpectedCodeError: it needs something that is not passed, as this version of Triton compiles it.
+    """
+    path = folder() / f"{_digest(variant, capability)}.cubin"
+    try:
+        head, ptx, code = path.read_bytes().split(b"\0\0\0\0", 2)
+        return Cubin(code=code, ptx=ptx.decode(), **json.loads(head))
+    except (OSError, ValueError):  # not there, or damaged
+        built = compile_now(variant, capability)
+    described = {name: value for name, value in asdict(built).items() if name not in ("code", "ptx")}
+    try:
+        with atomic_path(path) as partial:
+            partial.write_bytes(b"\0\0\0\0".join([json.dumps(described).encode(), built.ptx.encode(), built.code]))
+    except UserError:  # the disk is full: it is compiled again next time
+        pass
+    return built
+
+
+def compile_now(variant: "Variant", capability: int) -> Cubin:
+    """`compiled` without the disk."""
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    constants = dict(variant.constants)
+    names = [name for name in variant.kernel.arg_names if name not in constants]
+    source = ASTSource(
+        fn=variant.kernel,
+        signature={
+            name: "constexpr" if name in constants else variant.types[names.index(name)]
+            for name in variant.kernel.arg_names
+        },
+        constexprs=constants,
+        attrs={
+            (variant.kernel.arg_names.index(names[number]),): [["tt.divisibility", 16]] for number in variant.aligned
+        },
+    )
+    options = {"num_warps": variant.warps, "num_stages": variant.stages, "enable_fp_fusion": True}
+    binary = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=options)
+    if binary.metadata.global_scratch_size or binary.metadata.profile_scratch_size:
+        raise UnexpectedCodeError("it needs scratch memory")
+    return Cubin(
+        name=binary.metadata.name,
+        code=binary.asm["cubin"],
+        ptx=binary.asm["ptx"],
+        formats=_formats(binary.asm["ptx"], variant.types),
+        warps=binary.metadata.num_warps,
+        shared_bytes=binary.metadata.shared,
+    )
+
+
+def folder() -> Path:
+    """Return the folder of the cache."""
+    chosen = os.environ.get("NERFCLI_KERNEL_CACHE")
+    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nerfcli"
+
+
+def _formats(ptx: str, types: tuple[str, ...]) -> str:
+    """The parameters of the only entry, which are the arguments and at most `_MOST_EXTRA` pointers behind them."""
+    entry = re.search(r"\.entry\s+\w+\s*\((.*?)\)", ptx, re.DOTALL)
+    found = re.findall(r"\.param\s+\.(\w+)", entry[1]) if entry else []
+    wanted = ["Q" if name.startswith("*") else _OF_TYPES[name] for name in types]
+    sizes = {"i": "I", "q": "Q"}
+    given = [_FORMATS.get(name, "?") for name in found]
+    own = [sizes.get(letter, letter) for letter in wanted]
+    extra = given[len(own) :]
+    # A float is declared as .f32 or .b32.
+    fits = all(a == b or (a, b) == ("I", "f") for a, b in zip(given, own, strict=False))
+    if not fits or len(given) < len(own) or len(extra) > _MOST_EXTRA or any(letter != "Q" for letter in extra):
+        raise UnexpectedCodeError(f"its parameters are {', '.join(found)}")
+    return "".join(wanted) + "Q" * len(extra)
+
+
+def _digest(variant: "Variant", capability: int) -> str:
+    described = (variant.kernel.__module__, variant.kernel.__name__, *variant[1:], capability)
+    return hashlib.blake2b(f"{_environment()} {described}".encode(), digest_size=20).hexdigest()
+
+
+@functools.cache
+def _environment() -> str:
+    """Digest of the sources of the kernels, and the versions."""
+    content = hashlib.blake2b(digest_size=20)
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        content.update(path.name.encode() + b"\0" + path.read_bytes())
+    return f"{content.hexdigest()} {triton.__version__} {sys.version_info[:2]} {platform.machine()}"

@@ -1,0 +1,152 @@
+"""Where the light of rays ends, on a GPU: mean, spread, heaviest interval and quantiles, in float32.
+
+Same operation as `reference.light_ends`. Mean and spread count places from that of the heaviest interval: a far, thin
+surface is narrower than its distance's last digit. Rays are gone along three times, as sums of squares would cancel.
+"""
+
+import math
+
+import torch
+import triton.language as tl
+from torch import Tensor
+
+from nerfcli.kernels.interface import LightEnds
+from nerfcli.kernels.reference.depth import SERIES_BELOW, VARIANCE_SERIES, VARIANCE_SERIES_BELOW
+from nerfcli.kernels.triton_cuda.compositing import absorbed
+from nerfcli.kernels.triton_cuda.hash_grid import device_floats
+from nerfcli.kernels.triton_cuda.launch import jit, launch
+from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, span_of
+
+THIN, VARIANCE_THIN = tl.constexpr(SERIES_BELOW), tl.constexpr(VARIANCE_SERIES_BELOW)
+# So many terms reach float32's precision at the limit.
+V0, V1, V2, V3, V4, V5 = (tl.constexpr(value) for value in VARIANCE_SERIES[:6])
+NOWHERE = tl.constexpr(2**30)
+
+
+@jit
+def _mean_fraction(x, alpha):
+    """`depth.mean_fraction` of optical depths whose opacity is alpha."""
+    y = tl.minimum(x, THIN)
+    x2 = y * y
+    series = 0.5 - y * (1 / 12 - x2 * (1 / 720 - x2 * (1 / 30240 - x2 * (1 / 1209600))))
+    thick = tl.where(x < THIN, 1.0, x)
+    return tl.where(x < THIN, series, 1.0 / thick - (1.0 - alpha) / tl.where(x < THIN, 1.0, alpha))
+
+
+@jit
+def _variance_fraction(x, alpha):
+    """`depth.variance_fraction` of optical depths whose opacity is alpha."""
+    y = tl.minimum(x, VARIANCE_THIN)
+    x2 = y * y
+    series = V0 + x2 * (V1 + x2 * (V2 + x2 * (V3 + x2 * (V4 + x2 * V5))))
+    thick = tl.where(x < VARIANCE_THIN, 1.0, x)
+    opaque = tl.where(x < VARIANCE_THIN, 1.0, alpha)
+    return tl.where(x < VARIANCE_THIN, series, 1.0 / (thick * thick) - (1.0 - alpha) / (opaque * opaque))
+
+
+@jit
+def _light_ends(
+    density, starts, ends, offsets, targets, weights, opacity, transmittance,
+    mean, spread, heaviest, largest, quantiles, rays, SHARES: tl.constexpr,
+    RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    there = ray < rays
+    first, last = span_of(offsets, ray, rays)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    depth, total, mass = (tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32), tl.zeros([RAYS], tl.float32))
+    most = tl.zeros([RAYS], tl.float32)
+    where = tl.zeros([RAYS], tl.int64)
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        later = valid & (i > first[:, None])
+        length = tl.load(ends + i, mask=valid, other=0.0) - tl.load(starts + i, mask=valid, other=0.0)
+        own = tl.load(density + i, mask=valid, other=0.0) * length
+        length = tl.load(ends + i - 1, mask=later, other=0.0) - tl.load(starts + i - 1, mask=later, other=0.0)
+        ahead = tl.load(density + i - 1, mask=later, other=0.0) * length
+        weight = tl.exp(-(depth[:, None] + tl.cumsum(ahead, 1))) * absorbed(own)
+        tl.store(weights + i, weight, mask=valid)
+        peak = tl.max(weight, 1)
+        place = tl.min(tl.where(valid & (weight == peak[:, None]), tl.arange(0, STEPS)[None, :], NOWHERE), 1)
+        where = tl.where(peak > most, first + step + place, where)
+        most = tl.maximum(most, peak)
+        depth += tl.sum(ahead, 1)
+        total += tl.sum(own, 1)
+        mass += tl.sum(weight, 1)
+    tl.debug_barrier()
+    ended = there & (most > 0.0)
+    start = tl.load(starts + where, mask=ended, other=0.0)
+    reach = tl.load(ends + where, mask=ended, other=0.0) - start
+    heavy = tl.load(density + where, mask=ended, other=0.0) * reach
+    inside = reach * _mean_fraction(heavy, absorbed(heavy))
+    mass = tl.where(ended, mass, 1.0)
+    moment = tl.zeros([RAYS], tl.float32)
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        at = tl.load(starts + i, mask=valid, other=0.0)
+        span = tl.load(ends + i, mask=valid, other=0.0) - at
+        x = tl.load(density + i, mask=valid, other=0.0) * span
+        place = (at - start[:, None]) + (span * _mean_fraction(x, absorbed(x)) - inside[:, None])
+        moment += tl.sum(tl.load(weights + i, mask=valid, other=0.0) * place, 1)
+    middle = moment / mass
+    squares = tl.zeros([RAYS], tl.float32)
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        at = tl.load(starts + i, mask=valid, other=0.0)
+        span = tl.load(ends + i, mask=valid, other=0.0) - at
+        x = tl.load(density + i, mask=valid, other=0.0) * span
+        alpha = absorbed(x)
+        off = (at - start[:, None]) + (span * _mean_fraction(x, alpha) - inside[:, None]) - middle[:, None]
+        apart = span * span * _variance_fraction(x, alpha) + off * off
+        squares += tl.sum(tl.load(weights + i, mask=valid, other=0.0) * apart, 1)
+    undefined = float("nan")
+    tl.store(opacity + ray, absorbed(total), mask=there)
+    tl.store(transmittance + ray, tl.exp(-total), mask=there)
+    tl.store(mean + ray, tl.where(ended, start + inside + middle, undefined), mask=there)
+    tl.store(spread + ray, tl.where(ended, tl.sqrt(squares / mass), undefined), mask=there)
+    tl.store(heaviest + ray, tl.where(ended, start + inside, undefined), mask=there)
+    tl.store(largest + ray, most, mask=there)
+    for share in range(SHARES):
+        target = tl.load(targets + share)
+        depth = tl.zeros([RAYS], tl.float32)
+        found = tl.zeros([RAYS], tl.int32) + NOWHERE
+        crossing = tl.zeros([RAYS], tl.float32)
+        for step in range(0, longest, STEPS):
+            i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+            valid = i < last[:, None]
+            later = valid & (i > first[:, None])
+            at = tl.load(starts + i, mask=valid, other=0.0)
+            span = tl.load(ends + i, mask=valid, other=0.0) - at
+            sigma = tl.load(density + i, mask=valid, other=0.0)
+            length = tl.load(ends + i - 1, mask=later, other=0.0) - tl.load(starts + i - 1, mask=later, other=0.0)
+            ahead = tl.load(density + i - 1, mask=later, other=0.0) * length
+            before = depth[:, None] + tl.cumsum(ahead, 1)
+            number = step + tl.arange(0, STEPS)[None, :]
+            crossed = valid & (before + sigma * span >= target)
+            place = tl.min(tl.where(crossed, number, NOWHERE), 1)
+            within = (target - before) / tl.where(sigma > 0.0, sigma, 1.0)
+            distance = at + tl.minimum(tl.maximum(within, 0.0), span)
+            chosen = tl.sum(tl.where(number == place[:, None], distance, 0.0), 1)
+            crossing = tl.where(place < found, chosen, crossing)
+            found = tl.minimum(place, found)
+            depth += tl.sum(ahead, 1)
+        tl.store(quantiles + ray * SHARES + share, tl.where(found < NOWHERE, crossing, undefined), mask=there)
+
+
+def light_ends(
+    density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, shares: tuple[float, ...]
+) -> LightEnds:
+    """See `reference.light_ends`; float32, without gradients."""
+    density, starts, ends = (x.detach().contiguous() for x in (density, starts, ends))
+    rays, device = len(offsets) - 1, density.device
+    targets = device_floats(tuple(-math.log1p(-share) for share in shares) or (0.0,), device)
+    columns = [torch.empty(rays, device=device) for _ in range(6)]
+    quantiles = torch.empty(rays, len(shares), device=device)
+    launch(
+        _light_ends, blocks_of(rays), density, starts, ends, offsets, targets, torch.empty_like(density), *columns,
+        quantiles, rays, SHARES=len(shares), RAYS=RAYS, STEPS=STEPS,
+    )  # fmt: skip
+    return LightEnds(*columns, quantiles=quantiles)

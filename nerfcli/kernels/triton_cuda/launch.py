@@ -1,0 +1,171 @@
+"""Launch of Triton kernels: compiled by Triton, loaded and started by the CUDA driver; no C compiler is needed.
+
+Triton's own launcher builds a C module once per machine, and is taken where that works and the driver does not. In
+Triton's interpreter (TRITON_INTERPRET=1, read when Triton is imported) the same kernels run on the CPU.
+"""
+
+import os
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nerfcli.kernels.triton_cuda import cubin, driver
+
+INTERPRETED = os.environ.get("TRITON_INTERPRET", "").lower() in ("1", "true", "on", "yes", "y")
+# The oldest compute capability that Triton supports.
+LEAST_CAPABILITY = (8, 0)
+# Names of types in Triton's signatures.
+TYPES = {
+    torch.float32: "fp32",
+    torch.float16: "fp16",
+    torch.int64: "i64",
+    torch.int32: "i32",
+    torch.uint8: "u8",
+}
+# Pointers that are multiples of this allow vector loads.
+ALIGNMENT = 16
+
+
+class Size(int):
+    """How much a program takes at a time: on a GPU, or in the interpreter, where a program costs as much for more."""
+
+    compiled: int
+
+    @classmethod
+    def of(cls, compiled: int, *, interpreted: int) -> "Size":
+        size = cls(interpreted if INTERPRETED else compiled)
+        size.compiled = compiled
+        return size
+
+
+class Variant(NamedTuple):
+    """What a kernel is compiled for.
+
+    Args:
+        kernel: the function under `triton.jit`.
+        types: of the arguments that are no constants, in order.
+        aligned: numbers of the pointers that are multiples of `ALIGNMENT`.
+        constants: names and values.
+        warps, stages: of Triton's options.
+    """
+
+    kernel: Any
+    types: tuple[str, ...]
+    aligned: tuple[int, ...]
+    constants: tuple[tuple[str, Any], ...]
+    warps: int
+    stages: int
+
+
+# `triton.jit`, without its types: it says that functions which only kernels may call never return.
+jit: Callable[[Callable[..., Any]], Any] = triton.jit
+
+# The variants of all launches so far, for those who want to know what to compile.
+seen: dict[Variant, None] = {}
+_loaded: dict[tuple[Variant, int], driver.Function] = {}
+_with_triton = False
+
+
+def launch(
+    kernel: Any, grid: tuple[int, ...], *arguments: Tensor | float, warps: int = 4, stages: int = 1, **constants: Any
+) -> None:
+    """Run a kernel on the device of its first tensor.
+
+    Args:
+        kernel: the function under `triton.jit`.
+        grid: number of programs along up to three axes; nothing is done where there are none.
+        arguments: those that are no constants: contiguous tensors, integers of 32 bits and floats.
+        warps, stages: of Triton's options.
+        constants: the `tl.constexpr` arguments.
+    """
+    if 0 in grid:
+        return
+    variant = variant_of(kernel, arguments, constants, warps=warps, stages=stages)
+    if INTERPRETED:
+        seen[variant] = None
+        kernel[grid](*arguments, **constants)
+        return
+    device = next(value.device for value in arguments if isinstance(value, Tensor))
+    with torch.cuda.device(device):
+        if _with_triton:
+            kernel[grid](*arguments, **constants, num_warps=warps, num_stages=stages)
+        else:
+            values = [value.data_ptr() if isinstance(value, Tensor) else value for value in arguments]
+            _function(variant, torch.cuda.current_device()).launch(
+                grid, values, torch.cuda.current_stream().cuda_stream
+            )
+
+
+def choose_launcher(device: torch.device) -> str | None:
+    """Find out by a small kernel how kernels can be launched on a device, and keep to it.
+
+    Returns:
+        None, or why they cannot be launched at all.
+    """
+    global _with_triton
+    capability = torch.cuda.get_device_capability(device)
+    if capability < LEAST_CAPABILITY:
+        return f"it has compute capability {capability[0]}.{capability[1]}, and 8.0 or newer is needed"
+    failures = []
+    for _with_triton in (False, True):
+        try:
+            if _counts(device):
+                return None
+            failures.append("wrong numbers")
+        except Exception as error:  # whatever it is, this way cannot be taken
+            failures.append(f"{type(error).__name__}: {error}".splitlines()[0])
+    return f"kernels cannot be launched by the driver ({failures[0]}), nor by Triton ({failures[1]})"
+
+
+def blocks(count: int, size: int) -> int:
+    """Return how many blocks of a size hold so many."""
+    return -(-count // size)
+
+
+def launcher() -> str:
+    """Return who launches kernels: "CUDA driver" or "Triton"."""
+    return "Triton" if _with_triton else "CUDA driver"
+
+
+def variant_of(
+    kernel: Any, arguments: tuple[Tensor | float, ...], constants: dict[str, Any], *, warps: int, stages: int
+) -> Variant:
+    """Return what a kernel has to be compiled for to take these arguments."""
+    types, aligned = [], []
+    for number, value in enumerate(arguments):
+        if isinstance(value, Tensor):
+            assert value.is_contiguous()
+            types.append(f"*{TYPES[value.dtype]}")
+            if value.data_ptr() % ALIGNMENT == 0:
+                aligned.append(number)
+        else:
+            types.append("i32" if isinstance(value, int) else "fp32")
+    fixed = tuple((name, value.compiled if isinstance(value, Size) else value) for name, value in constants.items())
+    return Variant(kernel, tuple(types), tuple(aligned), fixed, warps, stages)
+
+
+def _function(variant: Variant, device: int) -> driver.Function:
+    function = _loaded.get((variant, device))
+    if function is None:
+        major, minor = torch.cuda.get_device_capability(device)
+        built = cubin.compiled(variant, 10 * major + minor)
+        function = _loaded[variant, device] = driver.load(built, device)
+    return function
+
+
+@jit
+def _count(out, first, step, count, BLOCK: tl.constexpr):
+    i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    tl.store(out + i, first + i * step, mask=i < count)
+
+
+def _counts(device: torch.device) -> bool:
+    """Whether a small kernel does on a device what it should."""
+    out = torch.zeros(100, device=device)
+    launch(_count, (3,), out, 7, 0.5, 90, BLOCK=32)
+    expected = torch.where(torch.arange(100) < 90, 7 + 0.5 * torch.arange(100), 0.0)
+    return torch.equal(out.cpu(), expected)

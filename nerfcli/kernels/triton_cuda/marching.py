@@ -1,0 +1,225 @@
+"""The samples of rays: those in occupied cells, and those of them that light gets to, without gaps between them.
+
+Same operations as `reference.occupied_samples` and `reference.visible_samples`. Rays are marched twice: the first time
+counts, the second writes. What the host does not have yet, the number of samples, stays on the device: buffers are as
+large as those of earlier steps needed, and the one time that it waits, it learns whether they were large enough.
+"""
+
+# pyright: reportGeneralTypeIssues=false
+# `tl.static_range` can be iterated over in kernels alone.
+
+from dataclasses import dataclass
+
+import torch
+import triton.language as tl
+from torch import Tensor
+
+from nerfcli.kernels.contraction import CONTRACTIONS, sample_widths
+from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.triton_cuda import hash_grid, networks
+from nerfcli.kernels.triton_cuda.launch import INTERPRETED, blocks, jit, launch
+from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, cube, fill_ray_indices, ray_indices, span_of
+
+# Room for samples is a multiple of this, and this much larger than what was needed last.
+ROOM, SPARE = 2**6 if INTERPRETED else 2**14, 1.25
+WIDTH = networks.WIDTH
+COMPACTED = 128
+
+
+@dataclass
+class Capacity:
+    """Room for the occupied samples of a step, learned from the steps before; 0 before the first one."""
+
+    samples: int = 0
+
+    def fit(self, needed: int) -> None:
+        """Have room for so many, without shrinking for small changes."""
+        if not needed <= self.samples <= 4 * max(needed, ROOM):
+            self.samples = ROOM * blocks(int(SPARE * needed) + 1, ROOM)
+
+
+@jit
+def _march(
+    origins, directions, edges, jitter, occupied, side, intervals, offsets,
+    counts, starts, ends, coordinates, room, rays, WRITES: tl.constexpr,
+    CONTRACTION: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    there = ray < rays
+    ox = tl.load(origins + ray * 3, mask=there, other=0.0)[:, None]
+    oy = tl.load(origins + ray * 3 + 1, mask=there, other=0.0)[:, None]
+    oz = tl.load(origins + ray * 3 + 2, mask=there, other=0.0)[:, None]
+    dx = tl.load(directions + ray * 3, mask=there, other=0.0)[:, None]
+    dy = tl.load(directions + ray * 3 + 1, mask=there, other=0.0)[:, None]
+    dz = tl.load(directions + ray * 3 + 2, mask=there, other=0.0)[:, None]
+    shift = tl.load(jitter + ray, mask=there, other=0.0)[:, None]
+    scale = side.to(tl.float32)
+    found = tl.zeros([RAYS], tl.int64)
+    if WRITES:
+        found = tl.load(offsets + ray, mask=there, other=0)
+    for first in range(0, intervals, STEPS):
+        k = first + tl.arange(0, STEPS)
+        within = k < intervals
+        near = tl.load(edges + k, mask=within, other=0.0)[None, :]
+        middle = tl.load(edges + k + 1, mask=within, other=0.0)[None, :]
+        far = tl.load(edges + k + 2, mask=within, other=0.0)[None, :]
+        start, end = near + shift * (middle - near), middle + shift * (far - middle)
+        t = (start + end) * 0.5
+        x, y, z = cube(ox + dx * t, oy + dy * t, oz + dz * t, CONTRACTION)
+        inside = (x >= 0.0) & (y >= 0.0) & (z >= 0.0) & (x <= 1.0) & (y <= 1.0) & (z <= 1.0)
+        inside = inside & within[None, :] & there[:, None]
+        column = tl.minimum(tl.where(inside, x * scale, 0.0).to(tl.int32), side - 1)
+        row = tl.minimum(tl.where(inside, y * scale, 0.0).to(tl.int32), side - 1)
+        layer = tl.minimum(tl.where(inside, z * scale, 0.0).to(tl.int32), side - 1)
+        kept = inside & (tl.load(occupied + (layer * side + row) * side + column, mask=inside, other=0) != 0)
+        number = kept.to(tl.int32)
+        if WRITES:
+            place = found[:, None] + tl.cumsum(number, 1) - 1
+            fits = kept & (place < room)
+            tl.store(starts + place, start, mask=fits)
+            tl.store(ends + place, end, mask=fits)
+            tl.store(coordinates + place * 3, x, mask=fits)
+            tl.store(coordinates + place * 3 + 1, y, mask=fits)
+            tl.store(coordinates + place * 3 + 2, z, mask=fits)
+        found += tl.sum(number, 1)
+    if not WRITES:
+        tl.store(counts + ray, found, mask=there)
+
+
+@jit
+def _lit(
+    density, starts, ends, offsets, counts, deepest, room, rays,
+    RAYS: tl.constexpr, STEPS: tl.constexpr,
+):  # fmt: skip
+    """Number of samples of each ray in front of which the optical depth is below a limit: the first ones."""
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    first, last = span_of(offsets, ray, rays)
+    last = tl.minimum(last, room)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    depth = tl.zeros([RAYS], tl.float32)
+    lit = tl.zeros([RAYS], tl.int64)
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        valid = i < last[:, None]
+        # What stands in front of each: the samples one place before, so that nothing is subtracted from a sum.
+        ahead = valid & (i > first[:, None])
+        length = tl.load(ends + i - 1, mask=ahead, other=0.0) - tl.load(starts + i - 1, mask=ahead, other=0.0)
+        own = tl.load(density + i - 1, mask=ahead, other=0.0) * length
+        before = depth[:, None] + tl.cumsum(own, 1)
+        lit += tl.sum((valid & (before < deepest)).to(tl.int32), 1)
+        depth += tl.sum(own, 1)
+    tl.store(counts + ray, lit, mask=ray < rays)
+
+
+@jit
+def _compact(
+    index, wide, narrow, starts, ends, density, coordinates, code,
+    starts_out, ends_out, density_out, coordinates_out, code_out, samples,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    to = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    valid = to < samples
+    ray = tl.load(index + to, mask=valid, other=0)
+    at = to + tl.load(wide + ray, mask=valid, other=0) - tl.load(narrow + ray, mask=valid, other=0)
+    tl.store(starts_out + to, tl.load(starts + at, mask=valid), mask=valid)
+    tl.store(ends_out + to, tl.load(ends + at, mask=valid), mask=valid)
+    tl.store(density_out + to, tl.load(density + at, mask=valid), mask=valid)
+    for axis in tl.static_range(3):
+        tl.store(coordinates_out + to * 3 + axis, tl.load(coordinates + at * 3 + axis, mask=valid), mask=valid)
+    f = tl.arange(0, 32)
+    row = tl.load(code + at[:, None] * 32 + f[None, :], mask=valid[:, None])
+    tl.store(code_out + to[:, None] * 32 + f[None, :], row, mask=valid[:, None])
+
+
+def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `reference.occupied_samples`; float32."""
+    offsets = _counted(rays, along)
+    samples = int(offsets[-1])
+    return *_written(rays, along, offsets, room=samples), offsets
+
+
+def visible_samples(rays: Rays, along: March, grid: HashGrid, *, table: Tensor, capacity: Capacity) -> Samples:
+    """See `reference.visible_samples`; codes are float16.
+
+    Args:
+        table: that of the grid, in float16.
+        capacity: is kept from call to call; the host waits once where it is large enough.
+    """
+    offsets = _counted(rays, along)
+    count = len(rays.origins)
+    if capacity.samples == 0:
+        capacity.fit(int(offsets[-1]))
+    while True:
+        room = capacity.samples
+        starts, ends, coordinates = _written(rays, along, offsets, room=room)
+        needed = offsets[-1]
+        limit = needed.clamp_max(room)
+        widths = None
+        if grid.antialias and rays.cones is not None:
+            widths = _widths(rays, along, starts, ends, offsets)
+        code = hash_grid.encode(coordinates, table, grid.resolutions, widths=widths, count=limit, dtype=torch.float16)
+        density = networks.density(code, grid.layers, count=limit)
+        counts = torch.empty(count, dtype=torch.int64, device=offsets.device)
+        launch(
+            _lit, blocks_of(count), density, starts, ends, offsets, counts, float(along.max_optical_depth), room, count,
+            RAYS=RAYS, STEPS=STEPS,
+        )  # fmt: skip
+        kept = _offsets(counts)
+        candidates, samples = torch.stack([needed, kept[-1]]).tolist()  # the host waits
+        capacity.fit(candidates)
+        if candidates <= room:
+            break
+    index = ray_indices(kept, samples)
+    device = starts.device
+    lit = [torch.empty(samples, device=device) for _ in range(3)]
+    places = torch.empty(samples, 3, device=device)
+    codes = torch.empty(samples, WIDTH, dtype=torch.float16, device=device)
+    launch(
+        _compact, (blocks(samples, COMPACTED),), index, offsets, kept, starts, ends, density, coordinates, code,
+        *lit, places, codes, samples, BLOCK=COMPACTED,
+    )  # fmt: skip
+    return Samples(lit[0], lit[1], lit[2], codes, places, kept, index)
+
+
+def _counted(rays: Rays, along: March) -> Tensor:
+    """Offsets (R + 1,) of the occupied samples."""
+    counts = torch.empty(len(rays.origins), dtype=torch.int64, device=rays.origins.device)
+    _launch_march(rays, along, counts, counts, (rays.jitter, rays.jitter, rays.jitter), room=0)
+    return _offsets(counts)
+
+
+def _written(rays: Rays, along: March, offsets: Tensor, *, room: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Starts, ends and coordinates of the first `room` of the occupied samples."""
+    device = offsets.device
+    out = torch.empty(room, device=device), torch.empty(room, device=device), torch.empty(room, 3, device=device)
+    _launch_march(rays, along, offsets, None, out, room=room)
+    return out
+
+
+def _launch_march(
+    rays: Rays, along: March, offsets: Tensor, counts: Tensor | None, out: tuple[Tensor, Tensor, Tensor], *, room: int
+) -> None:
+    count = len(rays.origins)
+    launch(
+        _march, blocks_of(count), rays.origins.contiguous(), rays.directions.contiguous(), along.edges.contiguous(),
+        rays.jitter.contiguous(), along.occupied.contiguous().view(torch.uint8), along.occupied.shape[0],
+        len(along.edges) - 2, offsets, offsets if counts is None else counts, *out, room, count, WRITES=counts is None,
+        CONTRACTION=CONTRACTIONS.index(along.contraction), RAYS=RAYS, STEPS=STEPS,
+    )  # fmt: skip
+
+
+def _offsets(counts: Tensor) -> Tensor:
+    """(R + 1,) from (R,)."""
+    offsets = torch.zeros(len(counts) + 1, dtype=torch.int64, device=counts.device)
+    torch.cumsum(counts, 0, out=offsets[1:])
+    return offsets
+
+
+def _widths(rays: Rays, along: March, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
+    """Widths of pixels at samples; anything at those that are not there."""
+    assert rays.cones is not None
+    index = torch.zeros(len(starts), dtype=torch.int64, device=starts.device)
+    fill_ray_indices(offsets.clamp_max(len(starts)), index)
+    return sample_widths(
+        rays.origins, rays.directions, starts, ends, rays=index, cones=rays.cones, contraction=along.contraction
+    )

@@ -1,0 +1,266 @@
+"""Both small networks on tensor cores: float16 operands, float32 sums, all layers of a block of samples in one kernel.
+
+Same operations as `reference.density` and `reference.radiance`, with the spherical harmonics of the directions inside.
+Programs stay for many blocks, so that weights are loaded once. Nothing but the inputs is kept for the backward pass,
+which computes hidden layers again; gradients are scaled in it so that the largest one of a step is well inside float16.
+"""
+
+# pyright: reportGeneralTypeIssues=false
+# `tl.static_range` can be iterated over in kernels alone.
+
+import functools
+
+import torch
+import triton.language as tl
+from torch import Tensor
+
+from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
+from nerfcli.kernels.triton_cuda.harmonics import harmonics, harmonics_slopes
+from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
+
+# Widths that the kernels are written for: codes, hidden layers, and the outputs of the density network.
+WIDTH, HIDDEN, GEOMETRY = 32, (32, 64), 16
+BLOCK = Size.of(64, interpreted=256)
+PROGRAMS_PER_PROCESSOR = 4
+LIMIT = tl.constexpr(LOG_DENSITY_LIMIT)
+# What the largest gradient of an output becomes in float16: 2^12 below its end, 2^28 above its smallest number.
+LARGEST = tl.constexpr(16.0)
+
+
+@jit
+def _transposed(weights, OUT: tl.constexpr, IN: tl.constexpr, at: tl.constexpr, stride: tl.constexpr):
+    """(IN, OUT) in float16 of columns `at` and on of a row-major (OUT, ...) matrix."""
+    o, i = tl.arange(0, OUT), tl.arange(0, IN)
+    return tl.load(weights + at + o[None, :] * stride + i[:, None]).to(tl.float16)
+
+
+@jit
+def _colours_transposed(weights, H: tl.constexpr):
+    """(H, 16) in float16 of the matrix (3, H), with columns of zeros."""
+    o, i = tl.arange(0, 16), tl.arange(0, H)
+    return tl.load(weights + o[None, :] * H + i[:, None], mask=(o < 3)[None, :], other=0.0).to(tl.float16)
+
+
+@jit
+def _bounded_exp(g, column):
+    """Density of the first of 16 outputs."""
+    first = tl.sum(tl.where(column == 0, g, 0.0), 1)
+    return tl.exp(tl.clamp(first, -LIMIT, LIMIT, propagate_nan=tl.PropagateNan.ALL))
+
+
+@jit
+def _seen_along(directions, rays, i, valid, column, DEGREE: tl.constexpr):
+    """Harmonics (BLOCK, 16) in float16 of the directions of samples."""
+    ray = tl.load(rays + i, mask=valid, other=0)
+    x = tl.load(directions + ray * 3, mask=valid, other=0.0)[:, None]
+    y = tl.load(directions + ray * 3 + 1, mask=valid, other=0.0)[:, None]
+    z = tl.load(directions + ray * 3 + 2, mask=valid, other=0.0)[:, None]
+    return harmonics(x, y, z, column, DEGREE).to(tl.float16), x, y, z
+
+
+@jit
+def _density(
+    encoded, w1, w2, density, count, H: tl.constexpr, COUNT_ON_DEVICE: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
+    first, second = _transposed(w1, H, 32, 0, 32), _transposed(w2, 16, H, 0, H)
+    column, code = tl.arange(0, 16)[None, :], tl.arange(0, 32)
+    samples = (tl.load(count) if COUNT_ON_DEVICE else count).to(tl.int32)
+    for tile in range(tl.program_id(0), tl.cdiv(samples, BLOCK), tl.num_programs(0)):
+        i = (tile * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+        valid = i < samples
+        x = tl.load(encoded + i[:, None] * 32 + code[None, :], mask=valid[:, None], other=0.0)
+        h = tl.maximum(tl.dot(x, first), 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
+        tl.store(density + i, _bounded_exp(tl.dot(h, second), column), mask=valid)
+
+
+@jit
+def _forward(
+    encoded, directions, rays, w1, w2, c1, c2, c3, density, rgb,
+    samples, H: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    first, second = _transposed(w1, H, 32, 0, 32), _transposed(w2, 16, H, 0, H)
+    third, seen = _transposed(c1, H, 16, 0, 32), _transposed(c1, H, 16, 16, 32)
+    fourth, fifth = _transposed(c2, H, H, 0, H), _colours_transposed(c3, H)
+    column, code = tl.arange(0, 16)[None, :], tl.arange(0, 32)
+    for tile in range(tl.program_id(0), tl.cdiv(samples, BLOCK), tl.num_programs(0)):
+        i = (tile * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+        valid = i < samples
+        x = tl.load(encoded + i[:, None] * 32 + code[None, :], mask=valid[:, None], other=0.0)
+        h = tl.maximum(tl.dot(x, first), 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
+        g = tl.dot(h, second)
+        tl.store(density + i, _bounded_exp(g, column), mask=valid)
+        sh, _x, _y, _z = _seen_along(directions, rays, i, valid, column, DEGREE)
+        h = tl.dot(sh, seen, tl.dot(g.to(tl.float16), third))
+        h = tl.maximum(h, 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
+        h = tl.maximum(tl.dot(h, fourth), 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
+        out = 1.0 / (1.0 + tl.exp(-tl.dot(h, fifth)))
+        tl.store(rgb + i[:, None] * 3 + column, out, mask=valid[:, None] & (column < 3))
+
+
+@jit
+def _largest(by_density, density, by_rgb, out, samples, BLOCK: tl.constexpr):
+    """The largest gradient of a log density or a colour."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    valid = i < samples
+    thick = tl.load(by_density + i, mask=valid, other=0.0) * tl.load(density + i, mask=valid, other=0.0)
+    most = tl.abs(thick)
+    for channel in tl.static_range(3):
+        most = tl.maximum(most, tl.abs(tl.load(by_rgb + i * 3 + channel, mask=valid, other=0.0)))
+    tl.atomic_max(out, tl.max(most, 0), sem="relaxed")
+
+
+@jit
+def _backward(
+    encoded, directions, rays, w1, w2, c1, c2, c3, by_density, by_rgb,
+    largest, by_encoded, by_direction, by_w1, by_w2, by_c1, by_c2, by_c3,
+    scale_out, samples, H: tl.constexpr, DEGREE: tl.constexpr, RAYS_LEARN: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    most = tl.load(largest)
+    scale = tl.where(most > 0.0, LARGEST / most, 1.0)
+    if tl.program_id(0) == 0:
+        tl.store(scale_out, scale)
+    first, second = _transposed(w1, H, 32, 0, 32), _transposed(w2, 16, H, 0, H)
+    third, seen = _transposed(c1, H, 16, 0, 32), _transposed(c1, H, 16, 16, 32)
+    fourth, fifth = _transposed(c2, H, H, 0, H), _colours_transposed(c3, H)
+    column, code = tl.arange(0, 16)[None, :], tl.arange(0, 32)
+    d_first = tl.zeros([32, H], tl.float32)
+    d_second = tl.zeros([H, 16], tl.float32)
+    d_third = tl.zeros([16, H], tl.float32)
+    d_seen = tl.zeros([16, H], tl.float32)
+    d_fourth = tl.zeros([H, H], tl.float32)
+    d_fifth = tl.zeros([H, 16], tl.float32)
+    for tile in range(tl.program_id(0), tl.cdiv(samples, BLOCK), tl.num_programs(0)):
+        i = (tile * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+        valid = i < samples
+        x = tl.load(encoded + i[:, None] * 32 + code[None, :], mask=valid[:, None], other=0.0)
+        h1 = tl.maximum(tl.dot(x, first), 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
+        g = tl.dot(h1, second)
+        density = _bounded_exp(g, column)
+        g16 = g.to(tl.float16)
+        sh, dx, dy, dz = _seen_along(directions, rays, i, valid, column, DEGREE)
+        h2 = tl.dot(sh, seen, tl.dot(g16, third))
+        h2 = tl.maximum(h2, 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
+        h3 = tl.maximum(tl.dot(h2, fourth), 0.0, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
+        # The slope of a sigmoid without 1 - value, which ends where the value rounds to 1.
+        a = tl.exp(-tl.abs(tl.dot(h3, fifth)))
+        slope = a / ((1.0 + a) * (1.0 + a))
+        d = tl.load(by_rgb + i[:, None] * 3 + column, mask=valid[:, None] & (column < 3), other=0.0) * slope
+        d_out = (d * scale).to(tl.float16)
+        d_fifth = tl.dot(tl.trans(h3), d_out, d_fifth)
+        d = tl.where(h3 > 0, tl.dot(d_out, tl.trans(fifth)), 0.0).to(tl.float16)
+        d_fourth = tl.dot(tl.trans(h2), d, d_fourth)
+        d = tl.where(h2 > 0, tl.dot(d, tl.trans(fourth)), 0.0).to(tl.float16)
+        d_third = tl.dot(tl.trans(g16), d, d_third)
+        d_seen = tl.dot(tl.trans(sh), d, d_seen)
+        if RAYS_LEARN:
+            of_harmonics = tl.dot(d, tl.trans(seen)) / scale
+            along_x, along_y, along_z = harmonics_slopes(dx, dy, dz, column, DEGREE)
+            tl.store(by_direction + i * 3, tl.sum(of_harmonics * along_x, 1), mask=valid)
+            tl.store(by_direction + i * 3 + 1, tl.sum(of_harmonics * along_y, 1), mask=valid)
+            tl.store(by_direction + i * 3 + 2, tl.sum(of_harmonics * along_z, 1), mask=valid)
+        d_log = tl.load(by_density + i, mask=valid, other=0.0) * density * scale
+        d_g = (tl.dot(d, tl.trans(third)) + tl.where(column == 0, d_log[:, None], 0.0)).to(tl.float16)
+        d_second = tl.dot(tl.trans(h1), d_g, d_second)
+        d = tl.where(h1 > 0, tl.dot(d_g, tl.trans(second)), 0.0).to(tl.float16)
+        d_first = tl.dot(tl.trans(x), d, d_first)
+        d_x = tl.dot(d, tl.trans(first)).to(tl.float16)
+        tl.store(by_encoded + i[:, None] * 32 + code[None, :], d_x, mask=valid[:, None])
+    wide, out, unscale = tl.arange(0, H), tl.arange(0, 16), 1.0 / scale
+    tl.atomic_add(by_w1 + wide[None, :] * 32 + code[:, None], d_first * unscale, sem="relaxed")
+    tl.atomic_add(by_w2 + out[None, :] * H + wide[:, None], d_second * unscale, sem="relaxed")
+    tl.atomic_add(by_c1 + wide[None, :] * 32 + out[:, None], d_third * unscale, sem="relaxed")
+    tl.atomic_add(by_c1 + 16 + wide[None, :] * 32 + out[:, None], d_seen * unscale, sem="relaxed")
+    tl.atomic_add(by_c2 + wide[None, :] * H + wide[:, None], d_fourth * unscale, sem="relaxed")
+    tl.atomic_add(by_c3 + out[None, :] * H + wide[:, None], d_fifth * unscale, mask=(out < 3)[None, :], sem="relaxed")
+
+
+def can_radiance(code_width: int, layers: tuple[Tensor, ...]) -> bool:
+    """Return whether this module supports layers behind codes of a width; other ones go to the reference."""
+    hidden = len(layers[0])
+    shapes = ((hidden, WIDTH), (GEOMETRY, hidden), (hidden, 2 * GEOMETRY), (hidden, hidden), (3, hidden))
+    return (
+        code_width == WIDTH
+        and hidden in HIDDEN
+        and all(tuple(layer.shape) == shape for layer, shape in zip(layers, shapes, strict=False))
+    )
+
+
+def density(encoded: Tensor, layers: tuple[Tensor, ...], *, count: Tensor | None = None) -> Tensor:
+    """`reference.density` of codes (N, 32) in float16, without gradients.
+
+    Args:
+        count: () int64 on the device: how many of the codes there are; all if None. What follows is undefined.
+    """
+    out = torch.empty(len(encoded), device=encoded.device)
+    launch(
+        _density, programs(len(encoded), encoded.device), encoded, *plain(layers[:2]), out,
+        len(encoded) if count is None else count, H=len(layers[0]), COUNT_ON_DEVICE=count is not None, BLOCK=BLOCK,
+    )  # fmt: skip
+    return out
+
+
+def radiance(
+    encoded: Tensor, directions: Tensor, rays: Tensor, layers: tuple[Tensor, ...], *, degree: int
+) -> tuple[Tensor, Tensor]:
+    """`reference.radiance` of codes (N, 32) in float16 seen along directions (R, 3) of rays (N,), without gradients."""
+    density, rgb = torch.empty(len(encoded), device=encoded.device), torch.empty(len(encoded), 3, device=encoded.device)
+    launch(
+        _forward, programs(len(encoded), encoded.device), encoded, directions, rays, *plain(layers), density, rgb,
+        len(encoded), H=len(layers[0]), DEGREE=degree, BLOCK=BLOCK,
+    )  # fmt: skip
+    return density, rgb
+
+
+def radiance_gradients(
+    encoded: Tensor,
+    directions: Tensor,
+    rays: Tensor,
+    layers: tuple[Tensor, ...],
+    *,
+    degree: int,
+    density: Tensor,
+    by_density: Tensor,
+    by_rgb: Tensor,
+    rays_learn: bool,
+) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+    """Gradients of `radiance`.
+
+    Returns:
+        by codes (N, 32) float16, multiplied by the second, a scalar; by directions of samples (N, 3), or (0, 3) where
+        rays do not learn; by layers.
+    """
+    samples, device = len(encoded), encoded.device
+    sizes = [layer.numel() for layer in layers]
+    # One buffer, as each that is set to zero is a launch: the gradients of the layers, and the largest one.
+    flat = torch.zeros(sum(sizes) + 1, device=device)
+    *parts, largest = flat.split([*sizes, 1])
+    of_layers = tuple(part.view(layer.shape) for part, layer in zip(parts, layers, strict=True))
+    by_encoded = torch.empty(samples, WIDTH, dtype=torch.float16, device=device)
+    by_direction = torch.empty(samples if rays_learn else 0, 3, device=device)
+    scale = torch.empty(1, device=device)
+    launch(
+        _largest, (blocks(samples, 1024),), by_density, density, by_rgb, largest, samples, BLOCK=1024
+    )  # fmt: skip
+    launch(
+        _backward, programs(samples, device), encoded, directions, rays, *plain(layers), by_density, by_rgb, largest,
+        by_encoded, by_direction, *of_layers, scale, samples, H=len(layers[0]), DEGREE=degree, RAYS_LEARN=rays_learn,
+        BLOCK=BLOCK, warps=4 if len(layers[0]) == 32 else 8,  # half as many registers for the sums of each thread
+    )  # fmt: skip
+    return by_encoded, scale, by_direction, of_layers
+
+
+def plain(layers: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """The layers without gradients, as kernels read them."""
+    return tuple(layer.detach().contiguous() for layer in layers)
+
+
+def programs(samples: int, device: torch.device) -> tuple[int]:
+    """Grid of as many programs as the device runs at a time, or as there are blocks."""
+    return (min(blocks(samples, BLOCK), PROGRAMS_PER_PROCESSOR * processors(device)),)
+
+
+@functools.cache
+def processors(device: torch.device) -> int:
+    """Number of streaming multiprocessors; 1 in the interpreter."""
+    return torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 1

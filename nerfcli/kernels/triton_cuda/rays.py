@@ -1,0 +1,98 @@
+"""What kernels along rays have in common: a program owns some rays, and looks at some samples of each at a time."""
+
+# pyright: reportGeneralTypeIssues=false
+# `tl.static_range` can be iterated over in kernels alone.
+
+import torch
+import triton.language as tl
+from torch import Tensor
+
+from nerfcli.kernels.triton_cuda.launch import Size, blocks, jit, launch
+
+# Rays of a program, and samples of each that it looks at together.
+RAYS = Size.of(16, interpreted=64)
+STEPS = 32
+# Components above this are scaled before they are squared, and so are all norms.
+FAR = tl.constexpr(4294967296.0)
+SHRINK = tl.constexpr(2.0**-66)
+
+
+def blocks_of(rays: int) -> tuple[int]:
+    """The grid of programs that own `RAYS` rays each."""
+    return (blocks(rays, RAYS),)
+
+
+@jit
+def contracted_norm(x, y, z, CONTRACTION: tl.constexpr):
+    """The norm of the contraction, at least 1."""
+    largest = tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z))
+    if CONTRACTION == 1:
+        shrink = tl.where(largest > FAR, SHRINK, 1.0)
+        u, v, w = x * shrink, y * shrink, z * shrink
+        return tl.maximum(tl.sqrt(u * u + v * v + w * w) / shrink, 1.0)
+    else:
+        return tl.maximum(largest, 1.0)
+
+
+@jit
+def cube(x, y, z, CONTRACTION: tl.constexpr):
+    """`grid_coordinates`, with the contractions numbered as in `CONTRACTIONS`."""
+    if CONTRACTION == 0:
+        return x * 0.5 + 0.5, y * 0.5 + 0.5, z * 0.5 + 0.5
+    else:
+        norm = contracted_norm(x, y, z, CONTRACTION)
+        scale = (2.0 - 1.0 / norm) * 0.25
+        return x / norm * scale + 0.5, y / norm * scale + 0.5, z / norm * scale + 0.5
+
+
+@jit
+def span_of(offsets, ray, rays):
+    """First and last + 1 of the samples of rays (RAYS,); none for rays beyond the last."""
+    there = ray < rays
+    first = tl.load(offsets + ray, mask=there, other=0)
+    return first, tl.load(offsets + ray + 1, mask=there, other=0)
+
+
+@jit
+def _ray_indices(offsets, out, rays, RAYS: tl.constexpr, STEPS: tl.constexpr):
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    first, last = span_of(offsets, ray, rays)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    for step in range(0, longest, STEPS):
+        i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+        owner = tl.zeros([RAYS, STEPS], tl.int64) + ray[:, None]
+        tl.store(out + i, owner, mask=i < last[:, None])
+
+
+def fill_ray_indices(offsets: Tensor, out: Tensor) -> None:
+    """Write the ray of each sample of offsets (R + 1,)."""
+    rays = len(offsets) - 1
+    launch(_ray_indices, blocks_of(rays), offsets, out, rays, RAYS=RAYS, STEPS=STEPS)
+
+
+def ray_indices(offsets: Tensor, samples: int | None = None) -> Tensor:
+    """See `reference.ray_indices`; `samples` is their number, where the host has it."""
+    out = torch.empty(int(offsets[-1]) if samples is None else samples, dtype=torch.int64, device=offsets.device)
+    fill_ray_indices(offsets, out)
+    return out
+
+
+@jit
+def _sum_rows(values, offsets, out, rays, COLUMNS: tl.constexpr, RAYS: tl.constexpr, STEPS: tl.constexpr):
+    ray = tl.program_id(0) * RAYS + tl.arange(0, RAYS)
+    first, last = span_of(offsets, ray, rays)
+    longest = tl.max(last - first, 0).to(tl.int32)
+    for column in tl.static_range(COLUMNS):
+        total = tl.zeros([RAYS], tl.float32)
+        for step in range(0, longest, STEPS):
+            i = first[:, None] + step + tl.arange(0, STEPS)[None, :]
+            total += tl.sum(tl.load(values + i * COLUMNS + column, mask=i < last[:, None], other=0.0), 1)
+        tl.store(out + ray * COLUMNS + column, total, mask=ray < rays)
+
+
+def sum_along_rays(values: Tensor, offsets: Tensor) -> Tensor:
+    """`reference.sum_along_rays` of rows (N, C), without gradients."""
+    rays = len(offsets) - 1
+    out = torch.empty(rays, values.shape[1], device=values.device)
+    launch(_sum_rows, blocks_of(rays), values, offsets, out, rays, COLUMNS=values.shape[1], RAYS=RAYS, STEPS=STEPS)
+    return out

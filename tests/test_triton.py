@@ -1,0 +1,312 @@
+"""The GPU kernels without a GPU: their numbers in Triton's interpreter, their machine code, and how they are launched.
+
+Triton reads TRITON_INTERPRET when it is imported, so that what is interpreted runs in a process of its own.
+"""
+
+import ctypes
+import json
+import os
+import re
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import nullcontext
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+
+pytest.importorskip("triton", reason="Triton is for Linux")
+
+from triton.backends import nvidia
+from triton.runtime.jit import JITFunction
+
+from nerfcli.kernels.triton_cuda import cubin, driver, launch
+from nerfcli.kernels.triton_cuda.cubin import Cubin, UnexpectedCodeError, compiled
+from nerfcli.kernels.triton_cuda.launch import Variant
+
+HERE = Path(__file__).parent
+CUOBJDUMP = Path(nvidia.__file__).parent / "bin" / "cuobjdump"
+# Of an Ampere, Ada or Blackwell desktop card, in bytes per program.
+MOST_SHARED = 99 * 1024
+
+
+class Interpreted(NamedTuple):
+    """The tests of `triton_kernels` in the interpreter: exit code, output, and the variants that they launched."""
+
+    code: int
+    output: str
+    variants: list[Variant]
+
+
+@pytest.fixture(scope="module")
+def interpreted(tmp_path_factory: pytest.TempPathFactory) -> Interpreted:
+    path = tmp_path_factory.mktemp("triton") / "variants.json"
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", HERE / "triton_kernels.py"],
+        env={**os.environ, "TRITON_INTERPRET": "1", "NERFCLI_VARIANTS": str(path)},
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=HERE.parent,
+    )
+    listed = json.loads(path.read_text()) if path.is_file() else []
+    variants = [
+        Variant(
+            getattr(import_module(module), name),
+            tuple(types),
+            tuple(aligned),
+            tuple((key, value) for key, value in constants),
+            warps,
+            stages,
+        )
+        for module, name, types, aligned, constants, warps, stages in listed
+    ]
+    return Interpreted(done.returncode, done.stdout + done.stderr, variants)
+
+
+@pytest.fixture
+def kernel_cache(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep machine code from one run of the tests to the next."""
+    assert pytestconfig.cache is not None
+    folder = pytestconfig.cache.mkdir("kernels")
+    monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(folder))
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(folder / "triton"))
+
+
+def test_kernels_agree_with_the_reference_in_the_interpreter(interpreted):
+    assert interpreted.code == 0, interpreted.output
+
+
+def machine_code(path: Path) -> tuple[str, int]:
+    """Instructions of a kernel, and how many bytes of a thread's registers are spilled to memory."""
+    done = subprocess.run([CUOBJDUMP, "-res-usage", "-sass", path], capture_output=True, text=True, check=True)
+    uses = re.search(r"STACK:(\d+)", done.stdout)
+    assert uses, done.stdout[:500]
+    return done.stdout, int(uses[1])
+
+
+@pytest.mark.gpu
+def test_kernels_agree_with_the_reference_on_a_gpu():
+    """Twice: what two programs write at once may be right by chance."""
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    plain = {key: value for key, value in os.environ.items() if key != "TRITON_INTERPRET"}
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", HERE / "triton_kernels.py"]
+    for _ in range(2):
+        done = subprocess.run(command, env=plain, capture_output=True, text=True, check=False, cwd=HERE.parent)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+ALL, HOTTEST = "all", "hottest"
+
+
+@pytest.mark.parametrize(
+    ("capability", "which"),
+    [
+        *((90, ALL), (80, HOTTEST), (120, HOTTEST)),
+        *(pytest.param(capability, ALL, marks=pytest.mark.slow) for capability in (80, 120)),
+    ],
+)
+def test_kernels_compile_within_the_limits_of_each_generation(interpreted, kernel_cache, capability, which, tmp_path):
+    """What the interpreter cannot see: types, shared memory, spilled registers, vector instructions, tensor cores."""
+    assert len(interpreted.variants) > 40, interpreted.output
+    path, sizes = tmp_path / "kernel.cubin", set()
+    for variant in interpreted.variants if which == ALL else hottest(interpreted.variants):
+        built = compiled(variant, capability)
+        name, constants = variant.kernel.fn.__name__, dict(variant.constants)
+        assert built.shared_bytes <= MOST_SHARED, name
+        path.write_bytes(built.code)
+        if built.formats not in sizes:
+            # The driver refuses a launch whose buffer has another size than the parameters.
+            assert parameter_bytes(path) == struct.calcsize(f"@{built.formats}"), name
+            sizes.add(built.formats)
+        networks_backward = name == "_backward" and "H" in constants
+        if not (networks_backward or name in ("_encode", "_encode_backward", "_points_backward")):
+            continue
+        text, spilled = machine_code(path)
+        if networks_backward:  # all sums of the weights' gradients are in registers
+            assert spilled <= (160 if constants["H"] == 32 else 700)
+            assert len(re.findall(r"HGMMA|HMMA", text)) > 30
+        else:
+            assert spilled == 0, name
+        if name == "_encode_backward" and capability >= 90:
+            assert len(re.findall(r"REDG?\.E\.ADD\.F32x4", text)) == 8  # one for each corner
+        if name == "_encode":
+            width = 64 if "*fp16" in variant.types[2] else 128
+            assert len(re.findall(rf"LDG\.E\.{width}", text)) >= 8, name
+
+
+def hottest(variants: list[Variant]) -> list[Variant]:
+    """The kernels that take most of a step, once each, for networks of the default width."""
+    chosen: dict[tuple[str, str], Variant] = {}
+    for variant in variants:
+        module, name = variant.kernel.fn.__module__.rpartition(".")[2], variant.kernel.fn.__name__
+        half = name != "_encode" or "*fp16" in variant.types
+        if module in ("hash_grid", "networks") and dict(variant.constants).get("H", 32) == 32 and half:
+            chosen.setdefault((module, name), variant)
+    return list(chosen.values())
+
+
+def parameter_bytes(path: Path) -> int:
+    """Size of the parameters, by the machine code."""
+    text = subprocess.run([CUOBJDUMP, "-elf", path], capture_output=True, text=True, check=True).stdout
+    found = re.search(r"EIATTR_CBANK_PARAM_SIZE\s+Format:\s+EIFMT_HVAL\s+Value:\s+(0x[0-9a-f]+)", text)
+    assert found, text[:500]
+    return int(found[1], 16)
+
+
+class FakeDriver:
+    """The driver library: it keeps what it is called with, and fails on request."""
+
+    def __init__(self, failing: str = "", error: int = 0):
+        self.calls: list[str] = []
+        self.launches: list[dict[str, Any]] = []
+        self.failing, self.error = failing, error
+        self.formats = ""
+
+    def __getattr__(self, name: str):
+        def function(*arguments: Any) -> int:
+            self.calls.append(name)
+            if name == self.failing:
+                return self.error
+            if name == "cuLaunchKernel":
+                self.note_launch(*arguments)
+            return 0
+
+        return function
+
+    def note_launch(self, handle, x, y, z, threads, ty, tz, shared, stream, params, extra) -> None:
+        assert params is None
+        assert (extra[0], extra[2], extra[4]) == (1, 2, None)
+        size = ctypes.c_size_t.from_address(extra[3]).value
+        self.launches.append(
+            {
+                "grid": (x, y, z),
+                "threads": (threads, ty, tz),
+                "shared": shared,
+                "stream": stream.value,
+                "buffer": ctypes.string_at(extra[1], size),
+            }
+        )
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> Callable[[FakeDriver], torch.device]:
+    """Have torch say that there is a GPU, and the driver be a fake. Tensors are on the CPU."""
+
+    def install(fake: FakeDriver, capability: tuple[int, int] = (9, 0)) -> torch.device:
+        monkeypatch.setattr(driver, "library", lambda: fake)
+        monkeypatch.setattr(driver, "_of_thread", threading.local())
+        monkeypatch.setattr(launch, "_loaded", {})
+        monkeypatch.setattr(launch, "_with_triton", False)
+        monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+        monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+        monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: capability)
+        monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(cuda_stream=4711))
+        return torch.device("cpu")
+
+    return install
+
+
+def test_a_launch_gives_the_driver_what_the_kernel_expects(device, kernel_cache):
+    fake = FakeDriver()
+    device(fake)
+    out = torch.zeros(100)
+    for _ in range(2):
+        launch.launch(launch._count, (3, 2), out, 7, 0.5, 90, BLOCK=32)
+    assert fake.launches[0] == fake.launches[1]
+    seen = fake.launches[0]
+    assert (seen["grid"], seen["threads"], seen["stream"]) == ((3, 2, 1), (128, 1, 1), 4711)
+    # Pointer, 7, 0.5, 90, and the two pointers that Triton adds.
+    assert struct.unpack("@QifiQQ", seen["buffer"]) == (out.data_ptr(), 7, 0.5, 90, 0, 0)
+    # Loaded once, in the context that torch uses, which this thread may not have had.
+    once = ["cuDeviceGet", "cuDevicePrimaryCtxRetain", "cuCtxSetCurrent", "cuModuleLoadData", "cuModuleGetFunction"]
+    assert fake.calls == [*once, "cuLaunchKernel", "cuLaunchKernel"]
+
+
+def test_much_shared_memory_is_asked_for(device):
+    fake = FakeDriver()
+    device(fake)
+    built = Cubin("kernel", b"code", "", "Q", 8, 60_000)
+    driver.load(built, 0).launch((5,), [12], 0)
+    assert "cuFuncSetAttribute" in fake.calls
+    assert fake.launches[0]["shared"] == 60_000
+    assert fake.launches[0]["threads"] == (256, 1, 1)
+
+
+def test_nothing_is_launched_for_nothing(device):
+    fake = FakeDriver()
+    device(fake)
+    launch.launch(launch._count, (0,), torch.zeros(0), 7, 0.5, 0, BLOCK=32)
+    assert fake.calls == []
+
+
+def test_what_is_not_aligned_is_compiled_for_that(device, kernel_cache):
+    fake = FakeDriver()
+    device(fake)
+    launch.launch(launch._count, (1,), torch.zeros(9)[1:], 7, 0.5, 8, BLOCK=32)
+    (variant, number), *_ = launch._loaded
+    assert variant.aligned == ()
+    assert number == 1
+
+
+def test_an_error_of_the_driver_is_named(device, kernel_cache):
+    device(FakeDriver("cuLaunchKernel", 701))
+    with pytest.raises(driver.DriverError, match="cuLaunchKernel returned error 701"):
+        launch.launch(launch._count, (1,), torch.zeros(4), 7, 0.5, 4, BLOCK=32)
+
+
+def test_old_devices_are_refused(device):
+    here = device(FakeDriver(), (7, 5))
+    assert launch.choose_launcher(here) == "it has compute capability 7.5, and 8.0 or newer is needed"
+
+
+def test_a_device_on_which_neither_way_works_is_refused_with_both_reasons(device, kernel_cache, monkeypatch):
+    """Here the fake driver computes nothing, and Triton's launcher finds no driver."""
+    here = device(FakeDriver())
+    reason = launch.choose_launcher(here)
+    assert reason is not None
+    assert re.match(r"kernels cannot be launched by the driver \(wrong numbers\), nor by Triton \(.*", reason)
+    here = device(FakeDriver("cuModuleLoadData", 200))
+    assert "DriverError: cuModuleLoadData returned error 200" in str(launch.choose_launcher(here))
+
+
+def test_triton_launches_where_the_driver_cannot(device, kernel_cache, monkeypatch):
+    here = device(FakeDriver("cuLaunchKernel", 1))
+
+    def counts(self, *arguments, grid, warmup, **named):
+        out, first, step, count = arguments
+        out[:count] = first + step * torch.arange(count)
+
+    monkeypatch.setattr(JITFunction, "run", counts)
+    assert launch.choose_launcher(here) is None
+    assert launch.launcher() == "Triton"
+
+
+def test_machine_code_is_kept_on_disk_and_damage_is_noticed(monkeypatch, tmp_path):
+    monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(tmp_path))
+    variant = launch.variant_of(launch._count, (torch.zeros(4), 7, 0.5, 4), {"BLOCK": 32}, warps=4, stages=1)
+    first = compiled(variant, 90)
+    (path,) = tmp_path.glob("*.cubin")
+    monkeypatch.setattr(cubin, "compile_now", None)
+    assert compiled(variant, 90) == first
+    with pytest.raises(TypeError):  # another architecture is another file
+        compiled(variant, 80)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(TypeError):
+        compiled(variant, 90)
+
+
+@pytest.mark.parametrize(
+    "parameters", [".param .u64 a", ".param .u64 a, .param .u64 b, .param .u32 c", ".param .u32 a"]
+)
+def test_parameters_that_nobody_expects_are_refused(parameters):
+    """As a later Triton might add: then its own launcher is taken."""
+    with pytest.raises(UnexpectedCodeError, match="its parameters are"):
+        cubin._formats(f".visible .entry kernel({parameters})", ("*fp32", "i64"))

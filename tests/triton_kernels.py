@@ -1,0 +1,449 @@
+"""The GPU kernels against the reference in float64: value and gradient, on odd sizes, in every branch.
+
+`test_triton_kernels` runs this in a process of its own: in Triton's interpreter on the CPU, or on a GPU.
+"""
+
+# pyright: reportCallIssue=false
+# It does not know how many tensors `on_device` gives.
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.kernels import Backend, HashGrid, March, PixelTable, Rays, Targets, reference, spherical_harmonics
+from nerfcli.kernels.contraction import contract
+from nerfcli.kernels.triton_cuda import compositing, coordinates, depth, hash_grid, marching, networks, pixels, row_adam
+from nerfcli.kernels.triton_cuda import rays as along
+from nerfcli.kernels.triton_cuda.backend import TritonBackend
+from nerfcli.kernels.triton_cuda.launch import INTERPRETED, seen
+
+DEVICE = torch.device("cpu" if INTERPRETED else "cuda")
+SIZES = [0, 1, 5, 123]
+# Of float32, and of what passes through float16: 11 bits, and sums of such.
+SINGLE, HALF = 1e-5, 6e-3
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def assert_close(actual: Tensor | None, expected: Tensor | None, name: str, *, relative: float = SINGLE) -> None:
+    assert actual is not None, name
+    assert expected is not None, name
+    actual, expected = actual.detach().cpu().double(), expected.detach().cpu().double()
+    assert actual.shape == expected.shape, name
+    if actual.numel() == 0:
+        return
+    assert torch.isfinite(actual).all(), name
+    error = actual - expected
+    assert error.norm() <= relative * expected.norm() + 1e-30, (name, float(error.norm() / expected.norm()))
+    assert error.abs().max() <= relative * expected.abs().max() + 1e-30, name
+
+
+def on_device(*tensors: Tensor) -> Any:
+    return tuple(tensor.to(DEVICE) for tensor in tensors)
+
+
+def offsets_of(samples: int, generator: torch.Generator) -> Tensor:
+    """Rays of random sizes, empty ones among them, and one longer than what a program looks at together."""
+    cuts = torch.randint(0, samples + 1, (max(1, samples // 9),), generator=generator).sort()[0]
+    cuts = cuts[cuts <= samples // 3]
+    return torch.cat([torch.tensor([0]), cuts, torch.tensor([samples // 3, samples, samples])])
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("faded", [False, True])
+def test_hash_encode(samples, faded, generator):
+    resolutions = (4, 7, 0, 40)  # the second has as many vertices as the table has rows, the third is left out
+    table = torch.randn(4, 512, 4, generator=generator)
+    points = torch.rand(samples, 3, generator=generator) * 1.2 - 0.1  # some are clamped
+    points[::7, 0], points[1::7, 1] = 0.0, 1.0
+    gradient = torch.randn(samples, 16, generator=generator)
+    gradient[::5, 4:] = 0.0
+    widths = torch.rand(samples, generator=generator).pow(4) if faded else None
+    exact = [x.clone().requires_grad_() for x in (points, table)]
+    reference.hash_encode(exact[0], exact[1], resolutions, widths).backward(gradient)
+    fast = [x.to(DEVICE).requires_grad_() for x in (points, table)]
+    given = None if widths is None else widths.to(DEVICE)
+    encoded = hash_grid.hash_encode(fast[0], fast[1], resolutions, None, given)
+    encoded.backward(gradient.to(DEVICE))
+    assert_close(encoded, reference.hash_encode(points, table, resolutions, widths), "encoded")
+    for name, a, b in zip(("points", "table"), fast, exact, strict=True):
+        assert_close(a.grad, b.grad, name)
+    sink = torch.ones_like(fast[1].detach())
+    hash_grid.hash_encode(fast[0].detach(), fast[1], resolutions, sink, given).backward(gradient.to(DEVICE))
+    assert_close(sink - 1, exact[1].grad, "sink")
+    half = hash_grid.encode(fast[0].detach(), fast[1].detach().half(), resolutions, widths=given, dtype=torch.float16)
+    assert_close(half.float(), encoded, "float16", relative=1e-3)
+
+
+def test_hash_encode_reads_no_row_that_is_no_vertex():
+    table = torch.full((1, 512, 4), torch.nan)
+    table[0, :125] = 1.0
+    points = torch.tensor([[1.0, 1.0, 1.0], [0.0, 1.0, 0.5], [7.0, -3.0, 1.0]])
+    encoded = hash_grid.hash_encode(*on_device(points, table), (4,))
+    assert torch.equal(encoded.cpu(), torch.ones(3, 4))
+
+
+def layers_of(hidden: int, generator: torch.Generator) -> list[Tensor]:
+    shapes = ((hidden, 32), (16, hidden), (hidden, 32), (hidden, hidden), (3, hidden))
+    # Rounded to float16, in which the kernels read them.
+    return [(torch.randn(s, generator=generator) * s[1] ** -0.5).half().float() for s in shapes]
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize(("hidden", "degree"), [(32, 3), (64, 1)])
+def test_networks(samples, hidden, degree, generator):
+    layers = layers_of(hidden, generator)
+    code = torch.randn(samples, 32, generator=generator).half()
+    directions = torch.nn.functional.normalize(torch.randn(9, 3, generator=generator), dim=-1)
+    rays = torch.randint(9, (samples,), generator=generator).sort()[0]
+    by_density, by_rgb = torch.randn(samples, generator=generator), torch.randn(samples, 3, generator=generator)
+    by_density, by_rgb = by_density * 1e-7, by_rgb * 1e-6  # as of a mean over many rays
+    inputs = [x.double().requires_grad_() for x in (code, directions[rays], *layers)]
+    each = torch.arange(samples)
+    exact = reference.radiance(inputs[0], spherical_harmonics(inputs[1], degree), each, tuple(inputs[2:]))
+    ((exact[0] * by_density).sum() + (exact[1] * by_rgb).sum()).backward()
+    given = on_device(code, directions, rays)
+    weights = on_device(*layers)
+    density, rgb = networks.radiance(*given, weights, degree=degree)
+    assert_close(density, exact[0], "density", relative=HALF)
+    assert_close(networks.density(given[0], weights), exact[0], "density alone", relative=HALF)
+    assert_close(rgb, exact[1], "rgb", relative=HALF)
+    by_code, scale, by_direction, of_layers = networks.radiance_gradients(
+        *given, weights, degree=degree, density=density, by_density=by_density.to(DEVICE), by_rgb=by_rgb.to(DEVICE),
+        rays_learn=True,
+    )  # fmt: skip
+    found = (by_code.float() / scale, by_direction, *of_layers)
+    names = ("code", "directions", *(f"layer {i}" for i in range(5)))
+    for name, a, b in zip(names, found, inputs, strict=True):
+        assert_close(a, b.grad if samples else torch.zeros_like(b), name, relative=4 * HALF)
+
+
+def test_densities_end_where_their_logarithms_do():
+    layers = [torch.zeros(s) for s in ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))]
+    layers[0][0, 0], layers[0][1, 0], layers[1][0, 0], layers[1][0, 1] = 1.0, -1.0, 1.0, -1.0
+    code = torch.zeros(5, 32)
+    code[:, 0] = torch.tensor([-60.0, -16.0, 16.0, 60.0, torch.nan])
+    found = networks.density(code.half().to(DEVICE), on_device(*layers)).cpu()
+    wanted = torch.tensor([-15.0, -15.0, 15.0, 15.0, torch.nan]).exp()
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=0, equal_nan=True)
+
+
+def rays_and_march(count: int, contraction: str, generator: torch.Generator) -> tuple[Rays, March]:
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    origins = -1.5 * directions + 0.3 * torch.randn(count, 3, generator=generator)
+    jitter, cones = torch.rand(count, generator=generator), 0.05 * torch.rand(count, generator=generator)
+    occupied = torch.rand(8, 8, 8, generator=generator) > 0.4
+    edges = torch.linspace(0.3, 4.0, 44)
+    return Rays(*on_device(origins, directions, jitter, cones)), March(*on_device(edges, occupied), contraction, 7.0)
+
+
+def exactly(rays: Rays, march: March) -> tuple[Rays, March]:
+    """The same in float64 on the CPU."""
+    plain = Rays(*(None if x is None else x.detach().cpu().double() for x in rays))  # type: ignore[arg-type]
+    return plain, march._replace(edges=march.edges.cpu().double(), occupied=march.occupied.cpu())
+
+
+@pytest.mark.parametrize(
+    ("count", "contraction"), [(0, "l2"), (1, "l2"), (5, "linf"), (5, "none"), (123, "l2"), (123, "linf")]
+)
+def test_occupied_samples(count, contraction, generator):
+    given = rays_and_march(count, contraction, generator)
+    fast, exact = marching.occupied_samples(*given), reference.occupied_samples(*exactly(*given))
+    assert torch.equal(fast[3].cpu(), exact[3])
+    for name, a, b in zip(("starts", "ends", "coordinates"), fast, exact, strict=False):
+        assert_close(a, b, name)
+    index = along.ray_indices(fast[3])
+    assert torch.equal(index.cpu(), reference.ray_indices(exact[3]))
+    values = torch.randn(len(index), 3, generator=generator)
+    assert_close(
+        along.sum_along_rays(values.to(DEVICE), fast[3]), reference.sum_along_rays(values.double(), exact[3]), "sums"
+    )
+
+
+@pytest.mark.parametrize(("count", "room", "faded"), [(0, 0, False), (1, 0, True), (5, 1, True), (60, 2000, False)])
+def test_visible_samples(count, room, faded, generator):
+    """With no, too little and too much room for candidates."""
+    rays, march = rays_and_march(count, "l2", generator)
+    table = (0.7 * torch.randn(8, 64, 4, generator=generator)).half().float()
+    layers = tuple(layers_of(32, generator))
+    march = march._replace(max_optical_depth=1.0)
+    grid = HashGrid(table, (4, 5, 6, 7, 8, 9, 10, 11), layers, antialias=faded)
+    exact = reference.visible_samples(
+        *exactly(rays, march), grid._replace(table=table.double(), layers=tuple(x.double() for x in layers))
+    )
+    capacity = marching.Capacity(room)
+    fast = marching.visible_samples(
+        rays, march, grid._replace(layers=on_device(*layers)), table=table.half().to(DEVICE), capacity=capacity
+    )
+    assert torch.equal(fast.offsets.cpu(), exact.offsets)  # none is kept by one alone for these seeds
+    assert fast.rays is not None
+    assert torch.equal(fast.rays.cpu(), reference.ray_indices(exact.offsets))
+    assert exact.encoded is not None
+    assert fast.encoded is not None
+    for name, relative in (("starts", SINGLE), ("ends", SINGLE), ("coordinates", SINGLE), ("encoded", HALF)):
+        assert_close(getattr(fast, name).float(), getattr(exact, name), name, relative=relative)
+    assert_close(fast.density, exact.density, "density", relative=HALF)
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
+@pytest.mark.parametrize("reach", [1e-3, 2.0, 1e12])
+def test_sample_coordinates(samples, contraction, reach, generator):
+    offsets = offsets_of(samples, generator)
+    rays = len(offsets) - 1
+    origins, directions = torch.randn(2, rays, 3, generator=generator)
+    starts = torch.rand(samples, generator=generator) * reach
+    ends = starts + 0.1 * reach
+    gradient = torch.randn(samples, 3, generator=generator)
+    exact = [x.double().requires_grad_() for x in (origins, directions)]
+    known = reference.sample_coordinates(
+        *exact, starts.double(), ends.double(), offsets=offsets, contraction=contraction
+    )
+    known.backward(gradient.double())
+    fast = [x.to(DEVICE).requires_grad_() for x in (origins, directions)]
+    found = coordinates.sample_coordinates(
+        *fast, *on_device(starts, ends), offsets=offsets.to(DEVICE), contraction=contraction,
+        known=known.detach().float().to(DEVICE),
+    )  # fmt: skip
+    found.backward(gradient.to(DEVICE))
+    for name, a, b in zip(("origins", "directions"), fast, exact, strict=True):
+        assert_close(a.grad, b.grad, name, relative=2e-5)
+
+
+def samples_along(
+    samples: int, magnitude: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Density, colours, starts, ends and offsets; a sample here and there is a million times as dense."""
+    offsets = offsets_of(samples, generator)
+    density = torch.rand(samples, generator=generator) * magnitude
+    density[3::11] *= 1e6
+    starts = torch.arange(samples) * 0.11 + 0.05 * torch.rand(samples, generator=generator)
+    ends = starts + 0.05 * torch.rand(samples, generator=generator)
+    return density, torch.rand(samples, 3, generator=generator), starts, ends, offsets
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("magnitude", [1e-6, 1.0, 100.0])
+def test_composite(samples, magnitude, generator):
+    density, rgb, starts, ends, offsets = samples_along(samples, magnitude, generator)
+    lengths, rays = ends - starts, len(offsets) - 1
+    background = torch.rand(rays, 3, generator=generator)
+    given = [torch.randn(s, generator=generator) for s in ((rays, 3), (rays,), (samples,))]
+
+    def run(function, dtype, device):
+        inputs = [x.to(device, dtype).clone().requires_grad_() for x in (density, rgb)]
+        out = function(
+            *inputs, lengths.to(device, dtype), offsets=offsets.to(device), background=background.to(device, dtype)
+        )
+        torch.stack([(a * b.to(device, dtype)).sum() for a, b in zip(out, given, strict=True)]).sum().backward()
+        return *out, *(x.grad for x in inputs)
+
+    cpu = torch.device("cpu")
+    fast, exact = run(compositing.composite, torch.float32, DEVICE), run(reference.composite, torch.float64, cpu)
+    for name, a, b in zip(("colour", "transmittance", "weights", "by density", "by rgb"), fast, exact, strict=True):
+        assert_close(a, b, name)
+    plain = [x.double() for x in (density, lengths)]
+    here = on_device(density, lengths, offsets)
+    assert_close(compositing.optical_depth_before(*here), reference.optical_depth_before(*plain, offsets), "before")
+    for name, a, b in zip(
+        ("weights", "passing"),
+        compositing.interval_weights(*here), reference.interval_weights(*plain, offsets), strict=True,
+    ):  # fmt: skip
+        assert_close(a, b, name)
+
+
+def test_small_opacities_keep_their_digits():
+    density = torch.logspace(-10, 1, 60)
+    offsets = torch.arange(61)
+    weights, passing = compositing.interval_weights(*on_device(density, torch.ones(60), offsets))
+    torch.testing.assert_close(weights.cpu().double(), -torch.expm1(-density.double()), rtol=1e-6, atol=0)
+    torch.testing.assert_close(passing.cpu().double(), (-density.double()).exp(), rtol=4e-6, atol=0)
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("far", [0.0, 1e4])
+def test_distortion(samples, far, generator):
+    """Also far away, where differences of sums of weighted distances would have no digits left."""
+    density, _, starts, ends, offsets = samples_along(samples, 1.0, generator)
+    starts, ends = starts + far, ends + far
+    weights = reference.interval_weights(density, (ends - starts), offsets)[0]
+    gradient = torch.randn(len(offsets) - 1, generator=generator)
+    exact, fast = weights.double().requires_grad_(), weights.to(DEVICE).requires_grad_()
+    wanted = reference.distortion(exact, starts.double(), ends.double(), offsets)
+    found = compositing.distortion(fast, *on_device(starts, ends, offsets))
+    wanted.backward(gradient.double())
+    found.backward(gradient.to(DEVICE))
+    assert_close(found, wanted, "distortion")
+    assert_close(fast.grad, exact.grad, "gradient")
+
+
+@pytest.mark.parametrize("samples", SIZES)
+@pytest.mark.parametrize("magnitude", [0.01, 3.0, 100.0])
+@pytest.mark.parametrize("shares", [(), (0.9, 0.1, 0.5)])
+def test_light_ends(samples, magnitude, shares, generator):
+    density, _, starts, ends, offsets = samples_along(samples, magnitude, generator)
+    if samples == 123:
+        density[60:90] = 0.0
+    exact = reference.light_ends(*(x.double() for x in (density, starts, ends)), offsets=offsets, shares=shares)
+    fast = depth.light_ends(*on_device(density, starts, ends), offsets=offsets.to(DEVICE), shares=shares)
+    for name in exact._fields:
+        torch.testing.assert_close(
+            getattr(fast, name).cpu().double(), getattr(exact, name), rtol=2e-5, atol=1e-7, equal_nan=True,
+            msg=lambda text, name=name: f"{name} {text}",
+        )  # fmt: skip
+
+
+def test_a_far_thin_surface_has_its_spread():
+    """1e-4 wide at a distance of 1000, where float32 counts in steps of 6e-5."""
+    starts = torch.tensor([1000.0, 1000.25])
+    ends, density = starts + 0.25, torch.tensor([1e4, 1.0])
+    found = depth.light_ends(
+        *on_device(
+            density,
+            starts,
+            ends,
+        ),
+        offsets=torch.tensor([0, 2]).to(DEVICE),
+        shares=(),
+    )
+    torch.testing.assert_close(found.spread.cpu(), torch.tensor([1e-4]), rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("rows", SIZES)
+def test_adam_rows(rows, generator):
+    """Also of rows of which one feature alone has a gradient, or none."""
+    start = [torch.randn(1, rows, 4, generator=generator) for _ in range(4)]
+    start[3].square_()
+    start[1][:, 1::3] = 0.0
+    start[1][:, 2::5, 1:] = 0.0
+    named = {"step": 3, "rate": 1e-2, "betas": (0.9, 0.99), "eps": 1e-15}
+    exact, fast = [x.double() for x in start], [x.clone().to(DEVICE) for x in start]
+    half = fast[0].half()
+    reference.adam_rows(*exact, **named)
+    row_adam.adam_rows(*fast, half=half, **named)
+    for name, a, b in zip(("table", "gradient", "first", "second"), fast, exact, strict=True):
+        assert_close(a, b, name)
+    assert torch.equal(half, fast[0].half())
+
+
+@pytest.mark.parametrize("count", SIZES)
+@pytest.mark.parametrize(("photos", "channels"), [(1, 3), (5, 4)])
+def test_pixel_rays(count, photos, channels, generator):
+    first = torch.arange(photos) * 12
+    bearings, poses = torch.randn(24, 3, generator=generator), torch.randn(photos, 4, 4, generator=generator)
+    colours = torch.randint(256, (photos * 12, channels), generator=generator, dtype=torch.uint8)
+    table = PixelTable(first, torch.arange(photos) % 2 * 12, bearings, poses, colours)
+    chosen = torch.randint(photos * 12, (count,), generator=generator)
+    found = pixels.pixel_rays(chosen.to(DEVICE), PixelTable(*on_device(*table)))
+    wanted = reference.pixel_rays(chosen, table)
+    for name, a, b in zip(("origins", "directions", "colours"), found, wanted, strict=True):
+        assert_close(a, b, name)
+
+
+def whole(
+    backend: Backend, dtype: torch.dtype, count: int, *, hidden: int, targets: Targets, with_sink: bool
+) -> dict[str, Tensor]:
+    """What a training gets of some rays, and the gradients of a random weighting of it."""
+    g = torch.Generator().manual_seed(3)
+    device = DEVICE if dtype == torch.float32 else torch.device("cpu")
+    rays, march = rays_and_march(count, "l2", g)
+    if dtype == torch.float64:
+        rays, march = exactly(rays, march)
+    rays = rays._replace(origins=rays.origins.requires_grad_(), directions=rays.directions.requires_grad_())
+    table = (0.5 * torch.randn(8, 256, 4, generator=g)).half().to(device, dtype).requires_grad_()
+    layers = tuple(x.to(device, dtype).requires_grad_() for x in layers_of(hidden, g))
+    resolutions = tuple(round(4 * 1.22**level) for level in range(8))
+    background = torch.rand(count, 3, generator=g).to(device, dtype)
+    sink = torch.zeros_like(table, requires_grad=False) if with_sink else None
+    seen = backend.render_rays(
+        rays, march, HashGrid(table, resolutions, layers, 3, with_sink), targets, background=background, sink=sink
+    )
+    total = sum((x * torch.randn(x.shape, generator=g).to(device, dtype)).sum() for x in seen[:4])
+    assert isinstance(total, Tensor)
+    total.backward()
+    gradients = {"by origins": rays.origins.grad, "by directions": rays.directions.grad}
+    gradients |= {f"by layer {i}": layer.grad for i, layer in enumerate(layers)}
+    gradients["by table"] = table.grad if sink is None else sink
+    assert (table.grad is None) == with_sink
+    return {**seen._asdict(), **{name: value for name, value in gradients.items() if value is not None}}
+
+
+@pytest.mark.parametrize(("count", "with_sink"), [(0, False), (1, True), (5, False), (23, True)])
+def test_a_training_gets_what_the_reference_gives_in_float64(count, with_sink):
+    """Colours, distortion and gradients of rays, layers and rows, with and without a sink and fading levels."""
+    given = {"hidden": 64 if with_sink else 32, "targets": Targets(True, True), "with_sink": with_sink}
+    exact = whole(kernels.backend_for(torch.device("cpu"), torch.float64), torch.float64, count, **given)
+    fast = whole(TritonBackend(DEVICE), torch.float32, count, **given)
+    assert int(fast["samples"]) == int(exact["samples"])
+    assert fast.keys() == exact.keys()
+    for name, value in fast.items():
+        if name != "samples":
+            assert_close(value, exact[name], name, relative=5 * HALF)
+
+
+def test_a_picture_is_what_the_reference_gives_in_float64(generator):
+    rays, march = rays_and_march(23, "l2", generator)
+    table = (0.5 * torch.randn(8, 256, 4, generator=generator)).half().float()
+    layers = layers_of(32, generator)
+    resolutions = tuple(round(4 * 1.22**level) for level in range(8))
+    background = torch.tensor([0.25, 0.5, 1.0])
+    named = {"shares": (0.25, 0.5), "negligible": 1e-3}
+    fast = TritonBackend(DEVICE).trace_rays(
+        rays,
+        march,
+        HashGrid(table.to(DEVICE), resolutions, on_device(*layers)),
+        background=background.to(DEVICE),
+        **named,
+    )
+    exact = kernels.backend_for(torch.device("cpu"), torch.float64).trace_rays(
+        *exactly(rays, march), HashGrid(table.double(), resolutions, tuple(x.double() for x in layers)),
+        background=background.double(), **named,
+    )  # fmt: skip
+    assert torch.equal(fast.intervals.offsets.cpu(), exact.intervals.offsets)
+    assert_close(fast.rgb, exact.rgb, "rgb", relative=HALF)
+    for name in ("opacity", "transmittance", "mean", "quantiles"):
+        defined = getattr(exact.ends, name).isfinite()
+        assert torch.equal(getattr(fast.ends, name).cpu().isfinite(), defined), name
+        assert_close(getattr(fast.ends, name).cpu()[defined], getattr(exact.ends, name)[defined], name, relative=HALF)
+
+
+def test_the_half_copy_follows_the_table(generator):
+    """After a step of Adam, which writes it, and after a change by others, such as a checkpoint that is read."""
+    backend = TritonBackend(DEVICE)
+    table = torch.randn(1, 16, 4, generator=generator).to(DEVICE)
+    gradient, first, second = torch.ones_like(table), torch.zeros_like(table), torch.zeros_like(table)
+    backend.adam_rows(table, gradient, first, second, step=1, rate=0.1, betas=(0.9, 0.99), eps=1e-15)
+    assert torch.equal(backend._half.of(table), table.half())
+    with torch.no_grad():
+        table.copy_(torch.zeros_like(table))
+    assert torch.equal(backend._half.of(table), table.half())
+
+
+def test_far_points_contract_as_in_the_reference(generator):
+    """Up to where squares would overflow."""
+    points = torch.randn(40, 3, generator=generator) * torch.logspace(-3, 36, 40)[:, None]
+    rays = Rays(*on_device(points, torch.zeros(40, 3), torch.zeros(40)))
+    march = March(*on_device(torch.tensor([0.0, 1.0, 2.0]), torch.ones(2, 2, 2, dtype=torch.bool)), "l2", 1.0)
+    found = marching.occupied_samples(rays, march)[2]
+    assert_close(found, contract(points.double()) / 4 + 0.5, "coordinates")
+    assert math.isfinite(float(found.sum()))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _variants() -> Iterator[None]:
+    """Write what has been launched into a file, for the test that compiles it."""
+    yield
+    if path := os.environ.get("NERFCLI_VARIANTS"):
+        listed = [(variant.kernel.fn.__module__, variant.kernel.fn.__name__, *variant[1:]) for variant in seen]
+        Path(path).write_text(json.dumps(listed))
