@@ -9,7 +9,7 @@ from PIL import Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.photos.held_out_exposure import gains_between, log_gains_of
+from nerfcli.photos.held_out_exposure import exif_slope, gains_between, log_gains_of
 from nerfcli.render.model import load_model
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
@@ -35,6 +35,25 @@ def test_gains_of_chance_are_told_to_be_the_mean(seed):
     gains = np.random.default_rng(seed).normal(size=(60, 3))
     places = np.arange(60) * 2
     assert np.array_equal(gains_between(places, gains - gains.mean(0), np.array([1, 7, 119])), np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("slope", [0.6, 1.0])
+def test_gains_follow_exif_as_far_as_the_tone_curve_lets_them(slope):
+    rng = np.random.default_rng(0)
+    exif = rng.permutation(np.linspace(-1, 1, 12))
+    gains = slope * exif[:, None] + 0.3 + rng.normal(0, 0.02, (12, 3))
+    assert exif_slope(np.arange(12), gains, exif) == pytest.approx(slope, abs=0.03)
+    unknown = np.append(exif, np.nan)
+    assert exif_slope(np.arange(13), np.append(gains, [[5.0] * 3], axis=0), unknown) == pytest.approx(slope, abs=0.03)
+
+
+def test_exif_that_tells_less_than_neighbours_or_the_mean_is_not_followed():
+    places, rng = np.arange(40), np.random.default_rng(1)
+    exif = rng.normal(size=40)
+    assert exif_slope(places, rng.normal(size=(40, 3)), exif) == 0.0
+    assert exif_slope(places, drifting(places.astype(float)), exif) == 0.0
+    assert exif_slope(places, drifting(places.astype(float)), np.zeros(40)) == 0.0
+    assert exif_slope(places[:2], np.ones((2, 3)), exif[:2]) == 1.0  # nothing to judge by
 
 
 def test_two_photos_tell_nothing_and_nobody_may_ask():
@@ -79,9 +98,13 @@ def test_what_exif_tells_of_a_held_out_photo_goes_before_its_neighbours(monkeypa
         "nerfcli.photos.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
     )
     told = {"a": (9.0, 9.0, 9.0), "b": (0.1, 0.2, 0.3)}
-    model = SimpleNamespace(log_exposure=1.0, exposures=told)
+    model = SimpleNamespace(log_exposure=1.0, exif_slope=1.0, exposures=told)
     assert log_gains_of(frames, model).tolist() == [[0.5] * 3, [0.1, 0.2, 0.3], [0.0] * 3]  # type: ignore[arg-type]
-    model = SimpleNamespace(log_exposure=None, exposures=told)
+    model.exif_slope = 0.6
+    assert log_gains_of(frames, model).tolist()[:2] == [[pytest.approx(0.3)] * 3, [0.1, 0.2, 0.3]]  # type: ignore[arg-type]
+    model.exif_slope = 0.0
+    assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
+    model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures=told)
     assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
 
 

@@ -79,7 +79,7 @@ def is_held_out(name: str, capture: Path) -> bool:
 CASES = {
     "default": ("default", Components()),
     "auto": ("auto", Components()),
-    "stereo": ("default", Components(points=0.1, stereo=True, overlap=True)),
+    "stereo": ("default", Components(points=0.1, stereo=True, exposure="learned")),
     "exposures": ("default", Components(exposure="learned", masks="empty")),
 }
 

@@ -34,8 +34,8 @@ from nerfcli.search.selection import (
     proposals,
     removals,
     select,
+    with_evidence,
     with_known_cameras,
-    with_points,
 )
 from nerfcli.search.trials import Trial, TrialStart
 
@@ -528,19 +528,31 @@ def test_what_is_supported_must_not_lose_more_than_its_error():
         assert decision.kept == kept  # mean m and distance d of two seeds: m > -d / 2
 
 
-def test_depths_of_stereo_matching_come_with_points_and_as_the_user_says():
+def test_depths_of_stereo_matching_come_with_evidence_and_as_the_user_says():
     facts = replace(FITTED, points=900, stereo=80_000)
     both = Components(points=0.1, stereo=True)
-    assert with_points(Components(), facts)[0] == both
-    assert [decision.why for decision in with_points(Components(), facts)[1]] == [
+    assert with_evidence(Components(), facts)[0] == both
+    assert [decision.why for decision in with_evidence(Components(), facts)[1]] == [
         "900 pixels see a 3D point at a known distance",
         "several photos agree on the depth of 80000 pixels",
     ]
-    assert with_points(Components(), replace(facts, stereo=0))[0] == Components(points=0.1)
-    assert with_points(Components(points=0.3), replace(facts, fixed=("points",)))[0] == replace(both, points=0.3)
-    assert with_points(Components(), replace(facts, fixed=("points",)))[0] == Components()
-    assert with_points(Components(), replace(facts, fixed=("stereo",)))[0] == Components(points=0.1)
+    assert with_evidence(Components(), replace(facts, stereo=0))[0] == Components(points=0.1)
+    assert with_evidence(Components(points=0.3), replace(facts, fixed=("points",)))[0] == replace(both, points=0.3)
+    assert with_evidence(Components(), replace(facts, fixed=("points",)))[0] == Components()
+    assert with_evidence(Components(), replace(facts, fixed=("stereo",)))[0] == Components(points=0.1)
     assert may_use_stereo(Components(), facts, has_time=True)
     assert not may_use_stereo(Components(), facts, has_time=False)
     assert not may_use_stereo(Components(), replace(facts, points=0), has_time=True)
     assert may_use_stereo(Components(stereo=True), replace(facts, fixed=("stereo",)), has_time=False)
+
+
+def test_a_sky_and_exposures_are_kept_on_evidence():
+    facts = replace(FITTED, points=900, stereo=80_000, sky_share=0.2, exposure_spread=0.26)
+    both = Components(points=0.1, stereo=True)
+    assert with_evidence(Components(), facts)[0] == replace(both, exposure="learned", background="sphere")
+    assert with_evidence(Components(), facts)[1][2].why == "photos differ in brightness by 30 % at the same points"
+    assert with_evidence(Components(), replace(facts, sky_share=0.02, exposure_spread=0.1))[0] == both
+    fixed = replace(facts, fixed=("background", "exposure"))
+    assert with_evidence(Components(exposure="exif"), fixed)[0] == replace(both, exposure="exif")
+    # Behind an object that is cut out, there is nothing.
+    assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()

@@ -23,6 +23,8 @@ DETAIL_DELAY, DETAIL_SLOPE = 0.125, 0.875
 SATURATED = 254.5 / 255
 # A ray that meets less than this has no colour of its own to speak of.
 LEAST_OPACITY = 1e-3
+# Levels of a background that a sigmoid reaches.
+LEAST_LEVEL = 0.02
 
 
 class Appearance(nn.Module):
@@ -58,6 +60,14 @@ class Appearance(nn.Module):
         self.cameras = None if components.cameras == "fixed" else Refinement(components.cameras, pool, log_focal)
         self.is_random = kind == "random" or (kind == "auto" and pool.has_alpha)
         self._pool = pool
+
+    @torch.no_grad()
+    def begin_background(self, colours: Tensor) -> None:
+        """Give all directions of a learned background the median of colours (N, 3) uint8: where no photo looks, it
+        stays."""
+        if self.background is not None and len(colours):
+            median = (colours.float().median(0).values / 255.0).clamp(LEAST_LEVEL, 1.0 - LEAST_LEVEL)
+            self.background.logits.add_(torch.logit(median)[:, None, None, None])
 
     def groups(self) -> list[dict[str, Any]]:
         """What is to be optimised, with its learning rate as a multiple of the field's."""

@@ -35,6 +35,8 @@ DEEPEST = 7.0
 # Rays pass over cells where a step takes away less light than this: hardly any at first, when all of space is thin fog
 # and nothing tells yet where the surfaces are; then ever more, so that surfaces have to become compact.
 FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
+# Weight of the light that ends before the sky where this is seen.
+SKY_WEIGHT = 0.1
 # Both beginnings are over at these shares of the budget at the latest, however few the steps.
 WARMUP_SHARE, CLOSING_SHARE = 0.1, 0.3
 # Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
@@ -66,6 +68,7 @@ class Fitting:
         points: pixels whose distance is known.
         error_map: where the error is, if pixels are drawn by it.
         covered: the cells that may be filled, see `coverage.covered_cells`; None for all.
+        sky: (pixels,) bool, those of the pool that show a sky that is learned; None where none are known.
         size: of the field; else `sizes.chosen_size` gives one for the settings and the pool.
     """
 
@@ -82,6 +85,7 @@ class Fitting:
         points: PointRays | None = None,
         error_map: ErrorMap | None = None,
         covered: Tensor | None = None,
+        sky: Tensor | None = None,
         size: FieldSettings | None = None,
     ):
         device = pool.colours.device
@@ -114,6 +118,9 @@ class Fitting:
         self._cameras_from = cameras_from
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.covered = covered
+        self._sky = sky if self.parts.background is not None else None
+        if self._sky is not None:
+            self.parts.begin_background(pool.colours[self._sky])
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
@@ -211,6 +218,9 @@ class Fitting:
             loss = loss + components.entropy * opacity_entropy(seen.transmittance)
         if len(drawn.distances):
             loss = loss + components.points * fading(fraction) * point_depth_loss(seen.off_target, drawn.trust)
+        if self._sky is not None:
+            opacity = (1.0 - seen.transmittance) * self._sky[drawn.numbers]
+            loss = loss + SKY_WEIGHT * opacity.sum() / max(1, count)
         watch.rows("rendered colour", seen.rgb, torch.arange(count, device=device))
         watch.values("loss", loss)
         return loss, losses.detach(), int(seen.samples)

@@ -1,6 +1,6 @@
 """Exposures of held-out photos, without using their pixels: from EXIF, or from photos taken before and after."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,24 +21,56 @@ def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray)
         log_gains: (P, 3) theirs.
         wanted: (T,) places of other photos.
     """
-    count = len(places)
-    if count < 3:
+    if len(places) < 3:
         return np.zeros((len(wanted), 3))
-    others = [np.arange(count) != left for left in range(count)]
-    told = np.array([_interpolated(places[o], log_gains[o], places[~o])[0] for o in others])
-    mean = np.array([log_gains[o].mean(0) for o in others])
-    if np.square(told - log_gains).sum() >= np.square(mean - log_gains).sum():
+    told = _left_out(lambda o: _interpolated(places[o], log_gains[o], places[~o])[0], log_gains)
+    if told >= _left_out(lambda o: log_gains[o].mean(0), log_gains):
         return np.zeros((len(wanted), 3))
     return _interpolated(places, log_gains, wanted)
+
+
+def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> float:
+    """Return the factor, from 0 to 1, by which gains of photos follow the exposures that EXIF tells.
+
+    Tone curves make it smaller than 1. It is 0 where the mean of other photos, or the photos before and after, tell the
+    gains of a photo that is left out better, by squared differences.
+
+    Args:
+        places, log_gains: see `gains_between`.
+        exif: (P,) logarithms of exposures; where these are not known, the photo takes no part.
+    """
+    known = np.isfinite(exif)
+    places, log_gains, exif = places[known], log_gains[known], exif[known]
+    if len(places) < 3:
+        return 1.0
+    proportional = _left_out(
+        lambda o: log_gains[o].mean(0) + _slope(exif[o], log_gains[o]) * (exif[~o] - exif[o].mean()), log_gains
+    )
+    between = _left_out(lambda o: _interpolated(places[o], log_gains[o], places[~o])[0], log_gains)
+    mean = _left_out(lambda o: log_gains[o].mean(0), log_gains)
+    return _slope(exif, log_gains) if proportional < min(between, mean) else 0.0
+
+
+def _slope(exif: np.ndarray, log_gains: np.ndarray) -> float:
+    """Return that of the straight line that fits gains (P, 3) best, one for all channels, kept from 0 to 1."""
+    off = exif - exif.mean()
+    squares = 3.0 * float(np.square(off).sum())
+    return float(np.clip((off[:, None] * log_gains).sum() / squares, 0.0, 1.0)) if squares > 0 else 0.0
+
+
+def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray) -> float:
+    """Return the sum of squared errors of predictions of each photo's gains from the others, (P,) bool."""
+    others = [np.arange(len(log_gains)) != left for left in range(len(log_gains))]
+    return float(sum(np.square(predict(o) - log_gains[~o][0]).sum() for o in others))
 
 
 def log_gains_of(frames: Sequence[Frame], model: Model) -> np.ndarray:
     """(N, 3) logarithms of the gains of photos relative to the pictures of a model, as EXIF tells them; where it does
     not, as the training does; else 0."""
-    if model.log_exposure is None:
+    if model.log_exposure is None or model.exif_slope == 0.0:
         by_exif = np.full(len(frames), np.nan)
     else:
-        by_exif = log_exposures(frames) - model.log_exposure
+        by_exif = model.exif_slope * (log_exposures(frames) - model.log_exposure)
     by_training = np.array([model.exposures.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
     return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None], by_training)
 

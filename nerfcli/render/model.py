@@ -56,6 +56,7 @@ class Model:
         unit_source: how a metre is known; None where nobody wrote it down.
         log_exposure: the mean of the training photos by EXIF, if the model knows photos of different exposures; see
             `photos.exif_exposure`.
+        exif_slope: by how much gains follow the exposures that EXIF tells, see `held_out_exposure.exif_slope`.
         exposures: of held-out photos by name, logarithms of their gains (3,) as training tells them where EXIF
             does not; see `photos.held_out_exposure`.
         sha256: of the file that it was read from.
@@ -69,6 +70,7 @@ class Model:
     unit: str
     unit_source: str | None = None
     log_exposure: float | None = None
+    exif_slope: float = 1.0
     exposures: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     sha256: str | None = None
 
@@ -100,6 +102,7 @@ def save_model(path: Path, model: Model) -> None:
         "unit": model.unit,
         "unit_source": model.unit_source,
         "log_exposure": model.log_exposure,
+        "exif_slope": model.exif_slope,
         "exposures": {name: list(gains) for name, gains in model.exposures.items()},
     }
     save_tensors(path, tensors, description)
@@ -135,6 +138,7 @@ def load_model(path: Path, device: str) -> Model:
         unit=description["unit"],
         unit_source=description.get("unit_source"),
         log_exposure=description.get("log_exposure"),
+        exif_slope=description.get("exif_slope", 1.0),
         exposures={name: tuple(gains) for name, gains in description.get("exposures", {}).items()},
         sha256=hashlib.sha256(content).hexdigest(),
     )

@@ -34,6 +34,9 @@ LEAST_EXPOSURE_SPREAD, LIKELY_EXPOSURE_SPREAD = 0.06, 0.11
 # A sky that fills less of the pixels is as well painted on the field. Measured 14 to 26 % where there is one,
 # 0 to 3 % on most real captures, after 120 to 500 steps. A larger share speaks for a sky, whatever the trial says.
 LEAST_FAR_SHARE, LIKELY_FAR_SHARE = 0.01, 0.1
+# A larger share of pixels that look like a sky are one: measured 24 and 11 % where there is one, at most 1.4 % on six
+# captures without.
+LEAST_SKY_SHARE = 0.03
 # Directions tell the colours of a sky so much better than one colour does: measured 7.0 to 10.2 dB before a sky, 0.0 to
 # 0.8 on surfaces that a coarse field has put far away. Or they tell them well: an overcast sky has one colour.
 LEAST_SKY_DB, LEAST_SKY_PSNR = 1.0, 22.0
@@ -61,6 +64,8 @@ class Facts:
         cameras: what matched features say of them; None where nothing is known.
         points: how many pixels see a point whose distance is known.
         stereo: how many pixels have a depth by stereo matching.
+        sky_share: of the pixels, those that look like a sky, see `multiview.sky`.
+        exposure_spread: standard deviation of the photos' brightness at points that they share, in logarithms of light.
         fixed: components that the user has decided on.
     """
 
@@ -71,6 +76,8 @@ class Facts:
     cameras: CameraCheck | None = None
     points: int = 0
     stereo: int = 0
+    sky_share: float = 0.0
+    exposure_spread: float = 0.0
     fixed: tuple[str, ...] = ()
 
 
@@ -132,18 +139,25 @@ def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bo
     return requested.stereo if "stereo" in facts.fixed else has_time and facts.points > 0
 
 
-def with_points(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
-    """The model whose rays end at the points that photos share, where that is not decided; and the decision about it.
+def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
+    """The model with what photos tell before any training, where that is not decided; and the decisions about it.
 
-    It is in the model from the first step on: later, light has ended elsewhere already, and points change little.
+    Rays end at the points that photos share and not before the sky, and photos have the exposures that shared pixels
+    tell. All of it is in the model from the first step on: later, light has ended elsewhere already.
     """
-    if facts.points == 0 or not may_use_points(requested, facts):
-        return requested, []
     wanted: list[tuple[Change, str]] = []
-    if "points" not in facts.fixed:
+    if facts.points and may_use_points(requested, facts):
         wanted.append((("points", CHOICES["points"].on), f"{facts.points} pixels see a 3D point at a known distance"))
-    if "stereo" not in facts.fixed and facts.stereo:
-        wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
+        if facts.stereo:
+            wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
+        if facts.exposure_spread > LIKELY_EXPOSURE_SPREAD:
+            per_cent = 100.0 * math.expm1(facts.exposure_spread)
+            reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"
+            wanted.append((("exposure", "learned"), reason))
+    if facts.sky_share > LEAST_SKY_SHARE and not facts.has_alpha:
+        reason = f"{100.0 * facts.sky_share:.0f} % of the pixels look like a sky: plain, and alike in all photos"
+        wanted.append((("background", "sphere"), reason))
+    wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]
     model = replace(requested, **dict(change for change, _ in wanted))
     return model, [untried(*change, reason, kept=True) for change, reason in wanted]
 
@@ -158,7 +172,7 @@ def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list
     """
     candidates: list[Change] = []
     declined: list[Decision] = []
-    if facts.has_exif:
+    if facts.has_exif and start.exposure == "none":
         candidates.append(("exposure", "exif"))
     if signs.exposure_spread > LEAST_EXPOSURE_SPREAD:
         candidates.append(("exposure", "learned"))
@@ -263,7 +277,7 @@ def select(
     """
     budget = SearchBudget(seconds, steps)
     first_steps = MOST_START_STEPS if seconds is not None else round(START_SHARE * (steps or 0))
-    model, decided = with_points(requested, facts)
+    model, decided = with_evidence(requested, facts)
     start = trials.begin(
         _without_poses(model),
         steps=min(first_steps, MOST_START_STEPS),
@@ -287,5 +301,6 @@ def select(
     race = Race(trials, start, budget, _without_poses(model))
     race.run(candidates, removals(model, facts), rules(candidates, start.signs, facts))
     chosen = replace(model, **dict(race.kept))
-    gains = race.log_gains if chosen.exposure == "learned" else None
+    is_found = chosen.exposure == "learned" and model.exposure != "learned"
+    gains = race.log_gains if is_found else None
     return Selection(chosen, (*decided, *race.decisions.values(), *declined), budget.spent, gains)

@@ -105,6 +105,8 @@ class Trials:
         exif: (photos,) logarithms of the exposures that EXIF tells, relative to their mean.
         log_focal: see `Fitting`.
         known: sets of pixels whose distance is known.
+        log_gains: (photos, 3) of exposures that learn, where matched pixels tell them.
+        sky: see `Fitting`.
         colours, storage: see `PixelPool`.
 
     Raises:
@@ -120,6 +122,8 @@ class Trials:
         exif: np.ndarray,
         log_focal: float = 0.0,
         known: Sequence[PointDepths] = (),
+        log_gains: Tensor | None = None,
+        sky: Tensor | None = None,
         colours: np.ndarray | None = None,
         storage: PhotoStorage = IN_MEMORY,
     ):
@@ -141,6 +145,7 @@ class Trials:
         points = PointRays([depths.among(self._pool) for depths in known], self._pool)
         self._points = points if points.known else None
         self._room = storage
+        self._log_gains, self._sky = log_gains, sky
 
     def begin(
         self, components: Components, *, steps: int, seconds: float = math.inf, fewest: int = 0
@@ -156,7 +161,8 @@ class Trials:
         Returns:
             None where it did not come to the fewest steps.
         """
-        fitting = self._fitting(components, seed=self._settings.seed, log_gains=None, cameras_from=0.0)
+        gains = self._log_gains if components.exposure == "learned" else None
+        fitting = self._fitting(components, seed=self._settings.seed, log_gains=gains, cameras_from=0.0)
         took: list[float] = []
 
         def share() -> float:
@@ -198,7 +204,8 @@ class Trials:
             seed: of everything random; candidates with the same one draw the same pixels.
             steps: to go.
         """
-        gains = {"exif": self._exif, "learned": start.signs.log_gains}.get(components.exposure)
+        learned = start.signs.log_gains if self._log_gains is None else self._log_gains
+        gains = {"exif": self._exif, "learned": learned}.get(components.exposure)
         fitting = self._fitting(components, seed=seed, log_gains=gains, cameras_from=FORK_SHARE)
         self._take_up(fitting, start)
         if fitting.parts.background is not None:
@@ -222,7 +229,8 @@ class Trials:
 
         def seen() -> tuple[Tensor, Tensor]:
             drawn = self._pool.draw(JUDGED_PIXELS, generator)
-            return drawn.directions, drawn.colours[:, :3]
+            shown = slice(None) if self._sky is None else self._sky[drawn.numbers]
+            return drawn.directions[shown], drawn.colours[shown, :3]
 
         return seen
 
@@ -237,6 +245,7 @@ class Trials:
             log_focal=self._log_focal,
             cameras_from=cameras_from,
             points=self._points if components.points else None,
+            sky=self._sky if components.background == "sphere" else None,
             error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
         )
 

@@ -1,6 +1,8 @@
 """Checkpoints: write a training's state to the run folder and restore it bit for bit."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,8 @@ from nerfcli.field.kinds import settings_from_json
 from nerfcli.fit.extent import Extent
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.watch import that_must_be_finite
-from nerfcli.photos.held_out_exposure import gains_between
+from nerfcli.photos.exif_exposure import log_exposures
+from nerfcli.photos.held_out_exposure import exif_slope, gains_between
 from nerfcli.render.model import Model, save_model
 from nerfcli.runs.config import read_config
 from nerfcli.runs.files import FIELD, STATE
@@ -68,21 +71,37 @@ class Checkpoints:
             self._scene.unit,
             self._scene.unit_source,
             log_exposure=prepared.log_exposure,
+            exif_slope=self._exif_slope(),
             exposures=self._held_out_exposures(),
         )
 
-    def _held_out_exposures(self) -> dict[str, tuple[float, ...]]:
-        """What the exposures that were learned tell of held-out photos, by name."""
+    def _learned_gains(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the places (P,) of the training photos in the capture and their learned gains (P, 3), if any."""
         exposure = self._fitting.parts.exposure
         if exposure is None or self._fitting.components.exposure != "learned":
-            return {}
+            return None
+        return self._places(self._scene.train_frames), exposure.log_gains().detach().cpu().double().numpy()
+
+    def _places(self, frames: Sequence[Frame]) -> np.ndarray:
         place = {frame.name: index for index, frame in enumerate(self._scene.frames)}
-        train, test = (
-            np.array([place[frame.name] for frame in frames], dtype=int)
-            for frames in (self._scene.train_frames, self._scene.test_frames)
-        )
-        gains = exposure.log_gains().detach().cpu().double().numpy()
-        told = gains_between(train, gains, test)
+        return np.array([place[frame.name] for frame in frames], dtype=int)
+
+    def _exif_slope(self) -> float:
+        learned = self._learned_gains()
+        if learned is None or self._prepared.log_exposure is None:
+            return 1.0
+        return exif_slope(*learned, self._exif)
+
+    @cached_property
+    def _exif(self) -> np.ndarray:
+        return log_exposures(self._scene.train_frames)
+
+    def _held_out_exposures(self) -> dict[str, tuple[float, ...]]:
+        """What the exposures that were learned tell of held-out photos, by name."""
+        learned = self._learned_gains()
+        if learned is None:
+            return {}
+        told = gains_between(*learned, self._places(self._scene.test_frames))
         return {frame.name: tuple(row) for frame, row in zip(self._scene.test_frames, told.tolist(), strict=True)}
 
     def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:

@@ -6,7 +6,7 @@ Nothing of held-out photos is read here except the image sizes of their cameras.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,9 @@ from nerfcli.fit.coverage import covered_cells
 from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
 from nerfcli.fit.fitting import OCCUPANCY_SIDE, Fitting
-from nerfcli.fit.point_depth import PointDepths, PointRays, point_depths, stereo_depths
+from nerfcli.fit.point_depth import PointDepths, PointRays
 from nerfcli.multiview.camera_check import CameraCheck, check_cameras
 from nerfcli.multiview.correspondences import Shared
-from nerfcli.multiview.stereo import LEAST_SIDE_PX, LONGER_SIDE_PX, affordable_side_px, dense_depths
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.pool import Album, PixelPool, load_album
@@ -38,17 +37,16 @@ from nerfcli.search.selection import (
     may_use_points,
     may_use_stereo,
     select,
+    with_evidence,
     with_known_cameras,
-    with_points,
 )
 from nerfcli.search.trials import Trials
+from nerfcli.train.evidence import Evidence
 
 # A search that has no time left has this.
 LEAST_SECONDS = 1e-3
 # Of a search, what the comparison of photos may take.
 MATCHING_SHARE = 0.5
-# Of the budget, what stereo matching may take.
-STEREO_SHARE = 0.06
 
 
 @dataclass(frozen=True)
@@ -89,6 +87,7 @@ class Prepared:
     log_focal: float
     points: PointRays | None
     seconds: float
+    sky: Tensor | None
 
     def fitting(self) -> Fitting:
         """Return the training at its first step."""
@@ -102,6 +101,7 @@ class Prepared:
             points=self.points,
             error_map=ErrorMap(self.pool) if self.settings.components.pixels == "error" else None,
             covered=self.covered(),
+            sky=self.sky,
         )
 
     def covered(self) -> Tensor | None:
@@ -165,7 +165,7 @@ def prepare(
     )
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
-    evidence = _Evidence(shared, album, pool, extent, settings, notify)
+    evidence = Evidence(shared, album, pool, extent, settings, notify)
     selection, log_focal = None, 0.0
     if begun is not None:
         settings = replace(settings, components=begun.components)
@@ -185,60 +185,17 @@ def prepare(
     reference, gains = _exposures(scene, settings.components, notify=notify)
     if selection is not None and selection.log_gains is not None:
         gains = selection.log_gains
+    elif settings.components.exposure == "learned" and settings.components.stereo:
+        gains = evidence.gains_or(gains)
     points = _points(scene, settings.components, evidence, pool=pool) if settings.components.points else None
+    sky = evidence.sky if settings.components.background == "sphere" else None
     seconds = evidence.stereo_seconds if selection is None else selection.seconds
-    return Prepared(settings, factor, storage, extent, pool, selection, reference, gains, log_focal, points, seconds)
+    return Prepared(
+        settings, factor, storage, extent, pool, selection, reference, gains, log_focal, points, seconds, sky
+    )
 
 
-class _Evidence:
-    """Pixels at known distances, computed on first use."""
-
-    def __init__(
-        self,
-        shared: Shared,
-        album: Album,
-        pool: PixelPool,
-        extent: Extent,
-        settings: TrainSettings,
-        notify: Callable[[str], None],
-    ):
-        self._shared, self._album, self._pool, self._settings = shared, album, pool, settings
-        self._similarity, self.notify = extent.training_from_scene, notify
-        self.stereo_seconds = 0.0
-        budget = settings.budget_seconds
-        self.side_px = LONGER_SIDE_PX
-        if budget is not None:
-            self.side_px = affordable_side_px(album.photos, seconds=STEREO_SHARE * budget, threads=settings.threads)
-
-    @cached_property
-    def of_tracks(self) -> PointDepths:
-        """Of points of structure from motion, or of matched features."""
-        return point_depths(self._shared.tracks, self._pool, self._similarity)
-
-    @cached_property
-    def of_stereo(self) -> PointDepths:
-        """Of stereo matching."""
-        began = time.perf_counter()
-        dense = dense_depths(
-            self._album.photos,
-            self._shared.tracks,
-            longer_side_px=self.side_px or LEAST_SIDE_PX,
-            threads=self._settings.threads,
-        )
-        found = stereo_depths(dense, self._pool, self._similarity)
-        self.stereo_seconds = time.perf_counter() - began
-        self.notify(
-            f"stereo matching: the depth of {len(found.numbers)} pixels of the training photos, "
-            f"{self.stereo_seconds:.1f} s"
-        )
-        return found
-
-    def sets(self, components: Components) -> list[PointDepths]:
-        """Return those that a model with points uses."""
-        return [self.of_tracks, self.of_stereo] if components.stereo else [self.of_tracks]
-
-
-def _points(scene: Scene, components: Components, evidence: _Evidence, *, pool: PixelPool) -> PointRays:
+def _points(scene: Scene, components: Components, evidence: Evidence, *, pool: PixelPool) -> PointRays:
     """Return the pixels at known distances that are drawn in each step."""
     points = PointRays(evidence.sets(components), pool)
     if not points.known:
@@ -256,7 +213,7 @@ def _facts(
     settings: TrainSettings,
     *,
     shared: Shared,
-    evidence: _Evidence,
+    evidence: Evidence,
     notify: Callable[[str], None],
 ) -> Facts:
     """Collect facts about the scene before training."""
@@ -273,10 +230,13 @@ def _facts(
         cameras=_camera_check(album, shared, notify=notify) if lacks_points and has_time else None,
         fixed=settings.fixed,
     )
+    if not facts.has_alpha and "background" not in facts.fixed:
+        facts = replace(facts, sky_share=float(evidence.sky.float().mean()))
     if may_use_points(settings.components, facts) and (shared.of_model.count or has_time or settings.components.points):
         facts = replace(facts, points=len(evidence.of_tracks.numbers))
         if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
-            facts = replace(facts, stereo=len(evidence.of_stereo.numbers))
+            stereo = len(evidence.of_stereo.numbers)
+            facts = replace(facts, stereo=stereo, exposure_spread=evidence.exposure_spread)
     return facts
 
 
@@ -296,7 +256,7 @@ def _search(
     settings: TrainSettings,
     *,
     facts: Facts,
-    evidence: _Evidence,
+    evidence: Evidence,
     storage: PhotoStorage,
     began: float,
     notify: Callable[[str], None],
@@ -305,18 +265,21 @@ def _search(
     budget, steps = settings.budget_seconds, settings.steps
     if not is_worth_a_search(budget, steps):
         notify("the budget is too short for trials; only components that need no trial are selected")
-        components, decisions = with_points(settings.components, facts)
+        components, decisions = with_evidence(settings.components, facts)
         for decision in decisions:
             notify(decision.in_words())
         return Selection(components, tuple(decisions), time.perf_counter() - began)
     requested, log_focal, measured = with_known_cameras(settings.components, facts)
+    model, _ = with_evidence(requested, facts)
     trials = Trials(
         album.photos,
         extent,
         settings=settings,
         exif=_exif(scene),
         log_focal=log_focal,
-        known=evidence.sets(with_points(requested, facts)[0]) if facts.points else [],
+        known=evidence.sets(model) if facts.points else [],
+        log_gains=evidence.gains_or(torch.zeros(len(album.photos), 3)) if model.stereo else None,
+        sky=evidence.sky if model.background == "sphere" else None,
         colours=album.colours,
         storage=storage,
     )

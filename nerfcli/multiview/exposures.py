@@ -1,0 +1,100 @@
+"""Exposures of photos by what they have in common: the ratio of light at pixels that show the same point."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.multiview.graph import connected_groups
+from nerfcli.multiview.stereo import DenseDepth
+from nerfcli.photos.loading import LoadedPhoto
+
+# Pixels of each photo that are looked up in others, and how many of these, the nearest.
+MOST_PIXELS, OTHERS = 2000, 12
+# Two depths of a point agree within this part of them. Levels between which a ratio tells the exposure.
+CONSISTENT, DARKEST, BRIGHTEST = 0.02, 20, 240
+# Pairs with fewer common pixels tell nothing; more than the other number tell no more, as their errors are shared.
+FEWEST, MOST_WEIGHT = 50, 500
+# Around each pixel, so that details which do not lie on one another to the pixel cancel.
+WINDOW_PX = 3
+ROUNDS = 5
+
+
+def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]) -> np.ndarray:
+    """Estimate the logarithms (P, 3) of the gains of photos in linear light, per channel, with the mean 0.
+
+    A pair's is the median over common pixels; those of the photos have the least sum of absolute differences to these.
+
+    Args:
+        photos: with pixels in sRGB.
+        dense: the depths of each.
+
+    Returns:
+        NaN for photos that share too little with the others to be compared.
+    """
+    light = [_linear(cv2.blur(np.ascontiguousarray(photo.pixels[..., :3]), (WINDOW_PX, WINDOW_PX))) for photo in photos]
+    levels = [photo.pixels[..., :3] for photo in photos]
+    maps = []
+    for photo, depth in zip(photos, dense, strict=True):
+        known = np.full(photo.pixels.shape[:2], np.nan)
+        known[depth.pixels[:, 1], depth.pixels[:, 0]] = depth.distances
+        maps.append(known)
+    centres = np.array([photo.frame.centre for photo in photos])
+    pairs, ratios, counts = [], [], []
+    generator = np.random.default_rng(0)
+    for one, (photo, depth) in enumerate(zip(photos, dense, strict=True)):
+        chosen = generator.permutation(len(depth.pixels))[:MOST_PIXELS]
+        pixels = depth.pixels[chosen]
+        bearings, _ = photo.frame.camera.bearings(pixels + 0.5)
+        points = apply(photo.frame.world_from_cam, bearings * depth.distances[chosen][:, None])
+        near = np.argsort(np.linalg.norm(centres - centres[one], axis=1), kind="stable")[1 : OTHERS + 1]
+        for other in near.tolist():
+            second = photos[other]
+            camera = second.frame.camera
+            away = np.linalg.norm(points - second.frame.centre, axis=1)
+            places, seen = camera.project(apply(inverse(second.frame.world_from_cam), points))
+            seen &= (places >= 0).all(1) & (places < (camera.width, camera.height)).all(1)
+            column, row = np.where(seen[:, None], places, 0).astype(np.int64).T
+            with np.errstate(invalid="ignore"):
+                seen &= np.abs(maps[other][row, column] / np.maximum(away, 1e-12) - 1.0) < CONSISTENT
+            both = np.concatenate([levels[one][pixels[:, 1], pixels[:, 0]], levels[other][row, column]], axis=1)
+            seen &= ((both > DARKEST) & (both < BRIGHTEST)).all(1)
+            if seen.sum() < FEWEST:
+                continue
+            ratio = light[other][row[seen], column[seen]] / light[one][pixels[seen, 1], pixels[seen, 0]]
+            pairs.append((one, other))
+            ratios.append(np.median(np.log(ratio), axis=0))
+            counts.append(min(int(seen.sum()), MOST_WEIGHT))
+    return _gains(len(photos), np.array(pairs).reshape(-1, 2), np.array(ratios).reshape(-1, 3), np.array(counts))
+
+
+def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return (count, 3) gains whose differences fit ratios (N, 3) of pairs (N, 2); NaN outside the largest group."""
+    gains = np.full((count, 3), np.nan)
+    group = connected_groups(range(count), [tuple(pair) for pair in pairs.tolist()])[0] if count else []
+    if len(group) < 2:
+        return gains
+    inside = np.isin(pairs[:, 0], group)
+    place = np.full(count, -1)
+    place[group] = np.arange(len(group))
+    first, second = place[pairs[inside]].T
+    design = np.zeros((len(first) + 1, len(group)))
+    design[np.arange(len(first)), second] = 1.0
+    design[np.arange(len(first)), first] -= 1.0
+    design[-1] = 1.0  # their mean is 0
+    for channel in range(3):
+        wanted = np.append(ratios[inside, channel], 0.0)
+        robust, found = np.ones(len(first)), np.zeros(len(group))
+        for _ in range(ROUNDS):
+            root = np.append(np.sqrt(weights[inside] * robust), 1.0)
+            found = np.linalg.lstsq(design * root[:, None], wanted * root, rcond=None)[0]
+            robust = 1.0 / np.maximum(np.abs(design[:-1] @ found - wanted[:-1]), 0.01)
+        gains[group, channel] = found
+    return gains
+
+
+def _linear(levels: np.ndarray) -> np.ndarray:
+    """Return the linear light of sRGB levels, uint8."""
+    values = np.maximum(levels.astype(np.float64) / 255.0, 1e-3)
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,108 @@
+"""Evidence of training photos before training: pixels at known distances, relative exposures, the sky."""
+
+import time
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.fit.extent import Extent
+from nerfcli.fit.point_depth import PointDepths, point_depths, stereo_depths
+from nerfcli.multiview.correspondences import Shared
+from nerfcli.multiview.exposures import matched_log_gains
+from nerfcli.multiview.sky import sky_masks
+from nerfcli.multiview.stereo import LEAST_SIDE_PX, LONGER_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
+from nerfcli.photos.pool import Album, PixelPool
+from nerfcli.runs.components import Components
+from nerfcli.runs.settings import TrainSettings
+
+# Of the budget, what stereo matching may take.
+STEREO_SHARE = 0.06
+
+
+class Evidence:
+    """What training photos tell of depth, exposures and sky before any training, computed on first use.
+
+    Args:
+        shared: features and points of the photos.
+        album, pool: the photos, and their pixels in the training frame.
+        extent: of the field.
+        settings: of the training; the budget tells how large the pictures are that are matched.
+        notify: takes lines for the user.
+    """
+
+    def __init__(
+        self,
+        shared: Shared,
+        album: Album,
+        pool: PixelPool,
+        extent: Extent,
+        settings: TrainSettings,
+        notify: Callable[[str], None],
+    ):
+        self._shared, self._album, self._pool, self._settings = shared, album, pool, settings
+        self._similarity, self.notify = extent.training_from_scene, notify
+        self.stereo_seconds = 0.0
+        budget = settings.budget_seconds
+        self.side_px = LONGER_SIDE_PX
+        if budget is not None:
+            self.side_px = affordable_side_px(album.photos, seconds=STEREO_SHARE * budget, threads=settings.threads)
+
+    @cached_property
+    def of_tracks(self) -> PointDepths:
+        """Of points of structure from motion, or of matched features."""
+        return point_depths(self._shared.tracks, self._pool, self._similarity)
+
+    @cached_property
+    def _dense(self) -> list[DenseDepth]:
+        began = time.perf_counter()
+        found = dense_depths(
+            self._album.photos,
+            self._shared.tracks,
+            longer_side_px=self.side_px or LEAST_SIDE_PX,
+            threads=self._settings.threads,
+        )
+        self.stereo_seconds += time.perf_counter() - began
+        return found
+
+    @cached_property
+    def log_gains(self) -> np.ndarray:
+        """(photos, 3) logarithms of exposures by pixels that several photos share; NaN where unknown."""
+        dense = self._dense
+        began = time.perf_counter()
+        found = matched_log_gains(self._album.photos, dense)
+        self.stereo_seconds += time.perf_counter() - began
+        return found
+
+    def gains_or(self, others: Tensor) -> Tensor:
+        """Return (photos, 3) logarithms of exposures, or others where these are unknown."""
+        known = torch.from_numpy(self.log_gains).to(others)
+        return torch.where(known.isfinite(), known, others)
+
+    @property
+    def exposure_spread(self) -> float:
+        """Standard deviation of the photos' brightness by matched pixels; 0 where nothing is known."""
+        known = self.log_gains[np.isfinite(self.log_gains).all(1)]
+        return float(known.mean(1).std()) if len(known) else 0.0
+
+    @cached_property
+    def sky(self) -> Tensor:
+        """(pixels,) bool, those of the pool that look like a sky."""
+        masks = sky_masks(self._album.photos, threads=self._settings.threads)
+        return torch.from_numpy(np.concatenate([mask.ravel() for mask in masks])).to(self._pool.colours.device)
+
+    @cached_property
+    def of_stereo(self) -> PointDepths:
+        """Of stereo matching."""
+        found = stereo_depths(self._dense, self._pool, self._similarity)
+        self.notify(
+            f"stereo matching: the depth of {len(found.numbers)} pixels of the training photos, "
+            f"{self.stereo_seconds:.1f} s"
+        )
+        return found
+
+    def sets(self, components: Components) -> list[PointDepths]:
+        """Return those that a model with points uses."""
+        return [self.of_tracks, self.of_stereo] if components.stereo else [self.of_tracks]

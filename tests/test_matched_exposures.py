@@ -1,0 +1,52 @@
+"""Exposures by pixels that photos have in common, on photos whose gains are known."""
+
+import numpy as np
+import pytest
+from test_stereo import OFFSETS, PINHOLE, photo, truth
+
+from nerfcli.multiview.exposures import matched_log_gains
+from nerfcli.multiview.stereo import DenseDepth
+from nerfcli.photos.loading import LoadedPhoto
+
+GAINS = np.array([[0.0, 0.1, -0.1], [0.4, 0.4, 0.4], [-0.5, -0.4, -0.3], [0.1, -0.1, 0.0]])
+NOTHING = DenseDepth(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
+
+
+def exposed(one: LoadedPhoto, log_gains: np.ndarray) -> LoadedPhoto:
+    """The same photo with other gains in linear light."""
+    light = ((one.pixels / 255 + 0.055) / 1.055) ** 2.4 * np.exp(log_gains)
+    levels = 255 * (1.055 * light ** (1 / 2.4) - 0.055)
+    return LoadedPhoto(one.frame, np.clip(np.rint(levels), 0, 255).astype(np.uint8), None)
+
+
+def depth(one: LoadedPhoto) -> DenseDepth:
+    """The true one of every third pixel."""
+    rows, columns = (axis.ravel() for axis in np.mgrid[:150:2, :200:2])
+    distances = truth(PINHOLE, one.frame.world_from_cam)[0][rows, columns]
+    return DenseDepth(np.stack([columns, rows], axis=-1), distances, np.full(len(rows), 0.01))
+
+
+def test_gains_are_found_to_a_hundredth():
+    photos = [exposed(photo(x, contrast=1.5), gains) for x, gains in zip(OFFSETS, GAINS, strict=True)]
+    found = matched_log_gains(photos, [depth(one) for one in photos])
+    assert found == pytest.approx(GAINS - GAINS.mean(0), abs=0.02)
+    assert found.mean(0) == pytest.approx(np.zeros(3), abs=1e-3)
+
+
+def test_photos_that_share_nothing_have_no_gains():
+    photos = [exposed(photo(x, contrast=1.5), gains) for x, gains in zip(OFFSETS, GAINS, strict=True)]
+    depths = [depth(one) for one in photos]
+    found = matched_log_gains(photos, [*depths[:3], NOTHING])
+    assert np.isfinite(found).all(axis=1).tolist() == [True, True, True, False]
+    assert found[:3] == pytest.approx(GAINS[:3] - GAINS[:3].mean(0), abs=0.02)
+    for few in ([NOTHING] * 4, [NOTHING] * 3 + depths[3:]):
+        assert np.isnan(matched_log_gains(photos, few)).all()
+    assert np.isnan(matched_log_gains(photos[:1], depths[:1])).all()
+
+
+def test_white_pixels_tell_nothing():
+    white = exposed(photo(0.0), np.full(3, 5.0))
+    photos = [white, *(photo(x) for x in OFFSETS[1:3])]
+    found = matched_log_gains(photos, [depth(one) for one in photos])
+    assert np.isnan(found[0]).all()
+    assert found[1:] == pytest.approx(np.zeros((2, 3)), abs=0.02)

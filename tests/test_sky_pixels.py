@@ -1,0 +1,66 @@
+"""Pixels that look like a sky, in photos of a sky by direction above textured hills and of a plain wall."""
+
+import numpy as np
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import rotation_from_vector
+from nerfcli.multiview.sky import sky_masks
+from nerfcli.photos.loading import LoadedPhoto
+
+CAMERA = Camera.pinhole(160, 120, 140.0)
+GAINS = (1.0, 0.8, 1.2, 0.9, 1.0)
+
+
+def photo(x: float, *, turned: float = 0.0, gain: float = 1.0, below: bool = False) -> LoadedPhoto:
+    """The sky's colour goes with the direction; below a skyline 10 degrees above the horizon is noise."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_vector(np.array([0.0, turned, 0.0]))
+    pose[0, 3] = x
+    rays = (CAMERA.pixel_bearings()[0] @ pose[:3, :3].T).reshape(120, 160, 3)
+    sky = np.stack([90 - 60 * rays[..., 1], 120 - 40 * rays[..., 0], 170 + 0 * rays[..., 1]], axis=-1)
+    noise = np.random.default_rng(round(1000 * x)).uniform(0, 255, (120, 160, 3))
+    is_plain = rays[..., 1:2] > 0.17 if below else rays[..., 1:2] < -0.17
+    levels = np.where(is_plain, gain * sky, noise)
+    return LoadedPhoto(Frame(f"{x}.png", CAMERA, pose), np.clip(np.rint(levels), 0, 255).astype(np.uint8), None)
+
+
+def is_sky(one: LoadedPhoto) -> np.ndarray:
+    rays = (CAMERA.pixel_bearings()[0] @ one.frame.world_from_cam[:3, :3].T).reshape(120, 160, 3)
+    return rays[..., 1] < -0.17
+
+
+def photos() -> list[LoadedPhoto]:
+    return [photo(0.2 * k, turned=0.05 * k, gain=gain) for k, gain in enumerate(GAINS)]
+
+
+def test_the_sky_is_found_but_for_its_border_whatever_the_exposures():
+    for one, mask in zip(photos(), sky_masks(photos(), threads=1), strict=True):
+        assert mask.shape == (120, 160)
+        assert not mask[~is_sky(one)].any()
+        assert mask[is_sky(one)].mean() > 0.7
+
+
+def test_what_is_plain_below_the_horizon_is_no_sky():
+    ground = [photo(0.2 * k, turned=0.05 * k, below=True) for k in range(4)]
+    assert not any(mask.any() for mask in sky_masks(ground, threads=1))
+
+
+def test_what_is_elsewhere_in_each_photo_is_no_sky():
+    """A plain patch that moves against the directions, as a near thing does."""
+    plain = photos()
+    for k, one in enumerate(plain):
+        one.pixels[...] = np.random.default_rng(k).integers(0, 255, one.pixels.shape)
+        one.pixels[10:40, 10 + 30 * k : 34 + 30 * k] = 200
+    assert not any(mask.any() for mask in sky_masks(plain, threads=1))
+
+
+def test_a_single_photo_has_no_sky():
+    assert not sky_masks(photos()[:1], threads=1)[0].any()
+
+
+def test_a_mask_is_no_sky():
+    masked = [LoadedPhoto(one.frame, one.pixels, np.arange(160) >= np.full((120, 1), 80)) for one in photos()]
+    for mask in sky_masks(masked, threads=2):
+        assert not mask[:, :79].any()
+        assert mask[:, 80:].any()
