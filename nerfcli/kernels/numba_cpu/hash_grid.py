@@ -13,56 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.numba_cpu.corners import dense_corners, hashed_corners
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import ROW, dot_rows, gather_rows, prefetch, scatter_rows
+from nerfcli.kernels.numba_cpu.vector import LANES, ROW, dot_rows, gather_rows, prefetch, scatter_rows
 
-# Row width that the kernels are written for, corners of a cell, and samples in a block.
+# Row width that the kernels are written for, and samples in a block: in smaller ones, a sample's row numbers are read
+# before the processor has stored them.
 FEATURES = ROW
-BLOCK = 32
-
-
-@numba.njit(inline="always")
-def _cells(points: Any, first: Any, count: Any, resolution: Any, cell: Any, inside: Any) -> None:
-    """Cells (3, BLOCK) and places inside them of a block of samples, coordinates clamped to [0, 1]."""
-    top, last = np.float32(resolution), np.int32(resolution - 1)
-    for axis in range(3):
-        for i in range(count):
-            scaled = min(max(points[first + i, axis], np.float32(0)), np.float32(1)) * top
-            floor = min(np.int32(scaled), last)
-            cell[axis, i] = np.uint32(floor)
-            inside[axis, i] = scaled - np.float32(floor)
-
-
-@numba.njit(inline="always")
-def _corner_rows(cell: Any, count: Any, resolution: Any, rows: Any, index: Any) -> None:
-    """Table rows of the 8 corners, corner after corner; bit 0 of the corner is x, bit 1 is y, bit 2 is z."""
-    side = np.uint32(resolution + 1)
-    dense = np.int64(side) * np.int64(side) * np.int64(side) <= np.int64(rows)
-    mask = np.uint32(rows - 1)
-    for corner in range(8):
-        dx, dy, dz = np.uint32(corner & 1), np.uint32((corner >> 1) & 1), np.uint32((corner >> 2) & 1)
-        if dense:
-            for i in range(count):
-                index[corner * BLOCK + i] = np.uint32(
-                    ((cell[2, i] + dz) * side + cell[1, i] + dy) * side + cell[0, i] + dx
-                )
-        else:
-            for i in range(count):
-                y, z = np.uint32(cell[1, i] + dy), np.uint32(cell[2, i] + dz)
-                mixed = np.uint32(cell[0, i] + dx) ^ np.uint32(y * np.uint32(2654435761))
-                index[corner * BLOCK + i] = (mixed ^ np.uint32(z * np.uint32(805459861))) & mask
-
-
-@numba.njit(inline="always")
-def _corner_weights(inside: Any, count: Any, weight: Any) -> None:
-    """Trilinear weights of the 8 corners, corner after corner."""
-    one = np.float32(1)
-    for corner in range(8):
-        for i in range(count):
-            x = inside[0, i] if corner & 1 else one - inside[0, i]
-            y = inside[1, i] if corner & 2 else one - inside[1, i]
-            z = inside[2, i] if corner & 4 else one - inside[2, i]
-            weight[corner * BLOCK + i] = x * y * z
+BLOCK = 128
 
 
 @numba.njit(inline="always")
@@ -77,37 +35,42 @@ def _fade(widths: Any, first: Any, count: Any, resolution: Any, weight: Any) -> 
 
 @numba.njit(inline="always")
 def _prepare_block(
-    points: Any, widths: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any, scratch: Any
-) -> None:
+    points: Any, stride: Any, widths: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any,
+    scratch: Any,
+) -> None:  # fmt: skip
     """Rows and weights of all corners of a block of samples, with the rows on their way into the cache."""
-    cell, inside, index, weight = scratch
-    _cells(points, first, count, resolution, cell, inside)
-    _corner_rows(cell, count, resolution, rows, index)
-    offset = np.int64(level) * rows * FEATURES
-    for corner in range(8):
-        for i in range(count):
-            prefetch(flat, offset + np.int64(index[corner * BLOCK + i]) * FEATURES)
-    _corner_weights(inside, count, weight)
+    inside, index, weight = scratch
+    side = np.int64(resolution) + 1
+    if side * side * side <= rows:
+        for i in range(0, count, LANES):
+            dense_corners(points, first + i, stride, resolution, rows, i, BLOCK, index, weight, inside)
+    else:
+        for i in range(0, count, LANES):
+            hashed_corners(points, first + i, stride, resolution, rows, i, BLOCK, index, weight, inside)
+        offset = np.int64(level) * rows * FEATURES
+        for corner in range(8):
+            for i in range(count):
+                prefetch(flat, offset + np.int64(index[corner * BLOCK + i]) * FEATURES)
     _fade(widths, first, count, resolution, weight)
 
 
 @numba.njit(inline="always")
 def new_scratch() -> Any:
-    """Room for cells, places inside them, rows and weights of a block."""
-    return (
-        np.empty((3, BLOCK), np.uint32),
-        np.empty((3, BLOCK), np.float32),
-        np.empty(8 * BLOCK, np.uint32),
-        np.empty(8 * BLOCK, np.float32),
-    )
+    """Room for places inside cells, rows and weights of a block."""
+    return np.empty(3 * BLOCK, np.float32), np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
 
 
 @numba.njit(inline="always")
 def encode_range(
-    points: Any, widths: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any, out: Any
-) -> None:
-    """All levels of samples first to last into the flat array `out`, with `new_scratch`."""
-    index, weight = scratch[2], scratch[3]
+    points: Any, stride: Any, widths: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any,
+    out: Any,
+) -> None:  # fmt: skip
+    """All levels of samples first to last into the flat array `out`, with `new_scratch`.
+
+    Args:
+        points: coordinates as `by_axis` lays them out, the next axis `stride` further on.
+    """
+    index, weight = scratch[1], scratch[2]
     width = resolutions.shape[0] * FEATURES
     for level in range(resolutions.shape[0]):
         resolution = resolutions[level]
@@ -119,29 +82,39 @@ def encode_range(
         offset = np.int64(level) * rows * FEATURES
         for start in range(first, last, BLOCK):
             count = min(BLOCK, last - start)
-            _prepare_block(points, widths, start, count, level, resolution, rows, flat, scratch)
+            _prepare_block(points, stride, widths, start, count, level, resolution, rows, flat, scratch)
             for i in range(count):
                 gather_rows(flat, offset, index, weight, i, BLOCK, out, (start + i) * width + level * FEATURES)
 
 
+def by_axis(points: Tensor) -> np.ndarray:
+    """Coordinates (N, 3) as (3, M), M >= N, a multiple of a vector: the corners of whole vectors are computed."""
+    count = len(points)
+    laid_out = points.new_zeros(3, -(-count // LANES) * LANES)
+    laid_out[:, :count] = points.t()
+    return laid_out.numpy()
+
+
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _encode_forward(points: Any, widths: Any, flat: Any, rows: Any, resolutions: Any, out: Any, threads: Any) -> None:
-    blocks = (points.shape[0] + BLOCK - 1) // BLOCK
+    width, stride = resolutions.shape[0] * FEATURES, points.shape[1]
+    samples = out.shape[0] // max(width, 1)
+    blocks = (samples + BLOCK - 1) // BLOCK
     for thread in numba.prange(threads):
         first = thread * blocks // threads * BLOCK
-        last = min((thread + 1) * blocks // threads * BLOCK, points.shape[0])
-        encode_range(points, widths, first, last, flat, rows, resolutions, new_scratch(), out)
+        last = min((thread + 1) * blocks // threads * BLOCK, samples)
+        encode_range(points.reshape(-1), stride, widths, first, last, flat, rows, resolutions, new_scratch(), out)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _encode_backward(
     points: Any, widths: Any, gradient: Any, rows: Any, resolutions: Any, flat: Any, threads: Any
 ) -> None:
-    samples = points.shape[0]
-    width = resolutions.shape[0] * FEATURES
+    width, stride = resolutions.shape[0] * FEATURES, points.shape[1]
+    samples = gradient.shape[0] // max(width, 1)
     for thread in numba.prange(threads):
         scratch = new_scratch()
-        index, weight = scratch[2], scratch[3]
+        index, weight = scratch[1], scratch[2]
         for level in range(thread, resolutions.shape[0], threads):
             resolution = resolutions[level]
             if resolution == 0:
@@ -150,7 +123,7 @@ def _encode_backward(
             column = level * FEATURES
             for first in range(0, samples, BLOCK):
                 count = min(BLOCK, samples - first)
-                _prepare_block(points, widths, first, count, level, resolution, rows, flat, scratch)
+                _prepare_block(points.reshape(-1), stride, widths, first, count, level, resolution, rows, flat, scratch)
                 for i in range(count):
                     at = (first + i) * width + column
                     a, b, c, d = gradient[at], gradient[at + 1], gradient[at + 2], gradient[at + 3]
@@ -170,12 +143,12 @@ def _slopes(
         for axis in range(3):
             across, other = (axis + 1) % 3, (axis + 2) % 3
             bit, bit_across, bit_other = 1 << axis, 1 << across, 1 << other
-            a, b = inside[across, i], inside[other, i]
+            a, b = inside[across * BLOCK + i], inside[other * BLOCK + i]
             low = (one - a) * (dots[bit * BLOCK + i] - dots[i])
             low += a * (dots[(bit | bit_across) * BLOCK + i] - dots[bit_across * BLOCK + i])
             high = (one - a) * (dots[(bit | bit_other) * BLOCK + i] - dots[bit_other * BLOCK + i])
             high += a * (dots[7 * BLOCK + i] - dots[(bit_across | bit_other) * BLOCK + i])
-            at = points[first + i, axis]
+            at = points[axis, first + i]
             if at >= np.float32(0) and at <= one:  # beyond, coordinates are clamped
                 out[first + i, axis] += scale * ((one - b) * low + b * high)
 
@@ -184,13 +157,14 @@ def _slopes(
 def _points_backward(
     points: Any, widths: Any, flat: Any, rows: Any, resolutions: Any, gradient: Any, out: Any, threads: Any
 ) -> None:
-    width = resolutions.shape[0] * FEATURES
-    blocks = (points.shape[0] + BLOCK - 1) // BLOCK
+    width, stride = resolutions.shape[0] * FEATURES, points.shape[1]
+    samples = out.shape[0]
+    blocks = (samples + BLOCK - 1) // BLOCK
     for thread in numba.prange(threads):
         begin = thread * blocks // threads * BLOCK
-        end = min((thread + 1) * blocks // threads * BLOCK, points.shape[0])
+        end = min((thread + 1) * blocks // threads * BLOCK, samples)
         scratch = new_scratch()
-        inside, index, dots = scratch[1], scratch[2], scratch[3]
+        inside, index, dots = scratch
         for level in range(resolutions.shape[0]):
             resolution = resolutions[level]
             if resolution == 0:
@@ -198,7 +172,7 @@ def _points_backward(
             offset = np.int64(level) * rows * FEATURES
             for first in range(begin, end, BLOCK):
                 count = min(BLOCK, end - first)
-                _prepare_block(points, widths, first, count, level, resolution, rows, flat, scratch)
+                _prepare_block(points.reshape(-1), stride, widths, first, count, level, resolution, rows, flat, scratch)
                 for i in range(count):
                     at = (first + i) * width + level * FEATURES
                     dot_rows(flat, offset, index, dots, i, BLOCK, gradient, at)
@@ -223,7 +197,7 @@ class _HashEncode(torch.autograd.Function):
         if known is None:
             out = torch.empty(len(points), levels * features)
             _encode_forward(
-                points.numpy(), widths.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(),
+                by_axis(points), widths.numpy(), table.view(-1).numpy(), rows, sides, out.view(-1).numpy(),
                 use_threads(),
             )  # fmt: skip
         else:
@@ -235,18 +209,18 @@ class _HashEncode(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None, None]:
         points, widths, table = ctx.saved_tensors
-        gradient = gradients[0].contiguous().view(-1).numpy()
+        gradient, laid_out = gradients[0].contiguous().view(-1).numpy(), by_axis(points)
         rows, of_points, of_table = ctx.table_shape[1], None, None
         if ctx.needs_input_grad[0]:
             of_points = torch.zeros_like(points)
             flat = table.view(-1).numpy()
             _points_backward(
-                points.numpy(), widths.numpy(), flat, rows, ctx.sides, gradient, of_points.numpy(), use_threads()
+                laid_out, widths.numpy(), flat, rows, ctx.sides, gradient, of_points.numpy(), use_threads()
             )
         if ctx.needs_input_grad[1]:
             of_table = torch.zeros(ctx.table_shape) if ctx.sink is None else ctx.sink
             flat = of_table.view(-1).numpy()
-            _encode_backward(points.numpy(), widths.numpy(), gradient, rows, ctx.sides, flat, use_threads())
+            _encode_backward(laid_out, widths.numpy(), gradient, rows, ctx.sides, flat, use_threads())
         return of_points, of_table if ctx.sink is None else None, None, None, None, None
 
 

@@ -20,7 +20,7 @@ def _count(
     """How many samples each ray has."""
     intervals = edges.shape[0] - 2 - CHUNK
     for ray in numba.prange(origins.shape[0]):
-        places, cells = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
+        places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
         count = 0
         for first in range(0, intervals, CHUNK):
             look_ahead(origins, directions, edges, jitter, ray, first, side, contraction, places, cells)
@@ -38,7 +38,7 @@ def _write(
     """The samples of each ray, from its offset on."""
     intervals = edges.shape[0] - 2 - CHUNK
     for ray in numba.prange(origins.shape[0]):
-        places, cells = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
+        places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
         at = offsets[ray]
         for first in range(0, intervals, CHUNK):
             if at == offsets[ray + 1]:
@@ -49,7 +49,7 @@ def _write(
                     starts[at] = cut(edges, jitter[ray], first + i)
                     ends[at] = cut(edges, jitter[ray], first + i + 1)
                     for axis in range(3):
-                        coordinates[at, axis] = places[axis, i]
+                        coordinates[at, axis] = places[axis * CHUNK + i]
                     at += 1
 
 

@@ -7,10 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.kernels.numba_cpu.steps import steps_in_ball, steps_in_contracted_cube, steps_in_cube
 from nerfcli.kernels.numba_cpu.threads import use_threads
+from nerfcli.kernels.numba_cpu.vector import LANES
 
-# Steps of a ray that are looked at together: LLVM makes no vectors of a loop over fewer.
-CHUNK = 16
+# Steps of a ray that are looked at together.
+CHUNK = LANES
 
 
 @numba.njit(inline="always")
@@ -39,27 +41,16 @@ def look_ahead(
     origins: Any, directions: Any, edges: Any, jitter: Any, ray: Any, first: Any, side: Any, contraction: Any,
     places: Any, cells: Any,
 ) -> None:  # fmt: skip
-    """Coordinates (3, CHUNK) of the middles of CHUNK intervals from `first`, and their cells; -1 outside of the grid.
+    """Coordinates (3 CHUNK,) of the middles of CHUNK intervals from `first`, and their cells; -1 outside of the grid.
 
     `edges` are `padded`: what lies beyond the last interval is for the caller to leave out.
     """
-    ox, oy, oz = origins[ray, 0], origins[ray, 1], origins[ray, 2]
-    dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-    shift, half, scale = jitter[ray], np.float32(0.5), np.float32(side)
-    zero, one, last = np.float32(0), np.float32(1), np.int32(side - 1)
-    near, middle, far = edges[first : first + CHUNK], edges[first + 1 :], edges[first + 2 :]
-    xs, ys, zs = places[0], places[1], places[2]
-    for i in range(CHUNK):
-        start, end = near[i] + shift * (middle[i] - near[i]), middle[i] + shift * (far[i] - middle[i])
-        t = (start + end) * half
-        x, y, z = cube(ox + dx * t, oy + dy * t, oz + dz * t, contraction)
-        xs[i], ys[i], zs[i] = x, y, z
-        inside = (x >= zero) & (y >= zero) & (z >= zero) & (x <= one) & (y <= one) & (z <= one)
-        # Clamped before they become integers: a far point outside of a bounded scene would not fit into one.
-        column = min(np.int32(min(max(x, zero), one) * scale), last)
-        row = min(np.int32(min(max(y, zero), one) * scale), last)
-        layer = min(np.int32(min(max(z, zero), one) * scale), last)
-        cells[i] = (layer * side + row) * side + column if inside else -1
+    if contraction == 0:
+        steps_in_cube(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
+    elif contraction == 1:
+        steps_in_ball(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
+    else:
+        steps_in_contracted_cube(origins, directions, ray, edges, jitter[ray], first, side, places, cells)
 
 
 def padded(edges: Tensor) -> np.ndarray:

@@ -14,6 +14,32 @@ LANES = 16
 # Rows of a block: with two vectors each they fill half of AVX-512's registers and hide the latency of a product.
 ROWS = 8
 
+# Types of LLVM, and vectors of them.
+INT, FLOAT, LONG = ir.IntType(32), ir.FloatType(), ir.IntType(64)
+INTS, FLOATS = ir.VectorType(INT, LANES), ir.VectorType(FLOAT, LANES)
+
+
+def ints(value: int) -> Any:
+    """A vector of one whole number."""
+    return ir.Constant(INTS, [value % 2**32] * LANES)
+
+
+def floats(value: float) -> Any:
+    """A vector of one number, which float32 must hold exactly."""
+    return ir.Constant(FLOATS, [value] * LANES)
+
+
+def in_all_lanes(builder: Any, scalar: Any, kind: Any) -> Any:
+    """A vector of type `kind` of one number that the machine code computes."""
+    undefined = ir.Constant(kind, ir.Undefined)
+    return builder.shuffle_vector(builder.insert_element(undefined, scalar, ir.Constant(INT, 0)), undefined, ints(0))
+
+
+def vector_at(builder: Any, pointer: Any, first: Any, step: Any, count: int, kind: Any) -> Any:
+    """The place of a vector of type `kind`: `count` steps behind element `first`."""
+    element = builder.add(first, builder.mul(step, ir.Constant(LONG, count)))
+    return builder.bitcast(builder.gep(pointer, [element]), kind.as_pointer())
+
 
 @intrinsic
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:

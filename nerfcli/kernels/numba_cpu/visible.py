@@ -98,13 +98,13 @@ def _follow(
     A sample's ray goes to `owner`, its start, end, density and coordinates to `record`, its features to `code`.
     """
     intervals = edges.shape[0] - 2 - CHUNK
-    places, cells = np.empty((3, CHUNK), np.float32), np.empty(CHUNK, np.int32)
+    places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
     lane_ray = np.full(LANES, -1, np.int64)
     lane_next = np.zeros(LANES, np.int64)
     lane_depth = np.zeros(LANES, np.float64)
     tile_lane = np.empty(ROUND, np.int64)
     tile_span = np.empty((ROUND, 2), np.float32)
-    points = np.empty((ROUND, 3), np.float32)
+    points = np.empty((3, ROUND), np.float32)
     widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
     encoded = np.empty((ROUND, WIDTH), np.float32)
     density = np.empty(ROUND, np.float32)
@@ -138,7 +138,7 @@ def _follow(
                             tile_span[filled, 0] = cut(edges, jitter[ray], k + i)
                             tile_span[filled, 1] = cut(edges, jitter[ray], k + i + 1)
                             for axis in range(3):
-                                points[filled, axis] = places[axis, i]
+                                points[axis, filled] = places[axis * CHUNK + i]
                             if cones.shape[0] > 0:
                                 t = (tile_span[filled, 0] + tile_span[filled, 1]) * np.float32(0.5)
                                 widths[filled] = cones[ray] * t * _stretch(origins, directions, ray, t, contraction)
@@ -153,7 +153,9 @@ def _follow(
                     lane_ray[lane] = -1
         if filled == 0:
             return found
-        encode_range(points, widths, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1))
+        encode_range(
+            points.reshape(-1), ROUND, widths, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1)
+        )
         density_range(encoded, 0, filled, weights, x, h, geometry, density)
         for i in range(filled):
             lane = tile_lane[i]
@@ -163,7 +165,7 @@ def _follow(
                 owner[found] = ray
                 record[found, 0], record[found, 1], record[found, 2] = tile_span[i, 0], tile_span[i, 1], density[i]
                 for axis in range(3):
-                    record[found, 3 + axis] = points[i, axis]
+                    record[found, 3 + axis] = points[axis, i]
                 for feature in range(WIDTH):
                     code[found, feature] = encoded[i, feature]
                 found += 1

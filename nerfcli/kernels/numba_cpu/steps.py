@@ -1,0 +1,116 @@
+"""Coordinates and cells of 16 steps along a ray, as vectors: LLVM leaves the same loop of Numba scalar."""
+
+from collections.abc import Callable
+from typing import Any, cast
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from nerfcli.kernels.numba_cpu.vector import FLOAT, FLOATS, INTS, LANES, LONG, floats, in_all_lanes, ints, vector_at
+
+_ONE_BIT = ir.VectorType(ir.IntType(1), LANES)
+
+
+def _larger(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
+
+
+def _smaller(builder: Any, a: Any, b: Any) -> Any:
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
+
+
+def _call(builder: Any, name: str, argument: Any) -> Any:
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(FLOATS, [FLOATS]), f"{name}.v{LANES}f32")
+    return builder.call(function, [argument])
+
+
+def _unit_cube(builder: Any, points: list[Any]) -> list[Any]:
+    return [builder.fadd(builder.fmul(along, floats(0.5)), floats(0.5)) for along in points]
+
+
+def _contracted(builder: Any, points: list[Any], norm: Any) -> list[Any]:
+    shrink = builder.fdiv(builder.fsub(floats(2.0), builder.fdiv(floats(1.0), norm)), norm)
+    scale = builder.fmul(shrink, floats(0.25))
+    return [builder.fadd(builder.fmul(along, scale), floats(0.5)) for along in points]
+
+
+def _ball(builder: Any, points: list[Any]) -> list[Any]:
+    x, y, z = (builder.fmul(along, along) for along in points)
+    square = builder.fadd(builder.fadd(x, y), z)
+    return _contracted(builder, points, _call(builder, "llvm.sqrt", _larger(builder, square, floats(1.0))))
+
+
+def _cube(builder: Any, points: list[Any]) -> list[Any]:
+    x, y, z = (_call(builder, "llvm.fabs", along) for along in points)
+    largest = _larger(builder, _larger(builder, x, y), _larger(builder, z, floats(1.0)))
+    return _contracted(builder, points, largest)
+
+
+def _cells(builder: Any, coordinates: list[Any], side: Any) -> Any:
+    """Numbers of cells in a grid, -1 outside; places are clamped first, as far ones would not fit into an integer."""
+    zero, one = floats(0.0), floats(1.0)
+    scale = in_all_lanes(builder, builder.sitofp(side, FLOAT), FLOATS)
+    line = in_all_lanes(builder, side, INTS)
+    last = builder.sub(line, ints(1))
+    inside, places = ir.Constant(_ONE_BIT, [1] * LANES), []
+    for along in coordinates:
+        within = _smaller(builder, _larger(builder, along, zero), one)
+        inside = builder.and_(inside, builder.fcmp_ordered("==", within, along))
+        place = builder.fptosi(builder.fmul(within, scale), INTS)
+        places.append(builder.select(builder.icmp_signed("<", place, last), place, last))
+    column, row, layer = places
+    cell = builder.add(builder.mul(builder.add(builder.mul(layer, line), row), line), column)
+    return builder.select(inside, cell, ints(-1))
+
+
+def _steps(cube_of: Callable[[Any, list[Any]], list[Any]]) -> Any:
+    """An intrinsic: (origins, directions, ray, edges, shift, first, side, places, cells), with arrays that are flat.
+
+    Edge k of the ray is edges[k] + shift * (edges[k + 1] - edges[k]). Writes the coordinates of the middles of 16
+    intervals from number `first` on to places[axis * 16 + i], and their cells in a grid of `side` to cells[i].
+    """
+
+    @intrinsic
+    def steps(
+        typing_context: Any, origins: Any, directions: Any, ray: Any, edges: Any, shift: Any, first: Any, side: Any,
+        places: Any, cells: Any,
+    ) -> Any:  # fmt: skip
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            def data(which: int) -> Any:
+                return context.make_array(signature.args[which])(context, builder, args[which]).data
+
+            ray, first = (context.cast(builder, args[i], signature.args[i], types.intp) for i in (2, 5))
+            side = context.cast(builder, args[6], signature.args[6], types.int32)
+            one, begin = ir.Constant(LONG, 1), builder.mul(ray, ir.Constant(LONG, 3))
+
+            def of_ray(which: int, axis: int) -> Any:
+                place = builder.gep(data(which), [builder.add(begin, ir.Constant(LONG, axis))])
+                return in_all_lanes(builder, builder.load(place), FLOATS)
+
+            near, middle, far = (
+                builder.load(vector_at(builder, data(3), first, one, count, FLOATS), align=4) for count in range(3)
+            )
+            jitter = in_all_lanes(builder, args[4], FLOATS)
+            start, end = (
+                builder.fadd(low, builder.fmul(jitter, builder.fsub(high, low)))
+                for low, high in ((near, middle), (middle, far))
+            )
+            t = builder.fmul(builder.fadd(start, end), floats(0.5))
+            points = [builder.fadd(of_ray(0, axis), builder.fmul(of_ray(1, axis), t)) for axis in range(3)]
+            coordinates = cube_of(builder, points)
+            zero = ir.Constant(LONG, 0)
+            for axis, along in enumerate(coordinates):
+                builder.store(along, vector_at(builder, data(7), zero, ir.Constant(LONG, LANES), axis, FLOATS), align=4)
+            builder.store(_cells(builder, coordinates, side), vector_at(builder, data(8), zero, one, 0, INTS), align=4)
+            return context.get_dummy_value()
+
+        return types.none(origins, directions, ray, edges, shift, first, side, places, cells), generate
+
+    return steps
+
+
+# See `_steps`; one for each of `CONTRACTIONS`.
+steps_in_cube: Callable[..., None] = cast(Any, _steps(_unit_cube))
+steps_in_ball: Callable[..., None] = cast(Any, _steps(_ball))
+steps_in_contracted_cube: Callable[..., None] = cast(Any, _steps(_cube))
