@@ -70,7 +70,7 @@ TRAINING: tuple[Group, ...] = (
             Mutant("place // width], dim=-1).double() + 0.5", "place // width], dim=-1).double()"),
             Mutant("motions[:, :3, 3] / scale", "motions[:, :3, 3] * scale"),
             Mutant("pose @ motion for", "motion @ pose for"),
-            Mutant("if not FIRST_SHARE < share < LAST_SHARE:", "if not FIRST_SHARE < share:"),
+            Mutant("if not FIRST_SHARE < fraction < LAST_SHARE:", "if not FIRST_SHARE < fraction:"),
             Mutant(
                 "refined(frame, frame.world_from_cam) for frame in held_out",
                 "refined(frame, poses[0]) for frame in held_out",
@@ -177,7 +177,7 @@ TRAINING: tuple[Group, ...] = (
             Mutant("axis=1) * training_from_scene.scale", "axis=1)"),
             Mutant("(surface.misses_px[kept] / HALF_ERROR_PX) ** 2", "surface.misses_px[kept] / HALF_ERROR_PX"),
             Mutant("(trust * off_target).mean()", "off_target.mean()"),
-            Mutant("1.0 - share / LAST_SHARE", "1.0 - share"),
+            Mutant("1.0 - fraction / LAST_SHARE", "1.0 - fraction"),
             Mutant("max(1, len(drawn.numbers) // PIXELS_PER_POINT)", "1"),
         ),
     ),
@@ -192,26 +192,29 @@ TRAINING: tuple[Group, ...] = (
             Mutant("painted - one < LEAST_SKY_DB", "one - painted < LEAST_SKY_DB"),
             Mutant("if min(check.misses_px) < SURELY_MISSED_PX", "if max(check.misses_px) < SURELY_MISSED_PX"),
             Mutant('if model.cameras == "poses" else model', 'if model.cameras == "none" else model'),
-            Mutant("value = asked.cameras if learns else", "value = 'focal' if learns else"),
+            Mutant("value = requested.cameras if learns else", "value = 'focal' if learns else"),
             Mutant('("cameras" in facts.fixed and not learns)', '"cameras" in facts.fixed'),
             Mutant(
-                "race = Race(trials, start, purse, _without_poses(model))", "race = Race(trials, start, purse, model)"
+                "race = Race(trials, start, budget, _without_poses(model))", "race = Race(trials, start, budget, model)"
             ),
             Mutant("_without_poses(model),", "model,"),
             Mutant(
-                'return fit and asked.cameras == "fixed" and not facts.has_alpha',
-                'return fit and asked.cameras == "fixed"',
+                'return fit and requested.cameras == "fixed" and not facts.has_alpha',
+                'return fit and requested.cameras == "fixed"',
             ),
             Mutant(
-                'return fit and asked.cameras == "fixed" and not facts.has_alpha', "return fit and not facts.has_alpha"
+                'return fit and requested.cameras == "fixed" and not facts.has_alpha',
+                "return fit and not facts.has_alpha",
             ),
-            Mutant("return bool(asked.points)", "return True"),
+            Mutant("return bool(requested.points)", "return True"),
             Mutant(
                 "judge_supported([without.trial], change, [start.trial]",
                 "judge_supported([start.trial], change, [without.trial]",
             ),
-            Mutant("model, start = asked, without", "model = asked"),
-            Mutant("return Selection(model, tuple(told), purse.spent)", "return Selection(asked, (), purse.spent)"),
+            Mutant("model, start = requested, without", "model = requested"),
+            Mutant(
+                "return Selection(model, tuple(decided), budget.spent)", "return Selection(requested, (), budget.spent)"
+            ),
             Mutant("MOST_START_STEPS = 250", "MOST_START_STEPS = 1000"),
         ),
     ),
@@ -277,8 +280,8 @@ TRAINING: tuple[Group, ...] = (
             Mutant("_FARTHEST_STEP / seen.clamp_min(_FARTHEST_STEP)", "1.0"),
             Mutant("focal[:, None] ** 2 * np", "focal[:, None] * np"),
             Mutant("rate * self.newton.change(", "self.newton.change("),
-            Mutant("if share > HOLDING_SHARES[0] else 0.0", "if share > 0.0 else 0.0"),
-            Mutant("share, DAMPING_SHARES, DAMPINGS", "share, DAMPING_SHARES, DAMPINGS[::-1]"),
+            Mutant("if fraction > HOLDING_SHARES[0] else 0.0", "if fraction > 0.0 else 0.0"),
+            Mutant("fraction, DAMPING_SHARES, DAMPINGS", "fraction, DAMPING_SHARES, DAMPINGS[::-1]"),
             Mutant("len(by_pose) * by_pose", "by_pose"),
             Mutant("self.values[index, names.index(FOCAL)] = log_focal", "pass"),
             Mutant("LENS_RATE * rate)", "rate)"),

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from nerfcli.kernels.contraction import sample_widths
 from nerfcli.kernels.interface import (
+    UNSEEN,
     HashGrid,
     Intervals,
     LightEnds,
@@ -24,8 +25,6 @@ from nerfcli.kernels.interface import (
 )
 from nerfcli.kernels.reference.compositing import contracted_distance, off_target, scale_gradients, sum_along_rays
 
-# The colour of samples that are not asked for theirs; what they may miss is half of their weight.
-UNSEEN = 0.5
 # Samples whose densities are computed at a time, where marching cannot stop behind what it meets.
 CHUNK = 2**16
 

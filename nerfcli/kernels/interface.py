@@ -13,6 +13,9 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+# The colour of samples that are not asked for theirs; what they may miss is half of their weight.
+UNSEEN = 0.5
+
 
 class Rays(NamedTuple):
     """R rays in the training frame.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nerfcli.kernels import March, Rays, RaysSeen
-from nerfcli.kernels.composition import UNSEEN
+from nerfcli.kernels.interface import UNSEEN
 from nerfcli.render.model import Marching, Model
 
 # The default: a quarter of a grey level.

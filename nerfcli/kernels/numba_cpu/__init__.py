@@ -16,6 +16,7 @@ from nerfcli.kernels.numba_cpu.projection import back_project, project
 from nerfcli.kernels.numba_cpu.rays import ray_indices
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows
 from nerfcli.kernels.numba_cpu.total_variation import denoise_total_variation
+from nerfcli.kernels.numba_cpu.tracing import trace_rays
 from nerfcli.kernels.numba_cpu.visible import visible_samples
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "radiance",
     "ray_indices",
     "sample_coordinates",
+    "trace_rays",
     "visible_samples",
     "warm_up",
 ]
@@ -76,7 +78,9 @@ def _run_all() -> None:
     shapes = ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))
     weights = tuple(torch.zeros(shape, requires_grad=True) for shape in shapes)
     rays, along = Rays(direction, direction, jitter), March(torch.tensor([0.5, 1.0, 1.5, 2.0]), occupied, "l2", 10.0)
-    _, _, _, encoded, points, *_ = visible_samples(rays, along, HashGrid(table, (2,) * 8, weights))
+    grid = HashGrid(table, (2,) * 8, weights)
+    _, _, _, encoded, points, *_ = visible_samples(rays, along, grid)
+    trace_rays(rays, along, grid, background=torch.zeros(3), shares=(0.5,), negligible=0.0)
     occupied_samples(rays, along)
     spans = (starts, starts + 1)
     sample_coordinates(direction, direction, *spans, offsets=offsets, contraction="l2", known=None)

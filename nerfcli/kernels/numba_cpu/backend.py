@@ -12,7 +12,7 @@ from torch import Tensor
 from nerfcli.kernels import numba_cpu, reference
 from nerfcli.kernels.composition import ComposedBackend, Parts
 from nerfcli.kernels.harmonics import spherical_harmonics
-from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
+from nerfcli.kernels.interface import HashGrid, March, Medium, Rays, RaysSeen, Samples
 from nerfcli.kernels.numba_cpu.row_adam import FEATURES
 from nerfcli.kernels.reference.backend import encode_into
 
@@ -28,6 +28,23 @@ class NumbaBackend(ComposedBackend):
         if device.type == "cpu" and dtype == torch.float32:
             return None
         return f"it supports float32 on the CPU only, not {str(dtype).removeprefix('torch.')} on {device.type}"
+
+    @torch.no_grad()
+    def trace_rays(
+        self,
+        rays: Rays,
+        march: March,
+        medium: HashGrid | Medium,
+        *,
+        background: Tensor,
+        shares: tuple[float, ...] = (),
+        negligible: float = 0.0,
+    ) -> RaysSeen:
+        if not isinstance(medium, HashGrid) or not _fits(medium, medium.layers):
+            return super().trace_rays(rays, march, medium, background=background, shares=shares, negligible=negligible)
+        return numba_cpu.trace_rays(
+            rays.detached(), march, medium, background=background, shares=shares, negligible=negligible
+        )
 
     def hash_encode(
         self, points: Tensor, table: Tensor, resolutions: tuple[int, ...], *, sink: Tensor | None = None
@@ -70,7 +87,7 @@ class NumbaBackend(ComposedBackend):
         return numba_cpu.denoise_total_variation(target, threshold, dual, iterations=iterations)
 
     def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
-        module = numba_cpu if _fits(grid) else reference
+        module = numba_cpu if _fits(grid, grid.layers[:2]) else reference
         return module.visible_samples(rays, march, grid)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
@@ -112,9 +129,7 @@ def _encode(
     return encode_into(points, table, resolutions, widths=widths, sink=sink)
 
 
-def _fits(grid: HashGrid) -> bool:
-    """Whether marching is compiled for these sizes."""
+def _fits(grid: HashGrid, layers: tuple[Tensor, ...]) -> bool:
+    """Whether marching is compiled for these sizes of a table and of layers."""
     code = grid.table.new_empty(0, grid.table.shape[0] * grid.table.shape[2])
-    return numba_cpu.can_hash_encode(code, grid.table, grid.resolutions) and numba_cpu.can_radiance(
-        code, grid.layers[:2]
-    )
+    return numba_cpu.can_hash_encode(code, grid.table, grid.resolutions) and numba_cpu.can_radiance(code, layers)

@@ -40,39 +40,46 @@ def _variance_fraction(x: Any, alpha: Any) -> Any:
     return 1.0 / (x * x) - (1.0 - alpha) / (alpha * alpha)
 
 
+# Columns of the running sums of a ray: optical depth, weight, mean and sum of squared differences from it, heaviest
+# interval and its weight, how many quantiles have been passed.
+DEPTH, MASS, MEAN, SQUARES, HEAVIEST, LARGEST, PASSED = range(7)
+COLUMNS = 7
+
+
+@numba.njit(inline="always")
+def add_interval(sums: Any, ray: Any, start: Any, length: Any, density: Any, targets: Any, quantiles: Any) -> Any:
+    """Add the next interval of a ray to its row of `sums`, zero at first, and return its weight.
+
+    The optical depths `targets` increase; where the ray passes them goes to its row of `quantiles`.
+    """
+    depth, own = sums[ray, DEPTH], density * length
+    alpha = -np.expm1(-own)
+    weight = np.exp(-depth) * alpha
+    if weight > 0.0:
+        place = start + length * _mean_fraction(own, alpha)
+        sums[ray, MASS] += weight
+        step = place - sums[ray, MEAN]
+        sums[ray, MEAN] += step * (weight / sums[ray, MASS])
+        within = length * length * _variance_fraction(own, alpha)
+        sums[ray, SQUARES] += weight * (step * (place - sums[ray, MEAN]) + within)
+        if weight > sums[ray, LARGEST]:
+            sums[ray, LARGEST], sums[ray, HEAVIEST] = weight, place
+    passed = np.int64(sums[ray, PASSED])
+    while passed < targets.shape[0] and depth + own >= targets[passed]:
+        inside = (targets[passed] - depth) / density if density > 0.0 else 0.0
+        quantiles[ray, passed] = start + min(max(inside, 0.0), length)
+        passed += 1
+    sums[ray, PASSED] = passed
+    sums[ray, DEPTH] = depth + own
+    return weight
+
+
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def _light_ends(density: Any, starts: Any, ends: Any, offsets: Any, targets: Any, out: Any, quantiles: Any) -> None:
-    """Columns of out: opacity, transmittance, mean, spread, heaviest, largest."""
+def _light_ends(density: Any, starts: Any, ends: Any, offsets: Any, targets: Any, sums: Any, quantiles: Any) -> None:
     for ray in numba.prange(offsets.shape[0] - 1):
-        depth, mass, mean, squares = 0.0, 0.0, 0.0, 0.0
-        largest, heaviest, crossed = 0.0, np.nan, 0
-        quantiles[ray, :] = np.nan
         for i in range(offsets[ray], offsets[ray + 1]):
             start, length = np.float64(starts[i]), np.float64(ends[i]) - np.float64(starts[i])
-            sigma = np.float64(density[i])
-            own = sigma * length
-            alpha = -np.expm1(-own)
-            weight = np.exp(-depth) * alpha
-            if weight > 0.0:
-                place = start + length * _mean_fraction(own, alpha)
-                mass += weight
-                step = place - mean
-                mean += step * (weight / mass)
-                squares += weight * (step * (place - mean) + length * length * _variance_fraction(own, alpha))
-                if weight > largest:
-                    largest, heaviest = weight, place
-            # Targets increase.
-            while crossed < targets.shape[0] and depth + own >= targets[crossed]:
-                inside = (targets[crossed] - depth) / sigma if sigma > 0.0 else 0.0
-                quantiles[ray, crossed] = start + min(max(inside, 0.0), length)
-                crossed += 1
-            depth += own
-        out[ray, 0] = -np.expm1(-depth)
-        out[ray, 1] = np.exp(-depth)
-        out[ray, 2] = mean if mass > 0.0 else np.nan
-        out[ray, 3] = np.sqrt(squares / mass) if mass > 0.0 else np.nan
-        out[ray, 4] = heaviest
-        out[ray, 5] = largest
+            add_interval(sums, ray, start, length, np.float64(density[i]), targets, quantiles)
 
 
 def light_ends(
@@ -80,14 +87,33 @@ def light_ends(
 ) -> LightEnds:
     """See `depth.light_ends`; float32 on the CPU, without gradients."""
     use_threads()
-    order = np.argsort(shares, kind="stable")
-    targets = torch.from_numpy(-np.log1p(-np.asarray(shares, dtype=np.float64)[order]))
-    rays = len(offsets) - 1
-    out, quantiles = torch.empty(rays, 6), torch.empty(rays, len(shares))
-    tensors = (density, starts, ends, offsets, targets, out, quantiles)
-    _light_ends(*(x.detach().contiguous().numpy() for x in tensors))
-    back = torch.from_numpy(np.argsort(order, kind="stable"))
-    return LightEnds(*(out[:, column] for column in range(6)), quantiles=quantiles[:, back])
+    sums, quantiles, targets = new_sums(len(offsets) - 1, shares)
+    arrays = [x.detach().contiguous().numpy() for x in (density, starts, ends, offsets)]
+    _light_ends(arrays[0], arrays[1], arrays[2], arrays[3], targets, sums, quantiles)
+    return light_ends_of(sums, quantiles, shares)
+
+
+def new_sums(rays: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return sums (R, COLUMNS), quantiles (R, Q) that no ray has passed, and their optical depths in order (Q,)."""
+    targets = np.sort(-np.log1p(-np.asarray(shares, dtype=np.float64)), kind="stable")
+    return np.zeros((rays, COLUMNS)), np.full((rays, len(shares)), np.nan, np.float32), targets
+
+
+def light_ends_of(sums: np.ndarray, quantiles: np.ndarray, shares: tuple[float, ...]) -> LightEnds:
+    """Return what rays came to whose intervals have all been added."""
+    depth, mass, mean, squares, heaviest, largest, _ = torch.from_numpy(sums).unbind(1)
+    seen = mass > 0.0
+    spread = torch.sqrt(squares / torch.where(seen, mass, 1.0))
+    back = np.argsort(np.argsort(shares, kind="stable"), kind="stable")
+    return LightEnds(
+        opacity=-torch.expm1(-depth).float(),
+        transmittance=torch.exp(-depth).float(),
+        mean=torch.where(seen, mean, torch.nan).float(),
+        spread=torch.where(seen, spread, torch.nan).float(),
+        heaviest=torch.where(largest > 0.0, heaviest, torch.nan).float(),
+        largest=largest.float(),
+        quantiles=torch.from_numpy(quantiles[:, back]),
+    )
 
 
 @numba.njit(inline="always")

@@ -33,7 +33,7 @@ def _fade(widths: Any, first: Any, count: Any, resolution: Any, weight: Any) -> 
                 weight[corner * BLOCK + i] /= max(side * widths[first + i], one)
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def _prepare_block(
     points: Any, stride: Any, widths: Any, first: Any, count: Any, level: Any, resolution: Any, rows: Any, flat: Any,
     scratch: Any,
@@ -60,7 +60,7 @@ def new_scratch() -> Any:
     return np.empty(3 * BLOCK, np.float32), np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def encode_range(
     points: Any, stride: Any, widths: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any,
     out: Any,
@@ -131,7 +131,7 @@ def _encode_backward(
                         scatter_rows(flat, offset, index, weight, i, BLOCK, gradient, at)
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def _slopes(
     inside: Any, count: Any, resolution: Any, dots: Any, points: Any, widths: Any, first: Any, out: Any
 ) -> None:

@@ -37,42 +37,42 @@ D1, D2, C1, C2, C3 = 0, 1024, 1536, 2560, 3584
 WEIGHTS = 4096
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def _layer_32(x: Any, weights: Any, at: Any, out: Any) -> None:
     """out (TILE, 32) = x (TILE, 32) @ weights[at:] (32, 32)."""
     for row in range(0, TILE, ROWS):
         product_32(x, row * WIDTH, WIDTH, 1, weights, at, WIDTH, WIDTH, out, row * WIDTH, WIDTH)
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def _rectified_32(x: Any, weights: Any, at: Any, out: Any) -> None:
     """out (TILE, 32) = max(0, x (TILE, 32) @ weights[at:] (32, 32))."""
     for row in range(0, TILE, ROWS):
         rectified_product_32(x, row * WIDTH, WIDTH, 1, weights, at, WIDTH, WIDTH, out, row * WIDTH, WIDTH)
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def _layer_16(x: Any, weights: Any, at: Any, out: Any) -> None:
     """out (TILE, 16) = x (TILE, 32) @ weights[at:] (32, 16)."""
     for row in range(0, TILE, ROWS):
         product_16(x, row * WIDTH, WIDTH, 1, weights, at, OUT, WIDTH, out, row * OUT, OUT)
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def _back_from_16(g: Any, weights: Any, at: Any, depth: Any, out: Any) -> None:
     """out (TILE, 32) = g (TILE, 16)[:, :depth] @ weights[at:] (depth, 32)."""
     for row in range(0, TILE, ROWS):
         product_32(g, row * OUT, OUT, 1, weights, at, WIDTH, depth, out, row * WIDTH, WIDTH)
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def _weights_32(x: Any, g: Any, sums: Any, at: Any) -> None:
     """sums[at:] (32, 32) += x (TILE, 32)^T @ g (TILE, 32)."""
     for row in range(0, WIDTH, ROWS):
         add_product_32(x, row, 1, WIDTH, g, 0, WIDTH, TILE, sums, at + row * WIDTH, WIDTH)
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
 def _weights_16(x: Any, g: Any, sums: Any, at: Any) -> None:
     """sums[at:] (32, 16) += x (TILE, 32)^T @ g (TILE, 16)."""
     for row in range(0, WIDTH, ROWS):
@@ -124,7 +124,18 @@ def _channels(out: Any, channels: Any) -> None:
             channels[3 * i + channel] = out[i * OUT + channel]
 
 
-@numba.njit(inline="always")
+@numba.njit(nogil=True, error_model="numpy")
+def density_tile(
+    encoded: Any, first: Any, count: Any, weights: Any, x: Any, h: Any, geometry: Any, density: Any
+) -> None:
+    """Outputs (TILE, 16) of the density network and densities (TILE,) of `count` samples; see `density_range`."""
+    _load_rows(encoded, first, count, x)
+    _rectified_32(x, weights, D1, h)
+    _layer_16(h, weights, D2, geometry)
+    _densities(geometry, density)
+
+
+@numba.njit(nogil=True, error_model="numpy")
 def density_range(
     encoded: Any, begin: Any, end: Any, weights: Any, x: Any, h: Any, geometry: Any, density: Any
 ) -> None:
@@ -132,12 +143,20 @@ def density_range(
     own = np.empty(TILE, np.float32)
     for first in range(begin, end, TILE):
         count = min(TILE, end - first)
-        _load_rows(encoded, first, count, x)
-        _rectified_32(x, weights, D1, h)
-        _layer_16(h, weights, D2, geometry)
-        _densities(geometry, own)
+        density_tile(encoded, first, count, weights, x, h, geometry, own)
         for i in range(count):
             density[first + i] = own[i]
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def colour_range(inputs: Any, weights: Any, x: Any, h: Any, out: Any, channels: Any) -> None:
+    """Colours (3 TILE,) of a tile of `_colour_inputs`; scratch space: x and h of TILE * WIDTH, out of TILE * OUT."""
+    _rectified_32(inputs, weights, C1, h)
+    _rectified_32(h, weights, C2, x)
+    _layer_16(x, weights, C3, out)
+    _channels(out, channels)
+    for i in range(3 * TILE):
+        channels[i] = sigmoid(channels[i])
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -168,15 +187,10 @@ def _radiance_forward(
             _rectified_32(x, weights, D1, h)
             _layer_16(h, weights, D2, geometry)
             _colour_inputs(geometry, harmonics, rays, first, count, x)
-            _rectified_32(x, weights, C1, h)
-            _rectified_32(h, weights, C2, x)
-            _layer_16(x, weights, C3, out)
+            colour_range(x, weights, x, h, out, channels)
             _densities(geometry, own)
             for i in range(count):
                 density[first + i] = own[i]
-            _channels(out, channels)
-            for i in range(3 * TILE):
-                channels[i] = sigmoid(channels[i])
             for i in range(3 * count):
                 rgb[3 * first + i] = channels[i]
 

@@ -33,7 +33,7 @@ def _block(x: Any, side: Any) -> Any:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _occupied_blocks(occupied: Any) -> Any:
+def occupied_blocks(occupied: Any) -> Any:
     """Which blocks of cells are occupied, or touch one that is."""
     side = occupied.shape[0]
     blocks = (side + BLOCK_SIDE - 1) // BLOCK_SIDE
@@ -88,6 +88,75 @@ def _stretch(origins: Any, directions: Any, ray: Any, t: Any, contraction: Any) 
 
 
 @numba.njit(inline="always")
+def new_round() -> Any:
+    """Lanes without rays, and room for the samples of a round: `lanes` and `round_` of `fill_round`."""
+    lanes = np.full(LANES, -1, np.int64), np.zeros(LANES, np.int64), np.zeros(LANES, np.float64)
+    look = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
+    samples = np.empty(ROUND, np.int64), np.empty((ROUND, 2), np.float32), np.empty((3, ROUND), np.float32)
+    return lanes, look, samples
+
+
+@numba.njit(inline="always")
+def block_reach(side: Any, contraction: Any) -> Any:
+    """The longest interval of which `_may_hold_something` knows where it goes: a block is BLOCK_SIDE / side wide."""
+    return np.float32(BLOCK_SIDE / side * (4.0 if contraction == 0 else 7.8))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def fill_round(
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
+    cones: Any, coming: Any, last_ray: Any, lane_ray: Any, lane_next: Any, lane_depth: Any, places: Any, cells: Any,
+    sample_lane: Any, sample_span: Any, points: Any, widths: Any,
+) -> Any:  # fmt: skip
+    """Find the next samples of the rays in the lanes, up to AHEAD each; a lane without a ray takes the one `coming`.
+
+    A sample's lane, start and end, coordinates and width go to the last four arrays.
+
+    Returns:
+        how many samples there are, and the ray that comes next.
+    """
+    intervals = edges.shape[0] - 2 - CHUNK
+    reach = block_reach(side, contraction)
+    filled = 0
+    for lane in range(LANES):
+        taken = 0
+        while taken == 0:
+            if lane_ray[lane] < 0:
+                if coming == last_ray:
+                    break
+                lane_ray[lane], lane_next[lane], lane_depth[lane] = coming, 0, 0.0
+                coming += 1
+            ray, k = lane_ray[lane], lane_next[lane]
+            while k < intervals and taken == 0:
+                start, end = cut(edges, jitter[ray], k), cut(edges, jitter[ray], k + CHUNK)
+                if not _may_hold_something(origins, directions, ray, start, end, blocks, side, reach, contraction):
+                    k += CHUNK
+                    continue
+                look_ahead(origins, directions, edges, jitter, ray, k, side, contraction, places, cells)
+                past = min(CHUNK, intervals - k)
+                for i in range(past):
+                    if cells[i] >= 0 and occupied[cells[i]]:
+                        sample_lane[filled] = lane
+                        sample_span[filled, 0] = cut(edges, jitter[ray], k + i)
+                        sample_span[filled, 1] = cut(edges, jitter[ray], k + i + 1)
+                        for axis in range(3):
+                            points[axis, filled] = places[axis * CHUNK + i]
+                        if cones.shape[0] > 0:
+                            t = (sample_span[filled, 0] + sample_span[filled, 1]) * np.float32(0.5)
+                            widths[filled] = cones[ray] * t * _stretch(origins, directions, ray, t, contraction)
+                        filled += 1
+                        taken += 1
+                        if taken == AHEAD:
+                            past = i + 1
+                            break
+                k += past
+            lane_next[lane] = k
+            if taken == 0:
+                lane_ray[lane] = -1
+    return filled, coming
+
+
+@numba.njit(nogil=True, error_model="numpy")
 def _follow(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
     flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, coming: Any, last_ray: Any,
@@ -98,59 +167,19 @@ def _follow(
     A sample's ray goes to `owner`, its start, end, density and coordinates to `record`, its features to `code`.
     """
     intervals = edges.shape[0] - 2 - CHUNK
-    places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
-    lane_ray = np.full(LANES, -1, np.int64)
-    lane_next = np.zeros(LANES, np.int64)
-    lane_depth = np.zeros(LANES, np.float64)
-    tile_lane = np.empty(ROUND, np.int64)
-    tile_span = np.empty((ROUND, 2), np.float32)
-    points = np.empty((3, ROUND), np.float32)
+    (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
     widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
     encoded = np.empty((ROUND, WIDTH), np.float32)
     density = np.empty(ROUND, np.float32)
     scratch = new_scratch()
     x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
     geometry = np.empty(TILE * OUT, np.float32)
-    # A block is BLOCK_SIDE / side of the cube wide; see `_may_hold_something`.
-    reach = np.float32(BLOCK_SIDE / side * (4.0 if contraction == 0 else 7.8))
     found = 0
     while True:
-        filled = 0
-        for lane in range(LANES):
-            taken = 0
-            while taken == 0:
-                if lane_ray[lane] < 0:
-                    if coming == last_ray:
-                        break
-                    lane_ray[lane], lane_next[lane], lane_depth[lane] = coming, 0, 0.0
-                    coming += 1
-                ray, k = lane_ray[lane], lane_next[lane]
-                while k < intervals and taken == 0:
-                    start, end = cut(edges, jitter[ray], k), cut(edges, jitter[ray], k + CHUNK)
-                    if not _may_hold_something(origins, directions, ray, start, end, blocks, side, reach, contraction):
-                        k += CHUNK
-                        continue
-                    look_ahead(origins, directions, edges, jitter, ray, k, side, contraction, places, cells)
-                    past = min(CHUNK, intervals - k)
-                    for i in range(past):
-                        if cells[i] >= 0 and occupied[cells[i]]:
-                            tile_lane[filled] = lane
-                            tile_span[filled, 0] = cut(edges, jitter[ray], k + i)
-                            tile_span[filled, 1] = cut(edges, jitter[ray], k + i + 1)
-                            for axis in range(3):
-                                points[axis, filled] = places[axis * CHUNK + i]
-                            if cones.shape[0] > 0:
-                                t = (tile_span[filled, 0] + tile_span[filled, 1]) * np.float32(0.5)
-                                widths[filled] = cones[ray] * t * _stretch(origins, directions, ray, t, contraction)
-                            filled += 1
-                            taken += 1
-                            if taken == AHEAD:
-                                past = i + 1
-                                break
-                    k += past
-                lane_next[lane] = k
-                if taken == 0:
-                    lane_ray[lane] = -1
+        filled, coming = fill_round(
+            origins, directions, edges, jitter, occupied, blocks, side, contraction, cones, coming, last_ray, lane_ray,
+            lane_next, lane_depth, places, cells, sample_lane, sample_span, points, widths,
+        )  # fmt: skip
         if filled == 0:
             return found
         encode_range(
@@ -158,18 +187,18 @@ def _follow(
         )
         density_range(encoded, 0, filled, weights, x, h, geometry, density)
         for i in range(filled):
-            lane = tile_lane[i]
+            lane = sample_lane[i]
             if lane_depth[lane] < deepest:
                 ray = lane_ray[lane]
                 counts[ray] += 1
                 owner[found] = ray
-                record[found, 0], record[found, 1], record[found, 2] = tile_span[i, 0], tile_span[i, 1], density[i]
+                record[found, 0], record[found, 1], record[found, 2] = sample_span[i, 0], sample_span[i, 1], density[i]
                 for axis in range(3):
                     record[found, 3 + axis] = points[axis, i]
                 for feature in range(WIDTH):
                     code[found, feature] = encoded[i, feature]
                 found += 1
-                lane_depth[lane] += np.float64(density[i]) * np.float64(tile_span[i, 1] - tile_span[i, 0])
+                lane_depth[lane] += np.float64(density[i]) * np.float64(sample_span[i, 1] - sample_span[i, 0])
         for lane in range(LANES):
             if lane_ray[lane] >= 0 and (lane_depth[lane] >= deepest or lane_next[lane] >= intervals):
                 lane_ray[lane] = -1
@@ -221,7 +250,7 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
     counts, found = np.zeros(count, np.int64), np.zeros(threads, np.int64)
     _visible(
         rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
-        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), _occupied_blocks(along.occupied.numpy()),
+        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
         along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
         grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
         np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers[:2]), along.max_optical_depth,

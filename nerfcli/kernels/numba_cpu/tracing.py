@@ -1,0 +1,169 @@
+"""Rays of pictures through a hash grid: marching, encoding, both networks and compositing in one pass.
+
+Same operation as `ComposedBackend.trace_rays`, two to three times as fast: of a sample nothing is kept but its interval
+and density. Whether a sample is asked for its colour is decided as it comes, when the number of samples of its ray is
+not yet known: the light of those that are not asked is counted, and bounds the error as before.
+"""
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from nerfcli.kernels.contraction import CONTRACTIONS
+from nerfcli.kernels.harmonics import spherical_harmonics
+from nerfcli.kernels.interface import UNSEEN, HashGrid, Intervals, March, Rays, RaysSeen
+from nerfcli.kernels.numba_cpu.depth import add_interval, light_ends_of, new_sums
+from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
+from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, colour_range, density_tile, flat_weights
+from nerfcli.kernels.numba_cpu.rays import CHUNK, padded
+from nerfcli.kernels.numba_cpu.threads import use_threads
+from nerfcli.kernels.numba_cpu.visible import LANES, ROUND, fill_round, new_round, occupied_blocks
+
+# A sample may go without its colour if it weighs no more than this part of what all of a ray together may weigh.
+PART = 1 / 8
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _add_colours(
+    inputs: Any, count: Any, ray: Any, weight: Any, weights: Any, x: Any, h: Any, out: Any, channels: Any, colours: Any
+) -> None:
+    """Add the weighted colours of a tile of samples to those of their rays, and clear the tile."""
+    colour_range(inputs, weights, x, h, out, channels)
+    for i in range(count):
+        for channel in range(3):
+            colours[ray[i], channel] += weight[i] * np.float64(channels[3 * i + channel])
+    inputs[:] = np.float32(0)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _trace(
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
+    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, harmonics: Any, negligible: Any,
+    targets: Any, coming: Any, last_ray: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any,
+    owner: Any, record: Any,
+) -> Any:  # fmt: skip
+    """Add all that rays `coming` to `last_ray` meet to their rows of sums, quantiles, colours and unseen weight.
+
+    The samples go to `owner` and `record` in the order in which they are found.
+
+    Returns:
+        how many samples there are.
+    """
+    intervals = edges.shape[0] - 2 - CHUNK
+    (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
+    widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
+    encoded = np.empty((ROUND, WIDTH), np.float32)
+    scratch = new_scratch()
+    x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
+    geometry, out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
+    density, channels = np.empty(TILE, np.float32), np.empty(3 * TILE, np.float32)
+    inputs, waiting = np.zeros(TILE * WIDTH, np.float32), 0
+    waiting_ray, waiting_weight = np.empty(TILE, np.int64), np.empty(TILE, np.float64)
+    found = 0
+    while True:
+        filled, coming = fill_round(
+            origins, directions, edges, jitter, occupied, blocks, side, contraction, cones, coming, last_ray, lane_ray,
+            lane_next, lane_depth, places, cells, sample_lane, sample_span, points, widths,
+        )  # fmt: skip
+        if filled == 0:
+            break
+        encode_range(
+            points.reshape(-1), ROUND, widths, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1)
+        )
+        for first in range(0, filled, TILE):
+            count = min(TILE, filled - first)
+            density_tile(encoded, first, count, weights, x, h, geometry, density)
+            for i in range(count):
+                lane = sample_lane[first + i]
+                if not lane_depth[lane] < deepest:
+                    continue
+                ray, start, end = lane_ray[lane], sample_span[first + i, 0], sample_span[first + i, 1]
+                length, own = np.float64(end) - np.float64(start), np.float64(density[i])
+                weight = add_interval(sums, ray, np.float64(start), length, own, targets, quantiles)
+                lane_depth[lane] += own * length
+                owner[found] = ray
+                record[found, 0], record[found, 1], record[found, 2] = start, end, density[i]
+                counts[ray] += 1
+                found += 1
+                if weight <= PART * negligible and unseen[ray] + weight <= negligible:
+                    unseen[ray] += weight
+                    continue
+                for j in range(OUT):
+                    inputs[waiting * WIDTH + j] = geometry[i * OUT + j]
+                    inputs[waiting * WIDTH + OUT + j] = harmonics[ray, j]
+                waiting_ray[waiting], waiting_weight[waiting] = ray, weight
+                waiting += 1
+                if waiting == TILE:
+                    _add_colours(inputs, waiting, waiting_ray, waiting_weight, weights, x, h, out, channels, colours)
+                    waiting = 0
+        for lane in range(LANES):
+            if lane_ray[lane] >= 0 and (not lane_depth[lane] < deepest or lane_next[lane] >= intervals):
+                lane_ray[lane] = -1
+    _add_colours(inputs, waiting, waiting_ray, waiting_weight, weights, x, h, out, channels, colours)
+    return found
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _trace_all(
+    origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
+    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, harmonics: Any, negligible: Any,
+    targets: Any, borders: Any, sums: Any, quantiles: Any, colours: Any, unseen: Any, counts: Any, owner: Any,
+    record: Any, found: Any,
+) -> None:  # fmt: skip
+    """`_trace`, by a thread for the rays from each border to the next."""
+    for thread in numba.prange(len(borders) - 1):
+        found[thread] = _trace(
+            origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows, resolutions, weights,
+            deepest, cones, harmonics, negligible, targets, borders[thread], borders[thread + 1], sums, quantiles,
+            colours, unseen, counts, owner[thread], record[thread],
+        )  # fmt: skip
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _sort(borders: Any, offsets: Any, owner: Any, record: Any, found: Any, spans: Any) -> None:
+    """Bring intervals into the order of the rays; along each ray they are in order already."""
+    for thread in numba.prange(len(borders) - 1):
+        place = offsets[borders[thread] : borders[thread + 1]].copy()
+        for i in range(found[thread]):
+            ray = owner[thread, i] - borders[thread]
+            for j in range(3):
+                spans[j, place[ray]] = record[thread, i, j]
+            place[ray] += 1
+
+
+def trace_rays(
+    rays: Rays, along: March, grid: HashGrid, *, background: Tensor, shares: tuple[float, ...], negligible: float
+) -> RaysSeen:
+    """See `Backend.trace_rays`; float32 on the CPU."""
+    threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
+    cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
+    borders = np.arange(threads + 1) * count // threads
+    # Room for all samples of all rays: memory that nobody writes to is never really taken.
+    room = (threads, -(-count // threads) * intervals)
+    owner, record = np.empty(room, np.int64), np.empty((*room, 3), np.float32)
+    counts, found = np.zeros(count, np.int64), np.zeros(threads, np.int64)
+    sums, quantiles, targets = new_sums(count, shares)
+    colours, unseen = np.zeros((count, 3)), np.zeros(count)
+    _trace_all(
+        rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
+        rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
+        along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
+        grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
+        np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers), along.max_optical_depth,
+        cones.contiguous().numpy(), spherical_harmonics(rays.directions, grid.view_degree).contiguous().numpy(),
+        negligible, targets, borders, sums, quantiles, colours, unseen, counts, owner, record, found,
+    )  # fmt: skip
+    offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
+    spans = torch.empty(3, int(offsets[-1]))
+    _sort(borders, offsets, owner, record, found, spans.numpy())
+    starts, ends, density = spans
+    light, left = light_ends_of(sums, quantiles, shares), torch.from_numpy(np.exp(-sums[:, 0]))
+    seen = torch.from_numpy(colours + UNSEEN * unseen[:, None]) + left[:, None] * background
+    stopped = left <= math.exp(-along.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
+    behind = torch.maximum(background, 1.0 - background).amax(-1)  # how far any colour is from the background's
+    error = UNSEEN * torch.from_numpy(unseen) + torch.where(stopped, left * behind, 0.0)
+    return RaysSeen(seen.float(), light, error.float(), Intervals(density, starts, ends, torch.from_numpy(offsets)))
