@@ -97,20 +97,20 @@ GROUPS: tuple[Group, ...] = (
             Mutant("< march.max_optical_depth\n", "< 2 * march.max_optical_depth\n"),
             Mutant("(1, 0))[offsets]", "(0, 1))[offsets]"),
             Mutant(
-                "self._encoded(samples, medium, widths=widths, sink=sink)",
-                "self._encoded(samples, medium, widths=None, sink=sink)",
+                "self._encoded(samples, grid, widths=widths, sink=sink)",
+                "self._encoded(samples, grid, widths=None, sink=sink)",
             ),
             Mutant(
-                "self._encoded(samples, medium, widths=widths, sink=sink)",
-                "self._encoded(samples, medium, widths=widths, sink=None)",
+                "self._encoded(samples, grid, widths=widths, sink=sink)",
+                "self._encoded(samples, grid, widths=widths, sink=None)",
             ),
             Mutant(
-                "self._networks(encoded, rays.directions, index, medium)",
-                "self._networks(encoded, -rays.directions, index, medium)",
+                "self._networks(encoded, directions, index, grid)",
+                "self._networks(encoded, -directions, index, grid)",
             ),
             Mutant(
-                "self._networks(encoded, rays.directions, index, medium)",
-                "self._networks(encoded.flip(0), rays.directions, index, medium)",
+                "self._networks(encoded, directions, index, grid)",
+                "self._networks(encoded.flip(0), directions, index, grid)",
             ),
             Mutant(
                 "density, rgb = medium.radiance(samples.coordinates,",
@@ -127,7 +127,7 @@ GROUPS: tuple[Group, ...] = (
             Mutant("rgb, distance=starts", "rgb, distance=ends"),
             Mutant("rgb, distance=starts", "rgb, distance=2 * starts"),
             Mutant("rays.origins.requires_grad or rays.directions", "rays.origins.requires_grad and rays.directions"),
-            Mutant("apart, off, offsets[-1])", "apart, off, offsets[0])"),
+            Mutant("torch.tensor(len(starts))", "torch.tensor(len(offsets))"),
             Mutant(
                 "background=background.expand(len(rays.origins), 3)",
                 "background=0.0 * background.expand(len(rays.origins), 3)",

@@ -172,13 +172,13 @@ TRAINING: tuple[Group, ...] = (
         "",
         (),
         (
-            Mutant(").among(pool)", ")"),
+            Mutant("    ).among(pool)\n\n\ndef stereo", "    )\n\n\ndef stereo"),
             Mutant("row * width + column", "column * width + row"),
             Mutant("axis=1) * training_from_scene.scale", "axis=1)"),
             Mutant("(surface.misses_px[kept] / HALF_ERROR_PX) ** 2", "surface.misses_px[kept] / HALF_ERROR_PX"),
             Mutant("(trust * off_target).mean()", "off_target.mean()"),
             Mutant("1.0 - fraction / LAST_SHARE", "1.0 - fraction"),
-            Mutant("max(1, len(drawn.numbers) // PIXELS_PER_POINT)", "1"),
+            Mutant("// PIXELS_PER_POINT // len(self.known)", "// PIXELS_PER_POINT"),
         ),
     ),
     Group(
@@ -208,8 +208,8 @@ TRAINING: tuple[Group, ...] = (
             ),
             Mutant("return bool(requested.points)", "return True"),
             Mutant(
-                "judge_supported([without.trial], change, [start.trial]",
-                "judge_supported([start.trial], change, [without.trial]",
+                "judge_supported([without.trial], (one.component, one.value), [start.trial]",
+                "judge_supported([start.trial], (one.component, one.value), [without.trial]",
             ),
             Mutant("model, start = requested, without", "model = requested"),
             Mutant(
