@@ -26,6 +26,7 @@ from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.loop import Progress, train
+from nerfcli.train.preparation import prepare
 
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 LEARNED = Components(background="sphere", exposure="learned")
@@ -175,6 +176,36 @@ def test_a_ray_sees_the_background_through_what_the_field_lets_pass_as_its_photo
     assert parts.background is not None
     assert parts.background.logits.grad is not None
     assert (parts.background.logits.grad > 0).all()
+
+
+def test_a_background_begins_with_the_colour_of_the_sky():
+    colours = torch.tensor([[0.2, 0.4, 0.8], [0.9, 0.1, 0.1]])
+    for sky in ([True, False], [False, True]):
+        parts, _ = parts_of(replace(LEARNED, exposure="none"), colours, [0.0, 0.0])
+        parts.show_sky(torch.tensor(sky))
+        assert parts.background is not None
+        assert parts.background(torch.tensor([[0.0, 0.6, -0.8]]))[0].tolist() == pytest.approx(
+            colours[sky.index(True)].tolist(), abs=0.003
+        )
+
+
+def test_light_of_the_sky_does_not_end_before_it(capture, tmp_path):
+    prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    passed = []
+    for sky in (None, torch.ones(len(prepared.pool.colours), dtype=torch.bool)):
+        fitting = replace(prepared, sky=sky).fitting()
+        for step in range(60):
+            fitting.advance(step / 60)
+        drawn = prepared.pool.draw(64, torch.Generator().manual_seed(0))
+        passed.append(float(fitting.light_from_beyond(drawn, distance=math.inf).mean()))
+    assert 1.0 - passed[1] < 0.7 * (1.0 - passed[0])
+
+
+def test_a_sky_that_no_pixel_shows_changes_nothing():
+    parts, drawn = parts_of(replace(LEARNED, exposure="none"), torch.full((2, 3), 0.5), [0.0, 0.0])
+    parts.show_sky(torch.tensor([False, False]))
+    assert parts.sky is None
+    assert parts.compared(torch.zeros(2, 3), torch.ones(2), drawn, behind=torch.zeros(2, 3))[0].requires_grad
 
 
 def test_a_saturated_pixel_says_only_that_the_light_was_at_least_that_bright():

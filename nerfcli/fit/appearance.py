@@ -60,14 +60,21 @@ class Appearance(nn.Module):
         self.cameras = None if components.cameras == "fixed" else Refinement(components.cameras, pool, log_focal)
         self.is_random = kind == "random" or (kind == "auto" and pool.has_alpha)
         self._pool = pool
+        self.sky: Tensor | None = None
 
     @torch.no_grad()
-    def begin_background(self, colours: Tensor) -> None:
-        """Give all directions of a learned background the median of colours (N, 3) uint8: where no photo looks, it
-        stays."""
-        if self.background is not None and len(colours):
-            median = (colours.float().median(0).values / 255.0).clamp(LEAST_LEVEL, 1.0 - LEAST_LEVEL)
-            self.background.logits.add_(torch.logit(median)[:, None, None, None])
+    def show_sky(self, sky: Tensor) -> None:
+        """Begin a learned background with the median colour of the sky: where no photo looks, it stays.
+
+        Args:
+            sky: (pixels,) bool, those of the pool that show it.
+        """
+        colours = self._pool.colours[sky]
+        if self.background is None or len(colours) == 0:
+            return
+        median = (colours[:, :3].float().median(0).values / 255.0).clamp(LEAST_LEVEL, 1.0 - LEAST_LEVEL)
+        self.background.logits.add_(torch.logit(median)[:, None, None, None])
+        self.sky = sky
 
     def groups(self) -> list[dict[str, Any]]:
         """What is to be optimised, with its learning rate as a multiple of the field's."""

@@ -118,9 +118,8 @@ class Fitting:
         self._cameras_from = cameras_from
         self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
         self.covered = covered
-        self._sky = sky if self.parts.background is not None else None
-        if self._sky is not None:
-            self.parts.begin_background(pool.colours[self._sky])
+        if sky is not None:
+            self.parts.show_sky(sky)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
@@ -218,8 +217,8 @@ class Fitting:
             loss = loss + components.entropy * opacity_entropy(seen.transmittance)
         if len(drawn.distances):
             loss = loss + components.points * fading(fraction) * point_depth_loss(seen.off_target, drawn.trust)
-        if self._sky is not None:
-            opacity = (1.0 - seen.transmittance) * self._sky[drawn.numbers]
+        if self.parts.sky is not None:
+            opacity = (1.0 - seen.transmittance) * self.parts.sky[drawn.numbers]
             loss = loss + SKY_WEIGHT * opacity.sum() / max(1, count)
         watch.rows("rendered colour", seen.rgb, torch.arange(count, device=device))
         watch.values("loss", loss)

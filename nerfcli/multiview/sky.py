@@ -59,7 +59,7 @@ class _Small:
         window = (WINDOW_PX, WINDOW_PX)
         self.levels = cv2.blur(levels, window)
         spread = cv2.blur(levels * levels, window) - self.levels * self.levels
-        self.plain: np.ndarray = (spread < MOST_SPREAD**2).all(-1)
+        self.plain = np.asarray((spread < MOST_SPREAD**2).all(-1))
         if photo.used is not None:
             self.plain &= cv2.resize(photo.used.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         self.turn = photo.frame.world_from_cam[:3, :3]
