@@ -435,8 +435,8 @@ GROUPS: tuple[Group, ...] = (
         (
             Mutant("(one - beta2) * g * g", "(one - beta2) * g"),
             Mutant("np.sqrt(v) * correction", "np.sqrt(v)"),
-            Mutant("touched |= gradient[row, j] != 0", "touched = gradient[row, j] != 0"),
-            Mutant("gradient[row, j] = np.float32(0)", "gradient[row, j] = g"),
+            Mutant("(a != zero) | (b != zero) | (c != zero) | (d != zero)", "(a != zero) | (b != zero) | (c != zero)"),
+            Mutant("gradient[at] = zero", "gradient[at] = g"),
             Mutant("rate * m /", "-rate * m /"),
         ),
     ),
