@@ -98,8 +98,12 @@ class Browser:
 
     def open(self, page: Path, fragment: str = "") -> None:
         """Load a page from the disk and wait until it has begun or said why not."""
+        self.visit(page.resolve().as_uri() + fragment)
+
+    def visit(self, url: str) -> None:
+        """Load a page by its address, as `open`."""
         self.send("Page.navigate", url="about:blank")
-        self.send("Page.navigate", url=page.resolve().as_uri() + fragment)
+        self.send("Page.navigate", url=url)
         self.wait("document.body && document.body.dataset.state")
 
     def run(self, script: str) -> Any:

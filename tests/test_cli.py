@@ -33,7 +33,8 @@ from nerfcli.train import loop
 from nerfcli.train.loop import Progress
 from nerfcli.workflows import poses as poses_workflow
 
-COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
+BATCH_COMMANDS = ("doctor", "poses", "train", "evaluate", "render", "run", "info", "convert", "bench", "export")
+COMMANDS = (*BATCH_COMMANDS, "view")
 WITHOUT_INPUT = ("selftest",)
 USAGE = 2
 PROJECT = Path(__file__).parent.parent
@@ -437,7 +438,7 @@ def test_many_inputs_share_one_output_folder(capture, tmp_path):
     assert result.stdout.splitlines() == [str(tmp_path / "runs" / "spheres-run")]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", BATCH_COMMANDS)
 @pytest.mark.parametrize("stdin", ["", "\n\n"])
 def test_an_empty_batch_is_told(command, stdin, tmp_path):
     result = nerfcli(command, "-", *needed(command, tmp_path), stdin=stdin)

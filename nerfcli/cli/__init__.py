@@ -19,6 +19,7 @@ from nerfcli.cli import (
     run,
     selftest,
     train,
+    view,
 )
 from nerfcli.interrupts import install_handlers
 
@@ -28,7 +29,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-for _module in (doctor, poses, train, evaluate, render, export, report, run, info, convert, selftest, bench, ablate):
+for _module in (
+    doctor,
+    poses,
+    train,
+    evaluate,
+    render,
+    view,
+    export,
+    report,
+    run,
+    info,
+    convert,
+    selftest,
+    bench,
+    ablate,
+):
     _name = _module.__name__.rsplit(".", 1)[-1]
     app.command(_name)(getattr(_module, _name))
 
@@ -48,6 +64,7 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
       nerfcli evaluate photos-scene-run/           -> photos-scene-run/metrics.json
       nerfcli render photos-scene-run/ --cameras orbit --depth conditional --video
       nerfcli report photos-scene-run/             -> photos-scene-run/report.html
+      nerfcli view photos-scene-run/               -> the field in a browser, during the training too
       nerfcli export photos-scene-run/ --to page   -> photos-scene-run.html; also mesh, points, volume
     Measure what each component of the model contributes:
       nerfcli ablate photos-scene/                 -> photos-scene-ablation/

@@ -42,6 +42,10 @@ class Console:
         line = json.dumps({"path": str(path), **(content or {})}) if self.json_lines else str(path)
         print(line, flush=True)  # noqa: T201 - the one place that writes results
 
+    def address(self, url: str) -> None:
+        """The address of a page as a result on stdout."""
+        print(json.dumps({"url": url}) if self.json_lines else url, flush=True)  # noqa: T201 - a result, as above
+
     def fact(self, content: dict[str, Any]) -> None:
         """One result that is no file: a line of JSON on stdout."""
         print(json.dumps(content), flush=True)  # noqa: T201 - a result, as above

@@ -70,6 +70,9 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the last checkpoint to the new total.")
     ] = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the field in a browser while it trains; see nerfcli view.")
+    ] = False,
     memory: Memory = None,
     device: Device = "auto",
     seed: Seed = 0,
@@ -119,6 +122,7 @@ def train(
     Examples:
       nerfcli train photos-scene --budget 90s
       nerfcli train photos-scene --budget 5m --resume
+      nerfcli train photos-scene --view
       nerfcli train photos-scene --holdout block:0.15 -o gap-run
       nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
       nerfcli train photos-scene --budget 5m --model default
@@ -197,6 +201,7 @@ def train(
                 resume=resume,
                 overwrite=overwrite,
                 holdout=rule,
+                view=view,
                 notify=console.note,
                 warn=console.warn,
                 progress=update,

@@ -34,7 +34,16 @@ class Mark:
         return f'<meta name="nerfcli-{self.kind}" content="{identity}">'
 
 
-def page_html(*, title: str, mark: Mark, style: str, body: str, script: str = "", origin: str | None = None) -> str:
+def page_html(
+    *,
+    title: str,
+    mark: Mark,
+    style: str,
+    body: str,
+    script: str = "",
+    origin: str | None = None,
+    connect: bool = False,
+) -> str:
     """Return a complete page that loads nothing, enforced by a content security policy.
 
     Args:
@@ -44,13 +53,16 @@ def page_html(*, title: str, mark: Mark, style: str, body: str, script: str = ""
         body: HTML, whatever comes from outside escaped.
         script: JavaScript that runs when the body is there; for data see `data_element`.
         origin: a digest of what the page was made from, for `is_made_from`.
+        connect: let it fetch from the server that it came from, and from no other.
     """
+    server = " 'self'" if connect else ""
     return _PAGE.substitute(
         mark=mark.html() + ("" if origin is None else f"\n{_origin_html(origin)}"),
         title=escape(title),
         kind=mark.kind,
-        policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'"
-        + ("; script-src 'unsafe-inline'" if script else ""),
+        policy=f"default-src 'none'; img-src data:{server}; style-src 'unsafe-inline'"
+        + ("; script-src 'unsafe-inline'" if script else "")
+        + ("; connect-src 'self'" if connect else ""),
         style=asset("page.css") + style,
         body=body,
         script=f"<script>{script}</script>\n" if script else "",

@@ -9,7 +9,8 @@ LOG = "log.jsonl"
 METRICS = "metrics.json"
 REPORT = "report.html"
 LOCK = ".train.lock"
+LIVE = ".live"
 # Of a reconstruction from an X-ray scan; tomography writes and reads it.
 RECONSTRUCTION = "reconstruction.json"
 
-__all__ = ["CAMERAS", "CONFIG", "FIELD", "LOCK", "LOG", "METRICS", "RECONSTRUCTION", "REPORT", "STATE"]
+__all__ = ["CAMERAS", "CONFIG", "FIELD", "LIVE", "LOCK", "LOG", "METRICS", "RECONSTRUCTION", "REPORT", "STATE"]

@@ -21,11 +21,14 @@ from nerfcli.runs.log import LogEntry, append_log, cut_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
+from nerfcli.train.live import LiveTraining
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.waypoints import SHARES, forget_waypoints, keep_waypoint, measure_waypoints
 
 CHECKPOINT_SECONDS = 30.0
+# A page that is open when the training ends has so long to take the last checkpoint.
+_LAST_LOOK_SECONDS = 2.0
 
 
 @dataclass(frozen=True)
@@ -88,19 +91,23 @@ def train(
     checkpoints.write_cameras()
     sentinel = Sentinel(fitting, prepared.pool, run=run, notify=notify)
     with deferred_interrupts() as interrupts:
+        live = LiveTraining(run, checkpoints.model, still_wanted=interrupts.raise_if_pending, notify=notify)
 
         def after_step(progress: Progress) -> None:
             on_progress(progress)
             prepared.storage.release_pages()
             interrupts.raise_if_pending()
+            live.after_step(fraction=progress.share, step=progress.step, seconds=progress.seconds, loss=progress.loss)
 
         try:
             _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
         except KeyboardInterrupt:
             if not fitting.in_step:
                 checkpoints.write()
+            live.end()
             raise
         checkpoints.write()
+        live.end(seconds=_LAST_LOOK_SECONDS)
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
     measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)

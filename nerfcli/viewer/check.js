@@ -8,8 +8,12 @@ function valueOf(map, { colour, ends, shares }, i, { factor, farthest, minOpacit
   if (map === "moment") return moment * factor;
   if (map === "background") return (moment + (1 - alpha) * farthest) * factor;
   if (alpha < minOpacity || mean < 0) return NaN;
-  const value = { conditional: mean, median, "max-weight": ends[4 * i + 3], quantile: shares[4 * i + 2],
-    spread: ends[4 * i + 1], disagreement: median < 0 ? -1 : Math.abs(median - mean) }[map];
+  let value = mean;
+  if (map === "median") value = median;
+  else if (map === "max-weight") value = ends[4 * i + 3];
+  else if (map === "quantile") value = shares[4 * i + 2];
+  else if (map === "spread") value = ends[4 * i + 1];
+  else if (map === "disagreement") value = median < 0 ? -1 : Math.abs(median - mean);
   return value < 0 ? NaN : value * factor;
 }
 

@@ -34,14 +34,20 @@ function readScene() {
     throw new Error('this file is damaged: "scene" is not JSON');
   }
   if (scene.format !== "nerfcli page 1") throw new Error(`this file has the format ${scene.format}`);
-  const { field, march } = scene;
-  scene.table = new Int16Array(bytesOf("table", 8 * field.rows).buffer);
-  scene.networks = new Float32Array(bytesOf("networks", 64 * field.networks).buffer);
-  scene.cuts = new Float32Array(bytesOf("cuts", 4 * (march.intervals + 1)).buffer);
-  scene.cells = cellsOf(bytesOf("occupied", Math.ceil(march.side ** 3 / 8)), march.side);
-  scene.sky = field.sky ? new Int16Array(bytesOf("sky", 6 * field.sky.side ** 3).buffer) : null;
   scene.colours = bytesOf("colours", 768);
+  if (scene.live) return scene;
   scene.expected = new Float32Array(bytesOf("expected").buffer);
+  return withField(scene, bytesOf);
+}
+
+/** The scene with the arrays of its field; `bytes(name, length)` gives them or throws. */
+function withField(scene, bytes) {
+  const { field, march } = scene;
+  scene.table = new Int16Array(bytes("table", 8 * field.rows).buffer);
+  scene.networks = new Float32Array(bytes("networks", 64 * field.networks).buffer);
+  scene.cuts = new Float32Array(bytes("cuts", 4 * (march.intervals + 1)).buffer);
+  scene.cells = cellsOf(bytes("occupied", Math.ceil(march.side ** 3 / 8)), march.side);
+  scene.sky = field.sky ? new Int16Array(bytes("sky", 6 * field.sky.side ** 3).buffer) : null;
   return scene;
 }
 
@@ -89,9 +95,8 @@ function shaderSource(scene, body, tableBits) {
     REACH: glslFloat((4 / march.side) * (field.contraction === 0 ? 4 : 7.8)),
     LARGEST_DENSE: field.largestDense, ROW_MASK: `${field.rowMask}u`,
     TABLE_BITS: tableBits, TABLE_WIDTH: 2 ** tableBits,
-    SKY_SIDE: field.sky ? field.sky.side : 0, SKY_SCALE: glslFloat(field.sky ? field.sky.scale : 1),
+    SKY_SIDE: field.sky ? field.sky.side : 0,
     RESOLUTIONS: field.resolutions.join(","), FIRST_ROWS: field.firstRows.join(","),
-    SCALES: field.scales.map(glslFloat).join(","),
   };
   return glslHead("isampler2D", "usampler3D", "isampler3D")
     + Object.entries(defines).map(([name, value]) => `#define ${name} ${value}`).join("\n") + "\n" + body;

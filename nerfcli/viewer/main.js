@@ -24,6 +24,12 @@ function start() {
     trouble(`This page cannot be shown: ${error.message}. Make it again with nerfcli export RUN --to page --overwrite.`);
     return;
   }
+  if (scene.live) startLive(scene);
+  else startHere(scene);
+}
+
+/** Draw on this device; the page, or nothing where that is not possible. */
+function startHere(scene) {
   const canvas = $("field");
   canvas.addEventListener("webglcontextlost", event => {
     event.preventDefault();
@@ -41,16 +47,22 @@ function start() {
   };
   const renderer = begin();
   if (!renderer) return;
-  const page = new Page(scene, renderer);
+  const page = show(scene, renderer);
   canvas.addEventListener("webglcontextrestored", () => {
     const again = begin();
     if (!again) return;
     $("trouble").hidden = true;
     page.restart(again);
   });
+  return page;
+}
+
+function show(scene, renderer) {
+  const page = new Page(scene, renderer);
   globalThis.nerfcliPage = page;  // for the browser's console, and for tests
   document.body.dataset.state = "ready";
   if (location.hash === "#check") page.check();
+  return page;
 }
 
 class Page {
@@ -78,7 +90,7 @@ class Page {
 
   restart(renderer) {
     this.renderer = renderer;
-    this.schedule = new Schedule(renderer, {
+    this.schedule = renderer.schedule({
       shown: (view, fine, coarse) => this.present(view, fine, coarse),
       rested: (view, fine) => this.rested(view, fine),
     });
@@ -358,7 +370,8 @@ class Page {
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   }
 
-  check() {
+  async check() {
+    if (this.scene.live) await fetchProof(this.scene);
     const found = compare(this.renderer, this.scene), table = $("checked");
     const rows = [["map", "largest", "99 %", "rms"], ...Object.entries(found).map(([map, f]) =>
       [map, ...[f.largest, f.percentile_99, f.rms].map(v => v.toExponential(1))])];

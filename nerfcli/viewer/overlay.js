@@ -8,14 +8,20 @@ class Overlay {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
     this.scene = scene;
-    this.pictures = scene.photos.map(photo => {
-      if (!photo.picture) return null;
-      const image = new Image();
-      image.src = photo.picture;
-      return image;
-    });
+    this.pictures = scene.photos.map(photo => photo.picture && new Image());
+    if (scene.live) this.fetchPictures();
+    else this.pictures.forEach((image, index) => { if (image) image.src = scene.photos[index].picture; });
     this.places = [];   // of the photos' middles on the screen, for clicks
     this.handles = [];  // of the box
+  }
+
+  /** Small pictures from the server, one after the other, so that they are in nobody's way. */
+  async fetchPictures() {
+    for (const [index, image] of this.pictures.entries()) {
+      if (!image) continue;
+      image.src = `${this.scene.photos[index].picture}&px=160`;
+      await image.decode().catch(() => { this.pictures[index] = null; });
+    }
   }
 
   /** Pixel of a point, or null behind the camera. */

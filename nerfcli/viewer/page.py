@@ -1,9 +1,10 @@
-"""One HTML file that renders a field by itself: no server, no download, opened from a disk."""
+"""The page that renders a field: one HTML file by itself, opened from a disk; or live, from a server of ours."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from nerfcli.viewer.proof import Proof
 
 FORMAT = "nerfcli page 1"
 SCRIPTS = ("geometry.js", "field.js", "render.js", "schedule.js", "walk.js", "path.js", "overlay.js", "check.js")
+LIVE_SCRIPTS = ("remote.js", "live.js")
 
 
 def page_html(
@@ -32,7 +34,7 @@ def page_html(
     proof: Proof,
     box: Sequence[float],
 ) -> str:
-    """Return the page's text.
+    """Return the text of a page that needs no server.
 
     Args:
         model: what it shows.
@@ -43,43 +45,80 @@ def page_html(
         proof: what it compares itself with.
         box: low and high corner that the crop box begins with, scene units.
     """
+    scene = _scene(model, run=run, frames=frames, photos=photos.entries, box=box)
+    scene |= {"field": packed.field, "march": packed.march, "proof": proof.description}
+    return _html(scene, {**packed.arrays, "expected": proof.expected}, run=run, connect=False)
+
+
+def live_page_html(
+    model: Model,
+    *,
+    run: Path,
+    frames: Sequence[Frame],
+    photos: Sequence[dict[str, Any]],
+    box: Sequence[float],
+    version: int,
+    refusal: str | None,
+) -> str:
+    """Return the text of a page that fetches its field and pictures from the server it came from.
+
+    Args:
+        model, run, frames, box: as for `page_html`.
+        photos: see `pictures.fetched_photos`.
+        version: of the field, see `server.Show.status`.
+        refusal: why the page cannot draw this field by itself; None if it can.
+    """
+    scene = _scene(model, run=run, frames=frames, photos=photos, box=box)
+    scene |= {"live": {"refusal": refusal, "version": version}, "march": {"far": model.marching.far}}
+    return _html(scene, {}, run=run, connect=True)
+
+
+def _scene(
+    model: Model, *, run: Path, frames: Sequence[Frame], photos: Sequence[dict[str, Any]], box: Sequence[float]
+) -> dict[str, Any]:
+    """What both kinds of page have, plain values."""
     size = 1.0 / model.training_from_scene.scale
     home = view_of(frames[len(frames) // 2])
-    name = run.resolve().name
     unit = {"metre": "metres", "arbitrary": "arbitrary units"}.get(model.unit, model.unit)
     source = f" ({model.unit_source})" if model.unit_source else ""
-    held_out = sum(entry["split"] == "test" for entry in photos.entries)
-    scene = {
+    held_out = sum(entry["split"] == "test" for entry in photos)
+    return {
         "format": FORMAT,
-        "run": name,
+        "run": run.resolve().name,
         "about": f"nerfcli {__version__}, field {str(model.sha256)[:12]}. Lengths in {unit}{source}, in the frame of "
-        f"the scene. {len(photos.entries)} photos, {held_out} held out.",
+        f"the scene. {len(photos)} photos, {held_out} held out.",
         "unit": model.unit,
         "training_from_scene": model.training_from_scene.to_json(),
         "tolerance": TOLERANCE,
-        "field": packed.field,
-        "march": packed.march,
         "size": size,
         "up": up_direction(frames).tolist(),
         "home": {**home, "fov": 2 * float(np.arctan2(home["height"] / 2, home["lens"][1]))},
         "frustum": frustum_depth(frames, size),
         "box": [float(value) for value in box],
-        "photos": photos.entries,
-        "proof": proof.description,
+        "photos": list(photos),
     }
-    arrays = {**packed.arrays, "colours": levels_of("turbo"), "expected": proof.expected}
+
+
+def _html(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], *, run: Path, connect: bool) -> str:
+    """The page around a scene."""
     shaders = "".join(_element(part, "x-shader/x-fragment", _text(f"{part}.glsl")) for part in ("trace", "show"))
     body = "\n".join(
         [
             _text("body.html"),
             shaders,
-            *(_element(key, "text/plain", _base64(values)) for key, values in arrays.items()),
+            *(_element(k, "text/plain", _base64(v)) for k, v in {**arrays, "colours": levels_of("turbo")}.items()),
             page.data_element("scene", scene),
         ]
     )
-    script = "\n".join(_text(part).replace('"use strict";\n', "") for part in (*SCRIPTS, "main.js"))
+    parts = (*SCRIPTS, *(LIVE_SCRIPTS if connect else ()), "main.js")
+    script = "\n".join(_text(part).replace('"use strict";\n', "") for part in parts)
     return page.page_html(
-        title=name, mark=page.Mark("page", run), style=_text("page.css"), body=body, script=f'"use strict";\n{script}'
+        title=scene["run"],
+        mark=page.Mark("page", run),
+        style=_text("page.css"),
+        body=body,
+        script=f'"use strict";\n{script}',
+        connect=connect,
     )
 
 

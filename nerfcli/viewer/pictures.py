@@ -59,8 +59,7 @@ def page_photos(
         threads: to read photos with.
         on_share: called with how much is done.
     """
-    frames = sorted([*((frame, "train") for frame in train), *((frame, "test") for frame in test)], key=_name)
-    gains = log_gains_of([frame for frame, _ in frames], model)
+    frames = _sorted(train, test)
     there = [index for index, (frame, _) in enumerate(frames) if frame.image is not None and frame.image.exists()]
     shown = [there[i] for i in np.unique(np.linspace(0, len(there) - 1, min(len(there), MOST_PICTURES)).astype(int))]
     longest = _longest(frames, shown, room_bytes)
@@ -71,11 +70,31 @@ def page_photos(
         for count, (index, jpeg) in enumerate(zip(of, encoded, strict=True)):
             pictures[index] = data_uri(jpeg, "jpeg")
             on_share((count + 1) / len(of))
-    entries = [
-        {**_entry(frame), "split": split, "log_gains": gains[index].tolist(), "picture": pictures.get(index)}
-        for index, (frame, split) in enumerate(frames)
-    ]
+    entries = [{**entry, "picture": pictures.get(index)} for index, entry in enumerate(_entries(model, frames))]
     return PagePhotos(entries, longest, len(frames) - len(there))
+
+
+def fetched_photos(model: Model, train: Sequence[Frame], test: Sequence[Frame]) -> list[dict[str, Any]]:
+    """Return the entries of `page_photos` with addresses of pictures at the page's server, for `photo_jpeg`."""
+    frames = _sorted(train, test)
+    there = [frame.image is not None and frame.image.exists() for frame, _ in frames]
+    return [
+        {**entry, "picture": f"photo?n={index}" if there[index] else None}
+        for index, entry in enumerate(_entries(model, frames))
+    ]
+
+
+def photo_jpeg(train: Sequence[Frame], test: Sequence[Frame], index: int, *, longest_px: int) -> bytes:
+    """Return the photo of an entry of `fetched_photos`.
+
+    Raises:
+        LookupError: there is no such photo.
+        UserError: it cannot be read.
+    """
+    frames = _sorted(train, test)
+    if not 0 <= index < len(frames) or frames[index][0].image is None:
+        raise LookupError(index)
+    return jpeg_bytes(_small_photo(frames[index][0], longest_px), quality=QUALITY)
 
 
 def frustum_depth(frames: Sequence[Frame], size: float) -> float:
@@ -96,12 +115,24 @@ def view_of(frame: Frame) -> dict[str, Any]:
     }
 
 
-def _entry(frame: Frame) -> dict[str, Any]:
-    return {"name": frame.name, **view_of(replace(frame, camera=pinhole_of(frame.camera)))}
+def _sorted(train: Sequence[Frame], test: Sequence[Frame]) -> list[tuple[Frame, str]]:
+    """The frames with their split, in the order of their names."""
+    frames = [*((frame, "train") for frame in train), *((frame, "test") for frame in test)]
+    return sorted(frames, key=lambda entry: entry[0].name)
 
 
-def _name(entry: tuple[Frame, str]) -> str:
-    return entry[0].name
+def _entries(model: Model, frames: Sequence[tuple[Frame, str]]) -> list[dict[str, Any]]:
+    """What the page holds of each frame besides its picture."""
+    gains = log_gains_of([frame for frame, _ in frames], model)
+    return [
+        {
+            "name": frame.name,
+            **view_of(replace(frame, camera=pinhole_of(frame.camera))),
+            "split": split,
+            "log_gains": gains[index].tolist(),
+        }
+        for index, (frame, split) in enumerate(frames)
+    ]
 
 
 def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_bytes: int) -> int:

@@ -20,18 +20,33 @@ class Renderer {
     // Half floats keep three digits of a depth; said where depths are shown.
     this.full = Boolean(gl.getExtension("EXT_color_buffer_float"));
     if (!this.full) gl.getExtension("EXT_color_buffer_half_float");
-    const bits = Math.max(10, Math.ceil(Math.log2(scene.field.rows) / 2));
+    this.shaders = shaders;
+    this.load();
+  }
+
+  /** Take the numbers of the scene's field, at first and whenever they are others. */
+  load() {
+    const { gl, scene, shaders } = this, bits = Math.max(10, Math.ceil(Math.log2(scene.field.rows) / 2));
     const limit = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     if (2 ** bits > limit) throw new Error(`the field needs textures of ${2 ** bits} pixels, this device has ${limit}`);
     const block = gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE);
     if (64 * scene.field.networks > block) throw new Error(`the networks need ${64 * scene.field.networks} bytes of `
       + `uniforms, this device has ${block}`);
-    this.trace = this.program(shaderSource(scene, shaders.trace, bits));
-    this.show = this.program(glslHead() + shaders.show);
+    const source = shaderSource(scene, shaders.trace, bits);
+    if (source !== this.source) {
+      if (this.trace) gl.deleteProgram(this.trace.program);
+      this.trace = this.program(source);
+      this.source = source;
+    }
+    this.show ||= this.program(glslHead() + shaders.show);
+    for (const name in this.textures || {}) gl.deleteTexture(this.textures[name]);
     this.textures = this.fieldTextures(bits);
     this.background = scene.field.background;
     this.bindNetworks();
   }
+
+  /** Draws views as they are asked for, see `Schedule`. */
+  schedule(callbacks) { return new Schedule(this, callbacks); }
 
   program(fragment) {
     const { gl } = this, program = gl.createProgram();
@@ -95,7 +110,7 @@ class Renderer {
   }
 
   bindNetworks() {
-    const { gl } = this, buffer = gl.createBuffer();
+    const { gl } = this, buffer = this.networks ||= gl.createBuffer();
     const place = gl.getUniformBlockIndex(this.trace.program, "Networks");
     if (place === gl.INVALID_INDEX) return;
     gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, buffer);
@@ -160,6 +175,8 @@ class Renderer {
     gl.uniform1f(places.negligible, tolerance / 50);
     gl.uniform4fv(places.targets, [0.5, 0.05, 0.95, view.share].map(share => -Math.log1p(-share)));
     gl.uniform3fv(places.background, this.background);
+    gl.uniform1fv(places["scales[0]"], scene.field.scales);
+    gl.uniform1f(places.skyScale, scene.field.sky ? scene.field.sky.scale : 1);
     gl.uniform1i(places.boxed, view.box ? 1 : 0);
     if (view.box) {
       const back = transposed(rotation).map(r => r.map(v => v / scale));

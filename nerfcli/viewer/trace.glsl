@@ -13,6 +13,8 @@ uniform mat3 trainingFromCamera;
 uniform vec3 origin;
 uniform vec4 lens;             // fx, fy, cx, cy in pixels of the whole picture
 uniform vec2 size;             // of the whole picture, pixels
+uniform float scales[LEVELS];  // what a level of a table's row is worth
+uniform float skyScale;
 uniform float stride;          // pixels of the whole picture per pixel drawn, along an axis
 uniform vec2 corner;           // the first of them that is drawn
 uniform float deepest;         // optical depth at which rays stop
@@ -29,7 +31,6 @@ layout(location = 2) out vec4 outShares;  // quantiles 5 %, 95 %, the chosen one
 
 const int RES[LEVELS] = int[LEVELS](RESOLUTIONS);
 const int FIRST[LEVELS] = int[LEVELS](FIRST_ROWS);
-const float SCALE[LEVELS] = float[LEVELS](SCALES);
 
 float cutAt(int k) { return texelFetch(cuts, ivec2(k & 1023, k >> 10), 0).x; }
 
@@ -86,7 +87,7 @@ vec4 level(int l, vec3 p, float width) {
 #if ANTIALIAS
   sum /= max(1.0, float(side) * width);
 #endif
-  return sum * SCALE[l];
+  return sum * scales[l];
 }
 
 #if HASH
@@ -172,7 +173,7 @@ vec3 behind(vec3 d) {
     vec3 v = mix(1.0 - t, t, vec3(e));
     sum += v.x * v.y * v.z * vec3(texelFetch(sky, min(c + e, SKY_SIDE - 1), 0).xyz);
   }
-  return 1.0 / (1.0 + exp(-sum * SKY_SCALE));
+  return 1.0 / (1.0 + exp(-sum * skyScale));
 #else
   return background;
 #endif

@@ -1,6 +1,7 @@
 """Train a scene, keep an existing run, resume one, or refuse to overwrite another one."""
 
 import shlex
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import loop
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
+from nerfcli.workflows.view_worker import viewer_beside
 
 NAMES_SHOWN = 8
 
@@ -29,6 +31,7 @@ def train_scene(
     resume: bool = False,
     overwrite: bool = False,
     holdout: str | None = None,
+    view: bool = False,
     notify: Notify = silent,
     warn: Notify = warn_python,
     progress: Progress = no_progress,
@@ -49,6 +52,7 @@ def train_scene(
         resume: go on from the last checkpoint of `run`.
         overwrite: replace another run at `run`.
         holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None as the scene says.
+        view: serve the interactive page during the training, see `workflows.view`; `notify` gets its address.
         notify, warn: take lines for the user.
         progress: takes the share of the budget and a few words, after every step.
 
@@ -82,7 +86,17 @@ def train_scene(
         clear_leftovers(run)
         if overwrite:
             (run / METRICS).unlink(missing_ok=True)  # they belong to the field that goes
-        _fit(loaded, run, settings, memory_bytes=memory_bytes, resume=resume, notify=notify, progress=progress)
+        with viewer_beside(run, threads=settings.threads, notify=notify) as start_viewer:
+            _fit(
+                loaded,
+                run,
+                settings,
+                memory_bytes=memory_bytes,
+                resume=resume,
+                on_begin=start_viewer if view else lambda: None,
+                notify=notify,
+                progress=progress,
+            )
     return Run(run)
 
 
@@ -186,10 +200,14 @@ def _fit(
     *,
     memory_bytes: int | None,
     resume: bool,
+    on_begin: Callable[[], None],
     notify: Notify,
     progress: Progress,
 ) -> None:
+    """Train; `on_begin` is called when cameras and configuration are written, and perhaps again."""
+
     def on_progress(state: loop.Progress) -> None:
+        on_begin()
         speed = f"{state.samples_per_second / 1e3:.0f} k samples/s"
         progress(state.share, f"step {state.step}  loss {state.loss:.4f}  {speed}")
 

@@ -1,0 +1,244 @@
+"""Pictures by the kernels for a page: coarse first, then finer, tiles from the middle out, until a newer view comes.
+
+One thread renders for all clients, tile by tile in turn, so that no tile waits for more than one of each other client.
+"""
+
+import math
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from queue import SimpleQueue
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.field.background import colours_behind
+from nerfcli.render.depth import MEDIAN
+from nerfcli.render.model import Model
+from nerfcli.render.rays import CENTRES, pixel_rays
+from nerfcli.render.tracing import render_rays
+
+# A view moves on within two tiles; the first picture of a motion is as coarse as this time demands.
+TILE_SECONDS = 0.02
+COARSE_SECONDS = 0.03
+COARSEST, SMALLEST_SIDE = 16, 32
+# What a tile costs besides its rays, in rays; without it, small tiles look slow and are made smaller still.
+_TILE_RAYS = 400
+# From one picture to the next finer one.
+FINER = 4
+# Seconds per ray before anything was measured, and how many tiles count: their median, as a few have to wait.
+_FIRST_RATE, _RATES = 1e-5, 9
+LARGEST_PX = 8192
+# Numbers of a pixel: rgb, opacity; mean, spread, median, heaviest; quantiles 5 %, 95 %, the chosen one; unused.
+NUMBERS = 12
+_HEAD = struct.Struct("<8I")
+
+
+@dataclass(frozen=True)
+class View:
+    """What a page wants to see.
+
+    Args:
+        frame: pinhole camera and pose in the scene's frame.
+        quantile: of the light, in (0, 1).
+    """
+
+    frame: Frame
+    quantile: float
+
+    def coarse(self, stride: int) -> Frame:
+        """The frame with one pixel for stride x stride; its rays are those of their middles."""
+        camera = self.frame.camera
+        width, height = (-(-size // stride) for size in (camera.width, camera.height))
+        lens = tuple(value / stride for value in camera.params)
+        return Frame(self.frame.name, Camera("PINHOLE", width, height, lens), self.frame.world_from_cam)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A rectangle of a picture with one pixel for stride x stride of the view."""
+
+    stride: int
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+def view_from_json(content: Any) -> View:
+    """Return the view that a page describes.
+
+    Raises:
+        ValueError: something is missing, not a number, or out of range.
+    """
+    try:
+        width, height = int(content["width"]), int(content["height"])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = np.array(content["turn"], float), np.array(content["place"], float)
+        lens = tuple(float(value) for value in content["lens"])
+        quantile = float(content["share"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"not a view: {error!r}") from error
+    sizes = 1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX
+    if not sizes or len(lens) != 4 or min(lens[:2]) <= 0 or not np.isfinite([*pose.ravel(), *lens]).all():
+        raise ValueError("a view has numbers out of range")
+    if not 0.0 < quantile < 1.0 or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
+        raise ValueError("a view has numbers out of range")
+    return View(Frame("view", Camera("PINHOLE", width, height, lens), pose), quantile)
+
+
+@torch.no_grad()
+def render_tile(model: Model, view: View, tile: Tile) -> np.ndarray:
+    """Return what the rays of a tile see: (height, width, NUMBERS) float32.
+
+    Colours and opacities are those of `render_picture`; distances are along the ray in the training frame, -1 where
+    undefined.
+    """
+    frame = view.coarse(tile.stride)
+    rows, columns = np.arange(tile.y, tile.y + tile.height), np.arange(tile.x, tile.x + tile.width)
+    pixels = (rows[:, None] * frame.camera.width + columns).ravel()
+    rays = pixel_rays(frame, model.training_from_scene, pixels=pixels, places=CENTRES, device=model.device)
+    seen = render_rays(
+        model,
+        rays.origin.expand_as(rays.directions),
+        rays.directions,
+        background=colours_behind(model.background, rays.directions),
+        shares=(MEDIAN, 0.05, 0.95, view.quantile),
+        cones=rays.cones,
+    )
+    ends = seen.ends
+    quantiles = ends.quantiles
+    values = torch.cat(
+        [
+            *(seen.rgb.clamp(0.0, 1.0), ends.opacity[:, None], ends.mean[:, None], ends.spread[:, None]),
+            *(quantiles[:, :1], ends.heaviest[:, None], quantiles[:, 1:], torch.zeros_like(ends.mean)[:, None]),
+        ],
+        dim=1,
+    )
+    return values.nan_to_num(nan=-1.0).cpu().numpy().reshape(tile.height, tile.width, NUMBERS)
+
+
+def strides_of(width: int, height: int, seconds_per_ray: float) -> list[int]:
+    """Return the strides of the pictures of a view, coarse to fine, the first one quick enough for a motion."""
+    stride = 1
+    while stride < COARSEST and width * height / stride**2 * seconds_per_ray > COARSE_SECONDS:
+        stride *= 2
+    strides = [stride]
+    while strides[-1] > 1:
+        strides.append(max(1, strides[-1] // FINER))
+    return strides
+
+
+def tiles_of(view: View, stride: int, seconds_per_ray: float) -> list[Tile]:
+    """Return the tiles of a picture, from its middle out; the whole where that is quick."""
+    camera = view.coarse(stride).camera
+    width, height = camera.width, camera.height
+    if width * height * seconds_per_ray <= max(TILE_SECONDS, COARSE_SECONDS) or stride == COARSEST:
+        return [Tile(stride, 0, 0, width, height)]
+    side = max(SMALLEST_SIDE, math.isqrt(max(0, int(TILE_SECONDS / seconds_per_ray) - _TILE_RAYS)))
+    tiles = [
+        Tile(stride, x, y, min(side, width - x), min(side, height - y))
+        for y in range(0, height, side)
+        for x in range(0, width, side)
+    ]
+    return sorted(tiles, key=lambda t: math.hypot(t.x + (t.width - width) / 2, t.y + (t.height - height) / 2))
+
+
+@dataclass
+class _Job:
+    """A view of one client on its way: what is still to render, and what was rendered."""
+
+    client: str
+    view: View
+    records: SimpleQueue[bytes | Exception | None] = field(default_factory=SimpleQueue)
+    opened: tuple[int, Model] | None = None
+    strides: list[int] = field(default_factory=list)
+    tiles: list[Tile] = field(default_factory=list)
+
+
+class Painter:
+    """Renders views for clients; a new view of a client ends the one before, between two tiles.
+
+    Args:
+        model: gives the newest model with its number.
+        threads: of the CPU.
+    """
+
+    def __init__(self, model: Callable[[], tuple[int, Model]], *, threads: int):
+        self._model = model
+        self._threads = threads
+        self._rates = deque([_FIRST_RATE], maxlen=_RATES)
+        self._newest: dict[str, _Job] = {}
+        self._waiting: list[_Job] = []
+        self._changed = threading.Condition()
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def paint(self, client: str, view: View) -> Iterator[bytes]:
+        """Yield the tiles of a view as they come: a head of 8 numbers, then three times four numbers a pixel.
+
+        The head is stride, x, y, width, height, width and height of the picture, number of the model.
+
+        Raises:
+            UserError: the field cannot be read.
+        """
+        job = _Job(client, view)
+        with self._changed:
+            before = self._newest.get(client)
+            if before is not None:
+                before.records.put(None)
+            self._newest[client] = job
+            self._waiting.append(job)
+            self._changed.notify()
+        try:
+            while (record := job.records.get()) is not None:
+                if isinstance(record, Exception):
+                    raise record
+                yield record
+        finally:
+            with self._changed:
+                if self._newest.get(client) is job:
+                    del self._newest[client]
+
+    def _work(self) -> None:
+        torch.set_num_threads(self._threads)  # OpenMP counts the threads of each thread that calls it
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting)
+                job = self._waiting.pop(0)
+            if self._newest.get(job.client) is not job:
+                continue
+            try:
+                job.records.put(self._step(job))
+            except Exception as error:  # it belongs to the client, not to this thread
+                job.records.put(error)
+                continue
+            if job.tiles or job.strides:
+                with self._changed:
+                    self._waiting.append(job)
+            else:
+                job.records.put(None)
+
+    def _step(self, job: _Job) -> bytes:
+        """Render the next tile of a job."""
+        if job.opened is None:
+            job.opened = self._model()
+            camera = job.view.frame.camera
+            job.strides = strides_of(camera.width, camera.height, median(self._rates))
+        if not job.tiles:
+            job.tiles = tiles_of(job.view, job.strides.pop(0), median(self._rates))
+        number, model = job.opened
+        tile = job.tiles.pop(0)
+        began = time.perf_counter()
+        seen = render_tile(model, job.view, tile)
+        self._rates.append((time.perf_counter() - began) / (tile.width * tile.height + _TILE_RAYS))
+        camera = job.view.coarse(tile.stride).camera
+        head = (tile.stride, tile.x, tile.y, tile.width, tile.height, camera.width, camera.height, number)
+        planes = np.moveaxis(seen.reshape(tile.height, tile.width, 3, 4), 2, 0)
+        return _HEAD.pack(*head) + np.ascontiguousarray(planes, "<f4").tobytes()

@@ -1,0 +1,264 @@
+"""The server of the interactive page: one address with a token, events for every client, pictures by the painter."""
+
+import hmac
+import json
+import secrets
+import socket
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Protocol
+from urllib.parse import parse_qs, urlsplit
+
+from nerfcli.errors import UserError
+
+# The first port that is tried, and how many after it.
+FIRST_PORT, PORTS_TRIED = 8123, 50
+# A client that has gone is noticed when this is written to it.
+EVENT_SECONDS = 1.0
+MOST_REQUEST_BYTES = 65536
+ACTIONS = ("pause", "continue", "stop")
+_HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
+
+
+class Show(Protocol):
+    """What the page shows; called from several threads. A UserError becomes a message in the page."""
+
+    def page(self) -> str:
+        """HTML of the page; it is loaded again where there is no field yet."""
+        ...
+
+    def field(self) -> bytes:
+        """The newest numbers of the field, see `live_data.field_bytes`."""
+        ...
+
+    def proof(self) -> bytes:
+        """Small pictures by the kernels of the newest field, see `live_data.proof_bytes`."""
+        ...
+
+    def photo(self, index: int, longest_px: int) -> bytes:
+        """JPEG of a photo; LookupError where there is none."""
+        ...
+
+    def picture(self, client: str, view: Any) -> Iterator[bytes]:
+        """Parts of a picture, see `Painter.paint`; ValueError for something that is no view."""
+        ...
+
+    def status(self) -> dict[str, Any]:
+        """State of the training and number of the newest field."""
+        ...
+
+    def control(self, action: str) -> None:
+        """One of `ACTIONS`."""
+        ...
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves a show; `clients` is the number of pages that are open.
+
+    Args:
+        show: what is served.
+        host: the address to listen on.
+        port: of that address; None for the first free one from `FIRST_PORT` on.
+
+    Raises:
+        UserError: the port is taken, or there is no such address.
+    """
+
+    daemon_threads = True
+    # On Windows this option means something else: that a second server may take the port of a first.
+    allow_reuse_address = sys.platform != "win32"
+
+    def __init__(self, show: Show, *, host: str, port: int | None):
+        self.show = show
+        self.token = secrets.token_urlsafe(16)
+        self.clients = 0
+        self.changed = threading.Condition()
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        ports = [port] if port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS_TRIED), 0]
+        for candidate in ports:
+            try:
+                super().__init__((host, candidate), _Handler)
+                break
+            except OSError as error:
+                if candidate == ports[-1] or not _is_taken(error):
+                    raise _cannot_listen(host, candidate, error) from error
+
+    @property
+    def port(self) -> int:
+        return self.server_address[1]
+
+    def url(self, host: str) -> str:
+        """The address of the page for a browser that reaches this machine as `host`."""
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.token}/"
+
+    def announce(self) -> None:
+        """Wake the event streams: the status has changed."""
+        with self.changed:
+            self.changed.notify_all()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Pass over clients that went away; show everything else."""
+        if not isinstance(sys.exc_info()[1], ConnectionError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    timeout = 60.0  # of a client that sends nothing
+
+    @property
+    def _of(self) -> PageServer:
+        assert isinstance(self.server, PageServer)
+        return self.server
+
+    def do_GET(self) -> None:
+        self._answer({"": self._page, "events": self._events, "field": self._field, "proof": self._proof})
+
+    def do_POST(self) -> None:
+        self._answer({"picture": self._picture, "control": self._control})
+
+    def _answer(self, places: dict[str, Any]) -> None:
+        address = urlsplit(self.path)
+        _, token, place = (address.path + "//").split("/", 3)[:3]
+        if not hmac.compare_digest(token.encode(), self._of.token.encode()):
+            self._send(
+                HTTPStatus.FORBIDDEN, "text/plain", b"wrong token: open the complete address that nerfcli wrote\n"
+            )
+            return
+        self._query = {name: values[-1] for name, values in parse_qs(address.query).items()}
+        handle = places.get(place.rstrip("/"))
+        if self.command == "GET" and place == "photo":
+            handle = self._photo
+        if handle is None:
+            self._send(HTTPStatus.NOT_FOUND, "text/plain", b"there is nothing here\n")
+            return
+        try:
+            handle()
+        except UserError as error:
+            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", f"{error.message}: {error.hint}".encode())
+        except ValueError as error:
+            self._send(HTTPStatus.BAD_REQUEST, "text/plain", str(error).encode())
+        except LookupError:
+            self._send(HTTPStatus.NOT_FOUND, "text/plain", b"there is nothing here\n")
+
+    def _page(self) -> None:
+        try:
+            text = self._of.show.page()
+        except UserError as error:  # the field of a training may be there soon
+            text = f"{error.message}: {error.hint}\n"
+            self._send(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain; charset=utf-8", text.encode(), {"Refresh": "2"})
+            return
+        self._send(HTTPStatus.OK, "text/html; charset=utf-8", text.encode())
+
+    def _field(self) -> None:
+        self._send(HTTPStatus.OK, "application/octet-stream", self._of.show.field())
+
+    def _proof(self) -> None:
+        self._send(HTTPStatus.OK, "application/octet-stream", self._of.show.proof())
+
+    def _photo(self) -> None:
+        content = self._of.show.photo(int(self._query.get("n", "")), int(self._query.get("px", "800")))
+        self._send(HTTPStatus.OK, "image/jpeg", content, {"Cache-Control": "private, max-age=3600"})
+
+    def _events(self) -> None:
+        """Send the status whenever it changes, and now and then; the client counts as open as long as this goes on."""
+        server = self._of
+        with server.changed:
+            server.clients += 1
+            server.changed.notify_all()
+        try:
+            self._begin("text/event-stream")
+            before = None
+            while True:
+                status = {**server.show.status(), "clients": server.clients}
+                line = f"data: {json.dumps(status)}\n\n" if status != before else ": still here\n\n"
+                before = status
+                self.wfile.write(line.encode())
+                with server.changed:
+                    server.changed.wait(EVENT_SECONDS)
+        finally:
+            with server.changed:
+                server.clients -= 1
+                server.changed.notify_all()
+
+    def _picture(self) -> None:
+        content = self._body()
+        parts = self._of.show.picture(str(content.get("client")), content.get("view"))
+        first = next(parts, None)  # what is wrong with the view or the field is found here, before the answer begins
+        self._begin("application/octet-stream")
+        try:
+            if first is not None:
+                self.wfile.write(first)
+            for part in parts:
+                self.wfile.write(part)
+        finally:
+            parts.close()  # type: ignore[attr-defined]
+
+    def _control(self) -> None:
+        action = self._body().get("action")
+        if action not in ACTIONS:
+            raise ValueError(f"unknown action {action!r}")
+        self._of.show.control(action)
+        self._send(HTTPStatus.OK, "application/json", json.dumps(self._of.show.status()).encode())
+
+    def _body(self) -> dict[str, Any]:
+        length = int(self.headers.get("Content-Length", ""))
+        if not 0 <= length <= MOST_REQUEST_BYTES:
+            raise ValueError(f"a request of {length} bytes")
+        content = json.loads(self.rfile.read(length))
+        if not isinstance(content, dict):
+            raise ValueError("the request is no object")
+        return content
+
+    def _begin(self, kind: str, more: dict[str, str] | None = None) -> None:
+        self.send_response(HTTPStatus.OK)
+        for name, value in {"Content-Type": kind, **_HEADERS, **(more or {})}.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+    def _send(self, status: HTTPStatus, kind: str, content: bytes, more: dict[str, str] | None = None) -> None:
+        self.send_response(status)
+        headers = {"Content-Type": kind, "Content-Length": str(len(content)), **_HEADERS, **(more or {})}
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing of each request."""
+
+
+def serve(server: PageServer, *, tick: float, on_tick: Any) -> None:
+    """Serve until interrupted, calling `on_tick` every `tick` seconds in this thread.
+
+    Raises:
+        KeyboardInterrupt: passed on when the server has stopped.
+    """
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
+    thread.start()
+    try:
+        while True:
+            on_tick()
+            time.sleep(tick)
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def _is_taken(error: OSError) -> bool:
+    from errno import EACCES, EADDRINUSE
+
+    return error.errno in (EADDRINUSE, EACCES)
+
+
+def _cannot_listen(host: str, port: int, error: OSError) -> UserError:
+    if _is_taken(error):
+        return UserError(
+            f"port {port} of {host} is in use", "choose another one, or omit --port to use the next free one"
+        )
+    return UserError(
+        f"cannot listen on {host}: {error.strerror or error}", "give an address of this machine with --host"
+    )

@@ -1,0 +1,72 @@
+"""The server of `train --view`, a process of its own: `python -m nerfcli.workflows.view_worker RUN`.
+
+A training then computes the same, in the same time, whoever looks at it or does not.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from nerfcli.child import messages, spawn, take_stdout
+from nerfcli.errors import UserError
+from nerfcli.runs.live import end_request
+from nerfcli.workflows.notices import Notify
+from nerfcli.workflows.view import view_run
+
+MODULE = "nerfcli.workflows.view_worker"
+# Of the threads of a training, while both work.
+_THREADS_SHARE = 2
+
+
+@contextmanager
+def viewer_beside(run: Path, *, threads: int, notify: Notify) -> Iterator[Callable[[], None]]:
+    """Yield a function that starts the server of a run, once; it ends with the context.
+
+    Args:
+        run: the folder, which need not be there before the start.
+        threads: of the training.
+        notify: takes the address.
+    """
+    with ExitStack() as ending:
+        log = ending.enter_context(open(os.devnull, "wb"))
+        child: subprocess.Popen[bytes] | None = None
+
+        def start() -> None:
+            nonlocal child
+            if child is None:
+                child = spawn(MODULE, run, log=log, threads=max(1, threads // _THREADS_SHARE))
+                listener = threading.Thread(target=_announce, args=(child, notify), daemon=True)
+                listener.start()
+                ending.callback(end_request, run)
+                ending.callback(listener.join)
+                ending.callback(child.kill)
+
+        yield start
+
+
+def _announce(child: subprocess.Popen[bytes], notify: Notify) -> None:
+    for message in messages(child):
+        for line in message["lines"]:
+            notify(line)
+
+
+def main() -> None:
+    """Serve the run of the first argument."""
+    send = take_stdout()
+
+    def on_ready(url: str, from_elsewhere: str) -> None:
+        send({"lines": [f"view the training at {url}", f"from another machine: {from_elsewhere}"]})
+
+    try:
+        threads = int(os.environ.get("OMP_NUM_THREADS", "0"))
+        view_run(Path(sys.argv[1]), threads=threads, browser=True, on_ready=on_ready)
+    except UserError as error:
+        send({"lines": [f"the training cannot be viewed: {error.message}"]})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,594 @@
+"""The server of the interactive page: who may look, what they get, and what their buttons do to a training."""
+
+import json
+import re
+import signal
+import socket
+import struct
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from browser import Browser, find_browser
+from commands import error_of, nerfcli, started
+from fog import foggy_cells
+
+from nerfcli import scene
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import INTERRUPTED, UserError
+from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
+from nerfcli.render.depth import DepthRequest
+from nerfcli.render.model import Marching, Model, save_model
+from nerfcli.render.pictures import RenderedPicture, render_picture
+from nerfcli.runs.files import FIELD, LIVE
+from nerfcli.runs.live import Pulse, Request, read_status, write_request
+from nerfcli.runs.run import Run
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.train import live as training_side
+from nerfcli.train import loop
+from nerfcli.viewer import painter
+from nerfcli.viewer.packing import pack_model
+from nerfcli.viewer.painter import Painter, Tile, View, render_tile, strides_of, tiles_of, view_from_json
+from nerfcli.viewer.pictures import view_of
+from nerfcli.viewer.server import PageServer
+from nerfcli.workflows.view import RunShow
+
+FEW = TrainSettings(budget_seconds=None, steps=12, samples_per_step=2**10, threads=2, downscale=8, model="default")
+
+
+class Served:
+    """A run that is served, and a client of it."""
+
+    def __init__(self, run: Path):
+        self.show = RunShow(run, threads=2)
+        self.server = PageServer(self.show, host="127.0.0.1", port=0)
+        self.url = self.server.url("127.0.0.1")
+        threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+
+    def get(self, place: str = "", body: Any = None) -> bytes:
+        data = None if body is None else json.dumps(body).encode()
+        with urllib.request.urlopen(urllib.request.Request(self.url + place, data), timeout=60) as answer:
+            return answer.read()
+
+    def refusal(self, place: str, body: Any = None, *, url: str | None = None) -> tuple[int, str]:
+        self.url, before = url or self.url, self.url
+        try:
+            with pytest.raises(urllib.error.HTTPError) as caught:
+                self.get(place, body)
+        finally:
+            self.url = before
+        with caught.value as answer:
+            return answer.code, answer.read().decode()
+
+    def close(self) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+        self.show.close()
+
+
+@pytest.fixture
+def served(finished) -> Iterator[Served]:
+    with closing(Served(finished)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def trained(spheres_run) -> Iterator[Served]:
+    with closing(Served(spheres_run)) as opened:
+        yield opened
+
+
+def frame_of(run: Path, *, width: int = 90, height: int = 66) -> Frame:
+    frame = Run(run).cameras.test[0]
+    camera = frame.camera
+    return replace(frame, camera=Camera.pinhole(width, height, camera.focal_px * width / camera.width))
+
+
+def asked(frame: Frame, *, client: str = "a") -> dict[str, Any]:
+    return {"client": client, "view": {**view_of(frame), "share": 0.25}}
+
+
+def records(content: bytes) -> Iterator[tuple[Tile, np.ndarray]]:
+    """The tiles of a picture as a page reads them: (height, width, 12)."""
+    while content:
+        stride, x, y, width, height, _, _, _ = struct.unpack("<8I", content[:32])
+        end = 32 + 48 * width * height
+        planes = np.frombuffer(content[32:end], "<f4").reshape(3, height, width, 4)
+        yield Tile(stride, x, y, width, height), np.moveaxis(planes, 0, 2).reshape(height, width, 12)
+        content = content[end:]
+
+
+def assembled(content: bytes, frame: Frame) -> np.ndarray:
+    """The finest picture; every pixel comes once."""
+    picture = np.full((frame.camera.height, frame.camera.width, 12), np.nan)
+    for tile, values in records(content):
+        if tile.stride == 1:
+            place = picture[tile.y : tile.y + tile.height, tile.x : tile.x + tile.width]
+            assert np.isnan(place).all()
+            place[:] = values
+    assert not np.isnan(picture).any()
+    return picture
+
+
+# Pictures
+
+
+def rendered(model: Model, frame: Frame, depth: str) -> RenderedPicture:
+    return render_picture(model, frame, background=model.background, depth=DepthRequest(depth, "ray", min_opacity=1e-9))
+
+
+def test_a_picture_is_that_of_nerfcli_render_bit_for_bit(trained):
+    frame, model = frame_of(trained.show._path), Run(trained.show._path).model()
+    picture = assembled(trained.get("picture", asked(frame)), frame)
+    by_render = {
+        name: rendered(model, frame, name) for name in ("conditional", "median", "max-weight", "quantile:0.25")
+    }
+    first = by_render["conditional"]
+    np.testing.assert_array_equal(picture[..., :3], first.rgb)
+    np.testing.assert_array_equal(picture[..., 3], first.opacity)
+    assert first.opacity.std() > 0.2
+    columns = {"conditional": 4, "median": 6, "max-weight": 7, "quantile:0.25": 10}
+    scale = model.training_from_scene.scale
+    for name, column in columns.items():
+        expected = by_render[name].depth
+        assert expected is not None
+        ours = np.where(picture[..., column] < 0, np.nan, picture[..., column] / scale)
+        np.testing.assert_allclose(ours, expected, rtol=1e-6)
+
+
+def test_a_coarse_picture_has_the_rays_of_the_middles_of_its_pixels(spheres_run):
+    frame, model = frame_of(spheres_run, width=50, height=33), Run(spheres_run).model()
+    view = View(frame, 0.25)
+    coarse = render_tile(model, view, Tile(4, 0, 0, 13, 9))
+    focal, _, cx, cy = frame.camera.params
+    moved = Frame(
+        "middle", Camera("PINHOLE", 1, 1, (focal, focal, cx - (4 * 5 + 1.5), cy - (4 * 3 + 1.5))), frame.world_from_cam
+    )
+    one = render_tile(model, View(moved, 0.25), Tile(1, 0, 0, 1, 1))
+    np.testing.assert_allclose(coarse[3, 5, :4], one[0, 0, :4], atol=2e-4)
+
+
+@pytest.mark.parametrize("rate", [1e-8, 3e-6, 1e-4, 1e-2])
+def test_strides_end_with_every_pixel_and_tiles_cover_each_once_from_the_middle(spheres_run, rate):
+    frame = frame_of(spheres_run, width=301, height=177)
+    strides = strides_of(301, 177, rate)
+    assert strides[-1] == 1
+    assert strides == sorted(set(strides), reverse=True)
+    for stride in strides:
+        tiles = tiles_of(View(frame, 0.5), stride, rate)
+        width, height = -(-301 // stride), -(-177 // stride)
+        seen = np.zeros((height, width), int)
+        for tile in tiles:
+            seen[tile.y : tile.y + tile.height, tile.x : tile.x + tile.width] += 1
+        assert (seen == 1).all()
+        off = [np.hypot(t.x + t.width / 2 - width / 2, t.y + t.height / 2 - height / 2) for t in tiles]
+        assert off == sorted(off)
+
+
+def test_a_newer_view_of_a_client_ends_the_one_before_between_two_tiles(monkeypatch, spheres_run):
+    """Counted in tiles, as no assertion may depend on how fast the machine is."""
+    first, second = (View(frame_of(spheres_run, width=size, height=size), 0.5) for size in (640, 320))
+    done: list[int] = []
+    going, held = threading.Event(), threading.Event()
+
+    def slow(model: Any, view: View, tile: Tile) -> np.ndarray:
+        done.append(view.frame.camera.width)
+        if len(done) == 3:
+            going.set()
+            held.wait(60)
+        return np.zeros((tile.height, tile.width, 12), np.float32)
+
+    monkeypatch.setattr(painter, "render_tile", slow)
+    works = Painter(lambda: (1, None), threads=1)  # type: ignore[arg-type, return-value]
+    works._rates.append(1e-3)
+    earlier, later = works.paint("a", first), works.paint("a", second)
+    got = [next(earlier)]
+    going.wait(60)
+    threading.Timer(0.05, held.set).start()
+    got_later = list(later)
+    got.extend(earlier)
+    assert len(got) <= 4
+    assert done[3:] == [320] * len(got_later)
+    assert len(got_later) > 3
+
+
+def test_two_clients_get_their_pictures_in_turn(monkeypatch, spheres_run):
+    order: list[int] = []
+
+    def quick(model: Any, view: View, tile: Tile) -> np.ndarray:
+        order.append(view.frame.camera.width)
+        time.sleep(0.001)
+        return np.zeros((tile.height, tile.width, 12), np.float32)
+
+    monkeypatch.setattr(painter, "render_tile", quick)
+    works = Painter(lambda: (1, None), threads=1)  # type: ignore[arg-type, return-value]
+    pictures: dict[str, list[bytes]] = {}
+    clients = {
+        name: threading.Thread(
+            target=lambda name=name, view=View(frame_of(spheres_run, width=size, height=size), 0.5): pictures.update(
+                {name: list(works.paint(name, view))}
+            )
+        )
+        for name, size in (("a", 800), ("b", 801))
+    }
+    for client in clients.values():
+        client.start()
+    for client in clients.values():
+        client.join(60)
+    both = order[4 : 2 * min(map(len, pictures.values())) - 4]
+    assert len(both) > 10
+    assert all(before != after for before, after in pairwise(both))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"width": 0},
+        {"width": 10**6},
+        {"lens": [1, 1, 1]},
+        {"lens": [-1, 1, 1, 1]},
+        {"place": [0, 0, float("nan")]},
+        {"turn": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]},
+        {"share": 1},
+        {"place": "here"},
+    ],
+)
+def test_what_is_no_view_is_refused(damage, finished):
+    sound = asked(frame_of(finished))["view"]
+    view_from_json(sound)
+    with pytest.raises(ValueError, match="view"):
+        view_from_json(sound | damage)
+
+
+# Who may look, and what they get
+
+
+def test_a_wrong_token_is_refused_everywhere(served):
+    for token in ("", "x", served.server.token[:-1], served.server.token + "x"):
+        wrong = served.url.replace(served.server.token, token)
+        for place, body in (
+            ("", None),
+            ("events", None),
+            ("field", None),
+            ("picture", {}),
+            ("control", {"action": "stop"}),
+        ):
+            code, text = served.refusal(place, body, url=wrong)
+            assert code == 403
+            assert "wrong token" in text
+    assert not served.show._request.stop
+
+
+def test_only_this_machine_can_reach_the_server_by_default(served):
+    assert served.server.server_address[0] == "127.0.0.1"
+    assert len(served.server.token) >= 20
+
+
+def test_what_is_not_there_and_what_makes_no_sense_is_told(served):
+    assert served.refusal("nothing")[0] == 404
+    assert served.refusal("photo?n=1000&px=100")[0] == 404
+    assert served.refusal("photo?n=x")[0] == 400
+    assert served.refusal("control", {"action": "explode"})[0] == 400
+    assert served.refusal("picture", {"view": {}})[0] == 400
+    assert served.refusal("picture", [1])[0] == 400
+    assert served.refusal("picture", {"client": "x" * 10**5})[0] == 400
+
+
+def test_the_page_may_fetch_from_its_server_alone(served):
+    page = served.get().decode()
+    policy = re.findall(r'Content-Security-Policy" content="([^"]*)"', page)[0]
+    assert "default-src 'none'" in policy
+    assert "connect-src 'self'" in policy
+    assert len(page) < 200_000
+    assert served.get("photo?n=0&px=40")[:2] == b"\xff\xd8"
+
+
+def test_the_field_comes_as_the_static_page_has_it(served):
+    content = served.get("field")
+    length = struct.unpack("<I", content[:4])[0]
+    head = json.loads(content[4 : 4 + length])
+    packed = pack_model(Run(served.show._path).model())
+    assert head["field"] == packed.field
+    assert content[4 + length :] == b"".join(array.tobytes() for array in packed.arrays.values())
+
+
+def test_a_network_without_a_table_is_drawn_by_the_server(finished):
+    field = FourierField(FourierFieldSettings(contraction="none", width=16, octaves=4))
+    old = Run(finished).model()
+    occupied = torch.ones(8, 8, 8, dtype=torch.bool)
+    marching = Marching(0.05, 4.0, 0.1, 0.0)
+    model = Model(field, occupied, marching, (0.2, 0.4, 0.6), old.training_from_scene, "arbitrary")
+    save_model(finished / FIELD, model)
+    with closing(Served(finished)) as served:
+        assert '"refusal":"the page cannot render a field of type mlp' in served.get().decode()
+        assert served.refusal("field")[0] == 503
+        frame = frame_of(finished, width=30, height=20)
+        picture = assembled(served.get("picture", asked(frame)), frame)
+    np.testing.assert_array_equal(picture[..., :3], rendered(model, frame, "conditional").rgb)
+
+
+def events(url: str) -> Generator[dict[str, Any], None, None]:
+    with urllib.request.urlopen(url + "events", timeout=60) as stream:
+        for line in stream:
+            if line.startswith(b"data: "):
+                yield json.loads(line[6:])
+
+
+def test_a_second_client_is_counted_and_goes(served):
+    with closing(events(served.url)) as one:
+        assert next(one)["clients"] == 1
+        with closing(events(served.url)) as other:
+            assert next(other)["clients"] == 2
+            served.server.announce()
+            assert next(one)["clients"] == 2
+        assert next(one)["clients"] == 1
+    with served.server.changed:
+        assert served.server.changed.wait_for(lambda: served.server.clients == 0, 60) or served.server.clients == 0
+
+
+# Addresses
+
+
+def test_a_port_that_is_taken_is_told_or_passed_over(finished):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        error, hint = error_of(nerfcli("view", finished, "--port", str(port), "--no-browser"))
+        assert error == f"Error: port {port} of 127.0.0.1 is in use"
+        assert "--port" in hint
+    show = RunShow(finished, threads=1)
+    with PageServer(show, host="127.0.0.1", port=None) as one, PageServer(show, host="127.0.0.1", port=None) as two:
+        assert one.port < two.port
+
+
+def test_an_address_that_is_not_ours_is_told(finished):
+    error, _ = error_of(nerfcli("view", finished, "--host", "192.0.2.1", "--no-browser"))
+    assert error.startswith("Error: cannot listen on 192.0.2.1")
+
+
+def test_ctrl_c_ends_the_server(finished):
+    process = started("view", finished, "--no-browser", "--json")
+    assert process.stdout is not None
+    url = json.loads(process.stdout.readline())["url"]
+    with closing(events(url)) as stream:
+        assert next(stream)["state"] == "none"
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stdout) == (INTERRUPTED, "")
+    assert re.search(r"ssh -L (\d+):127\.0\.0\.1:\1 ", stderr)
+    assert stderr.splitlines()[-1].startswith("Interrupted")
+    assert not (finished / LIVE).exists()
+
+
+# During a training
+
+
+def test_a_counter_that_goes_on_is_a_sign_of_life_and_an_old_one_is_none():
+    now = 0.0
+    pulse = Pulse(5.0, lambda: now)
+    assert not pulse.beats(None)
+    assert not pulse.beats(7)  # it may be years old
+    assert pulse.beats(8)
+    now = 4.9
+    assert pulse.beats(8)
+    now = 5.1
+    assert not pulse.beats(8)
+    assert pulse.beats(9)
+    assert not pulse.beats(None)
+
+
+def fit(run: Path, *, on_step: Any = lambda progress: None) -> None:
+    loop.train(
+        scene.load(run.with_name("spheres")), run, FEW, resume=False, notify=lambda text: None, on_progress=on_step
+    )
+
+
+class Watched:
+    """A run that somebody looks at from its first step on."""
+
+    def __init__(self, run: Path):
+        self.run, self.show = run, RunShow(run, threads=1)
+        self.server = SimpleNamespace(clients=1, announce=lambda: None)
+        self.states: list[str] = []
+
+    def on_step(self, progress: loop.Progress) -> None:
+        self.show.tick(self.server)  # type: ignore[arg-type]
+        self.states.append(self.show.status()["state"])
+
+
+@pytest.fixture
+def at_once(monkeypatch):
+    """The training looks for viewers, and gives them its field, after every step."""
+    for name, seconds in (("LOOK_SECONDS", 0.0), ("FIELD_SECONDS", 0.0), ("MOST_OF_TIME", 1e9)):
+        monkeypatch.setattr(training_side, name, seconds)
+    monkeypatch.setattr(loop, "_LAST_LOOK_SECONDS", 0.0)
+
+
+def test_who_looks_sees_each_field_and_changes_nothing(capture, at_once):
+    alone, run = capture.with_name("alone"), capture.with_name("watched")
+    fit(alone)
+    watched = Watched(run)
+    seen: dict[str, int] = {}
+
+    def on_step(progress: loop.Progress) -> None:
+        watched.on_step(progress)
+        if progress.step > 3:
+            status = watched.show.status()
+            assert (status["step"], status["version"]) == (progress.step - 1, progress.step - 1)
+            seen[str(watched.show.model()[1].sha256)] = progress.step
+
+    fit(run, on_step=on_step)
+    assert watched.states[3:] == ["training"] * 9
+    assert len(seen) >= 6  # the last steps of so short a training meet nothing, and leave the field as it is
+    assert (run / FIELD).read_bytes() == (alone / FIELD).read_bytes()
+    watched.server.clients = 0
+    watched.show.tick(watched.server)  # type: ignore[arg-type]
+    assert watched.show.status()["state"] == "ended"
+    assert watched.show.model()[1].sha256 == Run(run).checkpoint_sha256()
+    assert not (run / LIVE).exists()
+    assert not (alone / LIVE).exists()
+
+
+def test_pause_and_stop_reach_the_training(capture, at_once):
+    run = capture.with_name("watched")
+    watched = Watched(run)
+    paused_at: list[int] = []
+    last = 0
+
+    def elsewhere() -> None:
+        """The server's thread while the training waits."""
+        deadline = time.monotonic() + 60
+        while (status := read_status(run)) is None or not status.paused:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        for _ in range(5):
+            watched.show.tick(watched.server)  # type: ignore[arg-type]
+            time.sleep(0.05)
+            paused_at.append(last)
+        watched.show.control("continue")
+
+    def on_step(progress: loop.Progress) -> None:
+        nonlocal last
+        last = progress.step
+        watched.on_step(progress)
+        if progress.step == 4:
+            watched.show.control("pause")
+            threading.Thread(target=elsewhere, daemon=True).start()
+        if progress.step == 7:
+            watched.show.control("stop")
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(run, on_step=on_step)
+    assert paused_at == [4] * 5
+    assert Run(run).saved_progress()[0] == 7
+    assert read_status(run) is None
+
+
+def test_a_viewer_that_died_during_a_pause_holds_nobody_up(capture, at_once, monkeypatch):
+    monkeypatch.setattr(training_side, "VIEWER_SECONDS", 0.3)
+    run = capture.with_name("watched")
+
+    def on_step(progress: loop.Progress) -> None:
+        if progress.step <= 4:
+            write_request(run, Request(progress.step, paused=progress.step == 4))
+
+    fit(run, on_step=on_step)
+    assert Run(run).saved_progress()[0] == 12
+
+
+def test_a_disk_that_is_full_ends_the_view_and_not_the_training(capture, at_once, monkeypatch):
+    def full(path: Path, model: Model) -> None:
+        raise UserError(f"cannot write {path}: No space left on device", "free some")
+
+    monkeypatch.setattr(training_side, "save_model", full)
+    run, notes = capture.with_name("watched"), []
+    watched = Watched(run)
+    loaded = scene.load(capture)
+    loop.train(loaded, run, FEW, resume=False, notify=notes.append, on_progress=watched.on_step)
+    assert Run(run).saved_progress()[0] == 12
+    assert sum("can no longer be viewed" in note for note in notes) == 1
+
+
+def test_train_serves_its_run_with_view(capture):
+    process = started(
+        "train", capture, "--steps", "100000", "--downscale", "8", "--threads", "1", "--model", "default", "--view"
+    )
+    assert process.stderr is not None
+    lines = iter(process.stderr.readline, "")
+    url = next(found[0] for line in lines if (found := re.findall(r"http://\S+", line)))
+    with closing(events(url)) as stream:
+        step = next(s["step"] for s in stream if s["state"] == "training" and s["version"] > 0)
+        request = urllib.request.Request(url + "control", json.dumps({"action": "stop"}).encode())
+        urllib.request.urlopen(request, timeout=60).close()
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == INTERRUPTED
+    assert "--resume" in stderr
+    run = capture.with_name(f"{capture.name}-run")
+    assert Run(run).saved_progress()[0] >= step
+    assert not (run / LIVE).exists()
+
+
+# In a browser
+
+
+def test_a_browser_without_a_graphics_card_shows_what_the_server_renders(trained, tmp_path):
+    if find_browser() is None:
+        pytest.skip("there is no Chromium on this machine to open the page with")
+    with Browser(tmp_path, width=860, height=480) as browser:
+        browser.visit(trained.url)
+        assert browser.run("document.getElementById('by').value") == "server"
+        browser.wait("document.body.dataset.rested > 0")
+        assert not browser.errors
+        view = browser.run("nerfcliPage.view()")
+        found = np.array(browser.run("[...nerfcliPage.renderer.layers.at(-1).colour]")).reshape(
+            view["height"], view["width"], 4
+        )
+        frame = view_from_json(view).frame
+        model = Run(trained.show._path).model()
+        by_render = rendered(model, frame, "median")
+        np.testing.assert_array_equal(found[..., :3].astype(np.float32), by_render.rgb)
+        drawn = on_screen(browser)
+        np.testing.assert_allclose(drawn, 255 * by_render.rgb, atol=0.6)
+        # A motion: the last picture is warped until the new one comes; what was hidden is grey.
+        count = browser.run("nerfcliPage.renderer.latencies.length")
+        stride = browser.run(
+            "(() => { nerfcliPage.walk.move(0.3, 0, 0); nerfcliPage.moved(); "
+            "return document.getElementById('field').dataset.stride; })()"
+        )
+        assert stride == "warped"
+        warped = on_screen(browser)
+        browser.wait(f"nerfcliPage.done && nerfcliPage.renderer.latencies.length > {count}")
+        moved = on_screen(browser)
+        seen = (warped != 0x70).any(-1)
+        assert seen.mean() > 0.9
+        off, still = (np.abs(other - moved)[seen].mean() for other in (warped, drawn))
+        assert off < 0.5 * still
+        assert not browser.errors
+
+
+def test_a_browser_draws_each_new_field_by_itself(finished, tmp_path):
+    if find_browser() is None:
+        pytest.skip("there is no Chromium on this machine to open the page with")
+    old = Run(finished).model()
+    with closing(Served(finished)) as served, Browser(tmp_path, width=420, height=200) as browser:
+        served.server.clients = 1  # as `tick` counts them; the test calls it
+        served.show.tick(served.server)
+        browser.visit(served.url + "?by=page")
+        browser.wait("document.body.dataset.rested > 0")
+        assert browser.run("nerfcliPage.probe.colour.slice(0, 3)") == {"0": 1, "1": 1, "2": 1}
+        save_model(
+            finished / FIELD,
+            replace(old, background=(0.0, 0.5, 1.0), occupied=foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.0))),
+        )
+        served.show.tick(served.server)
+        browser.wait("document.body.dataset.version == 2")
+        browser.wait("nerfcliPage.done")
+        browser.run("nerfcliPage.check()")
+        found = json.loads(browser.run("document.getElementById('checked').dataset.found"))
+        assert found["colour"]["largest"] < 2e-3
+        assert found["opacity"]["largest"] < 2e-3
+        corner = browser.run("nerfcliPage.probe.colour.slice(0, 4)")
+        assert corner["2"] > corner["0"]
+        assert not browser.errors
+
+
+def on_screen(browser: Browser) -> np.ndarray:
+    """(H, W, 3) levels of the picture."""
+    width, height, *levels = browser.run(
+        "(c => [c.width, c.height, ...c.getContext('2d').getImageData(0, 0, c.width, c.height).data])"
+        "(document.getElementById('field'))"
+    )
+    return np.array(levels, float).reshape(height, width, 4)[..., :3]
