@@ -19,7 +19,7 @@ from nerfcli.media.images import downscale, write_png
 from nerfcli.memory import resident_bytes
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.photos.pool import Album, PixelPool, load_album
-from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, PhotoStorage, storage_for
+from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, PhotoStorage, check_device_memory, storage_for
 from nerfcli.render.rays import frame_rays
 from nerfcli.scene import Scene
 
@@ -347,7 +347,7 @@ def test_pages_are_given_back_beyond_the_limit(tmp_path):
 
 
 def test_what_does_not_fit_is_refused_up_front(tmp_path):
-    needs = Needs(photos=3 * 10**9, rest=10**9)
+    needs = Needs(photos=3 * 10**9, step=10**9, rest=10**9)
     assert storage_for(needs, None, folder=tmp_path)[0] is IN_MEMORY
     assert storage_for(needs, 4 * 10**9, folder=tmp_path)[0] is IN_MEMORY
     room, told = storage_for(needs, 2 * 10**9, folder=tmp_path)
@@ -357,6 +357,17 @@ def test_what_does_not_fit_is_refused_up_front(tmp_path):
         UserError, match=r"needs about 1\.00 GB of memory in addition to the photos, but the limit is 0\.90 GB"
     ) as caught:
         storage_for(needs, 9 * 10**8, folder=tmp_path)
+    assert caught.value.exit_code == OUT_OF_MEMORY
+
+
+def test_a_gpu_without_room_is_refused_up_front(monkeypatch):
+    needs = Needs(photos=3 * 10**9, step=10**9, rest=9 * 10**9)  # what the host decodes does not count there
+    device = torch.device("cuda:1")
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (4 * 10**9, 8 * 10**9))
+    assert check_device_memory(needs, device) == "memory on cuda:1: about 4.00 GB of 4.00 GB that are free"
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (3 * 10**9, 8 * 10**9))
+    with pytest.raises(UserError, match=r"needs about 4\.00 GB of memory on cuda:1, where 3\.00 GB are free") as caught:
+        check_device_memory(needs, device)
     assert caught.value.exit_code == OUT_OF_MEMORY
 
 

@@ -88,7 +88,7 @@ def measure(
     if records.last(COMPLETE) is not None:
         return
     load = load_average()
-    kernels.prepare(notify)
+    kernels.prepare(notify, subject.base.device)
     session = Session(records, wanted.budget_seconds, tell, notify)
     session.record("begun", load_average=load, busy=is_busy(load))
     if is_busy(load):

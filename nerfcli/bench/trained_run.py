@@ -12,7 +12,7 @@ from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.render.model import Model
 from nerfcli.runs.files import CONFIG, RECONSTRUCTION
 from nerfcli.runs.run import Run
-from nerfcli.runs.settings import TrainSettings, automatic_downscale
+from nerfcli.runs.settings import TrainSettings, automatic_downscale, sizes_for
 from nerfcli.scene import Scene
 
 
@@ -79,7 +79,12 @@ def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
     if not run.is_trained:
         raise UserError(f"{path} is not trained yet", "train it first (nerfcli train SCENE), or give a scene")
     base = TrainSettings(
-        seed=seed, device=device, threads=threads, downscale=trained.downscale, components=trained.components
+        seed=seed,
+        device=device,
+        threads=threads,
+        downscale=trained.downscale,
+        components=trained.components,
+        **sizes_for(device),
     )
     # As the training named it, which is relative to where the user then was; or beside the run, where both moved.
     places = (named, path.resolve().parent / named.name)
@@ -112,7 +117,7 @@ def _scene_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun
         run=None,
         scene=path,
         test_frames=scene.test_frames,
-        base=TrainSettings(seed=seed, device=device, threads=threads, downscale=_factor(scene)),
+        base=TrainSettings(seed=seed, device=device, threads=threads, downscale=_factor(scene), **sizes_for(device)),
         identity=scenes.fingerprint(scene),
         trained={},
     )

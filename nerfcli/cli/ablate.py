@@ -90,7 +90,7 @@ def ablate(
     """
     from nerfcli.ablate.results import COLUMNS, ResultRow, table_of
     from nerfcli.runs.components import CHOICES, Components, choose
-    from nerfcli.runs.settings import TrainSettings
+    from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.ablate import ablate_scene
 
     if unknown := [name for name in only or () if name not in CHOICES]:
@@ -98,16 +98,18 @@ def ablate(
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
     console = Console(quiet=quiet, json_lines=json)
+    torch_device = device_name(device)
     settings = TrainSettings(
         budget_seconds=None if budget is None else seconds_from_text(budget),
         steps=steps,
         downscale=downscale_factor(downscale),
         seed=seed,
-        device=device_name(device),
+        device=torch_device,
         threads=thread_count(threads),
         components=choose(Components(), included=include or (), excluded=exclude or ()),
         model=model_name(model),
         fixed=named_components(include, exclude),
+        **sizes_for(torch_device),
     )
     rule, limit = holdout_rule(holdout), memory_limit(memory)
 

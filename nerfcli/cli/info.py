@@ -1,5 +1,6 @@
 """nerfcli info: show what a folder or a file contains."""
 
+from json import dumps
 from pathlib import Path
 from typing import Annotated
 
@@ -8,14 +9,18 @@ import typer
 from nerfcli.cli.batch import for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.info_text import cost_lines, lines_of, words_of
-from nerfcli.cli.options import Json
+from nerfcli.cli.options import Json, thread_count
 
 
 @command
 def info(
     path: Annotated[
-        str, typer.Argument(help="Scene, run, renders, or one of their files; - to read paths from standard input.")
-    ],
+        str | None,
+        typer.Argument(help="Scene, run, renders, or one of their files; - to read paths from standard input."),
+    ] = None,
+    machine: Annotated[
+        bool, typer.Option("--machine", help="Show processors, GPUs, versions, and which kernels run on each device.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Show what a scene, a run or one of their files contains.
@@ -32,12 +37,21 @@ def info(
     Examples:
       nerfcli info photos-scene
       nerfcli info photos-scene-run --json
+      nerfcli info --machine
       nerfcli info photos-scene-run/failure-1200.safetensors
       nerfcli info photos-scene-run/renders/test-conditional-z/depth/a.tiff
     """
     from nerfcli.workflows.describe import describe
 
     console = Console(quiet=True, json_lines=True)
+    if machine == (path is not None):
+        raise typer.BadParameter("give a path, or --machine", param_hint="PATH")
+    if path is None:
+        from nerfcli.kernels.devices import describe_machine
+
+        described = describe_machine(thread_count(0))
+        typer.echo(dumps(described) if json else "\n".join(f"{name}: {value}" for name, value in described.items()))
+        return
 
     def work(folder: Path, one_of_many: bool) -> None:
         content = describe(folder)

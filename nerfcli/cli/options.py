@@ -15,7 +15,7 @@ Output = Annotated[
         "--output", "-o", help="Output file or folder; with several inputs, the folder that will contain the results."
     ),
 ]
-Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Device = Annotated[str, typer.Option(help="auto, cpu, cuda or cuda:1.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.", min=0)]
 Threads = Annotated[int, typer.Option(help="Number of CPU threads; 0 uses all.", min=0)]
 Downscale = Annotated[str, typer.Option(help="Reduce photos by this factor: auto, 1, 2, 4 or 8.")]

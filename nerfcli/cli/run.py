@@ -83,7 +83,7 @@ def run(
     from nerfcli.poses.input.settings import Limits, PoseSettings
     from nerfcli.render.pictures import DepthRequest
     from nerfcli.runs.components import Components, choose
-    from nerfcli.runs.settings import TrainSettings
+    from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run
     from nerfcli.workflows.poses import estimate_poses, folder_of_photos, given_intrinsics, without_suffix
     from nerfcli.workflows.render import render_run
@@ -113,6 +113,7 @@ def run(
         components=choose(Components(), included=include or (), excluded=exclude or ()),
         model=model_name(model),
         fixed=named_components(include, exclude),
+        **sizes_for(torch_device),
     )
     depth = DepthRequest(convention="conditional", axis="z")
 

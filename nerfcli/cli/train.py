@@ -1,6 +1,7 @@
 """nerfcli train: from a scene to a field."""
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -60,12 +61,25 @@ def train(
     model: ModelChoice = "auto",
     downscale: Downscale = "auto",
     contraction: Contraction = "auto",
-    log2_rows: Annotated[int, typer.Option(help="Rows of each hash table, as a power of two.", min=4, max=24)] = 16,
+    log2_rows: Annotated[
+        int | None,
+        typer.Option(
+            help="Rows of each hash table, as a power of two.  [default: 16, on a GPU 19]",
+            min=4,
+            max=24,
+            show_default=False,
+        ),
+    ] = None,
     levels: Annotated[int, typer.Option(help="Levels of the hash grid; values other than 8 are slow.", min=1)] = 8,
     width: Annotated[int, typer.Option(help="Width of the network layers; values other than 32 are slow.", min=1)] = 32,
     batch: Annotated[
-        int, typer.Option(help="Maximum number of samples per step; the first steps use fewer.", min=2**8)
-    ] = 2**16,
+        int | None,
+        typer.Option(
+            help="Maximum number of samples per step; the first steps use fewer.  [default: 65536, on a GPU 262144]",
+            min=2**8,
+            show_default=False,
+        ),
+    ] = None,
     holdout: Holdout = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the last checkpoint to the new total.")
@@ -132,7 +146,7 @@ def train(
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
     from nerfcli.runs.components import Components, choose
-    from nerfcli.runs.settings import TrainSettings
+    from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.tomography.scan import is_scan
     from nerfcli.workflows.train import train_scene
 
@@ -171,21 +185,24 @@ def train(
 
     @functools.cache
     def photo_settings() -> TrainSettings:
+        torch_device = device_name(device)
+        sized = replace(TrainSettings(), **sizes_for(torch_device))
+        largest = batch or sized.samples_per_step
         return TrainSettings(
             budget_seconds=budget_seconds,
             steps=steps,
             downscale=downscale_factor(downscale),
             contraction=contraction_name(contraction),
             seed=seed,
-            device=device_name(device),
+            device=torch_device,
             threads=thread_count(threads),
             components=choose(Components(), included=include or (), excluded=exclude or ()),
             model=model_name(model),
             fixed=named_components(include, exclude),
-            first_samples_per_step=min(TrainSettings.first_samples_per_step, batch),
-            samples_per_step=batch,
+            first_samples_per_step=min(sized.first_samples_per_step, largest),
+            samples_per_step=largest,
             levels=levels,
-            log2_rows=log2_rows,
+            log2_rows=log2_rows or sized.log2_rows,
             width=width,
             field=field_kind(field or "hash"),
             field_memory_bytes=None if field_memory is None else bytes_from_text(field_memory, "--field-memory"),

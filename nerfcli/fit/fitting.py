@@ -122,6 +122,7 @@ class Fitting:
             self.parts.show_sky(sky)
         self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
+        self._most_rays = MOST_RAYS if device.type == "cpu" else max(MOST_RAYS, settings.samples_per_step // 4)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
         self.optimiser = FieldOptimiser(self.field)
         self.parts_optimiser = PartsOptimiser(self.parts.groups())
@@ -151,7 +152,7 @@ class Fitting:
         self.parts_optimiser.zero_grad()
         if samples > 0:
             loss.backward()
-        self._check_finite(loss, drawn, watch)
+        value = self._finite_loss(loss, drawn, watch)
         rate = self.learning_rate(share)
         self.step += 1
         self.optimiser.step(self.step, rate)
@@ -160,7 +161,7 @@ class Fitting:
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False
-        return StepResult(loss=loss.item(), samples=samples, rays=rays)
+        return StepResult(loss=value, samples=samples, rays=rays)
 
     def draw(self, fraction: float) -> Drawn:
         """The pixels of the next step, after looking at what fills space if it is time."""
@@ -169,7 +170,7 @@ class Fitting:
             self._refresh_occupancy()
         growth = 2.0 ** min(self.step / DOUBLING_STEPS, MOST_DOUBLINGS)
         wanted = min(settings.samples_per_step, growth * settings.first_samples_per_step)
-        rays = min(MOST_RAYS, max(64, round(wanted / max(1.0, self.samples_per_ray))))
+        rays = min(self._most_rays, max(64, round(wanted / max(1.0, self.samples_per_ray))))
         source = self.pool if self.error_map is None or self.furthest < BEGINS else self.error_map
         drawn = source.draw(rays, self.generator)
         if self.points is None or fading(fraction) == 0.0:
@@ -288,7 +289,8 @@ class Fitting:
         occupied = self.occupancy.above(threshold)
         return occupied if self.covered is None else occupied & self.covered
 
-    def _check_finite(self, loss: Tensor, drawn: Drawn, watch: Watch) -> None:
+    def _finite_loss(self, loss: Tensor, drawn: Drawn, watch: Watch) -> float:
+        """The loss, if it and all gradients are finite."""
         total = loss.detach()
         rays = {"origins of rays": drawn.origins.grad, "directions of rays": drawn.directions.grad}
         of_rays = {name: gradient for name, gradient in rays.items() if gradient is not None}
@@ -297,8 +299,10 @@ class Fitting:
             total = total + gradient.sum()  # which is non-finite if any term is
         if self.optimiser.sink is not None:
             watch.values("gradient of rows", self.optimiser.sink)
-        if not math.isfinite(total.item()):
+        value, summed = torch.stack([loss.detach(), total]).tolist()  # together: a GPU is waited for once
+        if not math.isfinite(summed):
             raise NonFiniteError
+        return value
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return everything that `restore` needs to continue bit for bit."""

@@ -45,6 +45,8 @@ __all__ = [
     "backend_for",
     "contract",
     "contract_to_cube",
+    "driver_version",
+    "gpu_launcher",
     "grid_coordinates",
     "has_compiled",
     "prepare",
@@ -84,6 +86,25 @@ def why_not_triton(device: torch.device) -> str | None:
     if not torch.cuda.is_available():
         return "torch finds no CUDA device"
     return _why_not_triton(device.index if device.index is not None else torch.cuda.current_device())
+
+
+def gpu_launcher() -> str:
+    """Return what starts the GPU kernels, where they work."""
+    from nerfcli.kernels.triton_cuda.launch import launcher
+
+    return launcher()
+
+
+def driver_version() -> str:
+    """Return the newest version of CUDA that the driver supports, or "unknown"."""
+    try:
+        from nerfcli.kernels.triton_cuda.driver import DriverError, version
+    except ImportError:
+        return "unknown"
+    try:
+        return version()
+    except (OSError, DriverError):
+        return "unknown"
 
 
 def has_compiled() -> bool:

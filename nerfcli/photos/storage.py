@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from nerfcli.atomic import cannot_write
 from nerfcli.cameras.frame import Frame
@@ -32,9 +33,16 @@ _BYTES_PER_DECODED_PIXEL = 12
 
 @dataclass(frozen=True)
 class Needs:
-    """Bytes that a training takes: for photos, and for all else."""
+    """Bytes that a training takes.
+
+    Args:
+        photos: for photos.
+        step: for the field, its optimiser and a step.
+        rest: for all but photos, in the machine's memory.
+    """
 
     photos: int
+    step: int
     rest: int
 
 
@@ -54,12 +62,9 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     field_bytes = settings.field_memory_bytes or {"hash": 16 * settings.levels * 2**settings.log2_rows}.get(
         settings.field, _LARGEST_FIELD_BYTES
     )
-    rest = (
-        _BYTES_PER_DECODED_PIXEL * largest * min(settings.threads, len(frames))
-        + _COPIES_OF_FIELD * field_bytes
-        + _BYTES_PER_SAMPLE * settings.samples_per_step
-    )
-    return Needs(photos, rest + resident_bytes(os.getpid()))
+    step = _COPIES_OF_FIELD * field_bytes + _BYTES_PER_SAMPLE * settings.samples_per_step
+    rest = _BYTES_PER_DECODED_PIXEL * largest * min(settings.threads, len(frames)) + step
+    return Needs(photos, step, rest + resident_bytes(os.getpid()))
 
 
 class InMemory:
@@ -117,6 +122,23 @@ class InFiles:
 
 PhotoStorage = InMemory | InFiles
 IN_MEMORY = InMemory()
+
+
+def check_device_memory(needs: Needs, device: torch.device) -> str:
+    """Return a message for the user about the memory of a CUDA device.
+
+    Raises:
+        UserError: photos and training do not fit into what is free there.
+    """
+    free, _ = torch.cuda.mem_get_info(device)
+    needed = needs.photos + needs.step
+    if needed > free:
+        raise UserError(
+            f"training needs about {_gigabytes(needed)} of memory on {device}, where {_gigabytes(free)} are free",
+            "reduce the photos with --downscale 4, lower --log2-rows or --batch, or use --device cpu",
+            OUT_OF_MEMORY,
+        )
+    return f"memory on {device}: about {_gigabytes(needed)} of {_gigabytes(free)} that are free"
 
 
 def storage_for(needs: Needs, limit: int | None, *, folder: Path) -> tuple[PhotoStorage, str]:

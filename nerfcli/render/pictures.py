@@ -17,6 +17,7 @@ from nerfcli.render.rays import PictureRays, pixel_rays, places_in_pixel
 from nerfcli.render.tracing import TOLERANCE, render_rays
 
 RAYS_PER_TILE = 8192
+RAYS_PER_GPU_TILE = 2**16
 # Rays and what is behind them are made for this many at a time: their last bits must not depend on the tile.
 RAYS_PER_BLOCK = 2**18
 
@@ -73,7 +74,7 @@ def render_picture(
     depth: DepthRequest | None = None,
     quality: Quality = Quality(),
     on_tile: Callable[[int], None] | None = None,
-    rays_per_tile: int = RAYS_PER_TILE,
+    rays_per_tile: int | None = None,
 ) -> RenderedPicture:
     """Render one frame; every bit of it is the same for any size of tiles and any number of threads.
 
@@ -87,7 +88,8 @@ def render_picture(
         depth: which depth to compute along with the colour.
         quality: how much work to put into it.
         on_tile: called with the number of pixels after each tile.
-        rays_per_tile: how many are rendered at a time; a matter of speed and memory alone.
+        rays_per_tile: how many are rendered at a time, a matter of speed and memory alone; None for what suits the
+            device.
 
     Raises:
         UserError: the field gives numbers that are not finite.
@@ -97,7 +99,8 @@ def render_picture(
     width, height, count = frame.camera.width, frame.camera.height, quality.samples_per_pixel
     places = places_in_pixel(count)
     columns: list[tuple[Tensor, ...]] = []
-    block, tile = max(1, RAYS_PER_BLOCK // count), max(1, rays_per_tile // count)
+    together = rays_per_tile or (RAYS_PER_TILE if model.device.type == "cpu" else RAYS_PER_GPU_TILE)
+    block, tile = max(1, RAYS_PER_BLOCK // count), max(1, together // count)
     for first in range(0, width * height, block):
         chosen = np.arange(first, min(first + block, width * height))
         rays = pixel_rays(frame, model.training_from_scene, pixels=chosen, places=places, device=model.device)

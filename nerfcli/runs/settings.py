@@ -13,6 +13,8 @@ from nerfcli.runs.components import Components
 DOWNSCALES = (1, 2, 4, 8)
 # `--downscale auto` takes the largest pictures whose longer side is within this many pixels.
 AUTO_LONGER_SIDE_PX = 800
+# Sizes of a training on a GPU, which has nothing to do in small steps, and room for large tables.
+GPU_SIZES: dict[str, Any] = {"first_samples_per_step": 2**16, "samples_per_step": 2**18, "log2_rows": 19}
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,11 @@ class TrainSettings:
         known["components"] = Components(**content.get("components", {}))
         known["fixed"] = tuple(content.get("fixed", ()))
         return cls(**known)
+
+
+def sizes_for(device: str) -> dict[str, Any]:
+    """Return the settings that depend on the device, where they are not the defaults of `TrainSettings`."""
+    return GPU_SIZES if device.startswith("cuda") else {}
 
 
 def automatic_downscale(width: int, height: int) -> int:

@@ -71,7 +71,7 @@ def train(
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     torch.set_num_threads(settings.threads)
-    kernels.prepare(notify)
+    kernels.prepare(notify, settings.device)
     saved = load_tensors(run / STATE, settings.device) if resume else None
     begun = decisions_of(run, settings, saved[1]) if saved is not None else None
     prepared = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)

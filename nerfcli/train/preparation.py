@@ -24,7 +24,7 @@ from nerfcli.multiview.correspondences import Shared
 from nerfcli.multiview.triangulation import triangulate
 from nerfcli.photos.exif_exposure import log_exposures, mean_log_exposure, relative_log_exposures
 from nerfcli.photos.pool import Album, PixelPool, load_album
-from nerfcli.photos.storage import PhotoStorage, needs_of, storage_for
+from nerfcli.photos.storage import PhotoStorage, check_device_memory, needs_of, storage_for
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
@@ -144,6 +144,9 @@ def prepare(
     needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
     storage, text = storage_for(needs, memory_bytes, folder=run)
     notify(text)
+    device = torch.device(settings.device)
+    if device.type == "cuda":
+        notify(check_device_memory(needs, device))
     masks = settings.components.masks
     album = load_album(scene.train_frames, factor=factor, threads=settings.threads, storage=storage, masks=masks)
     shared = Shared(scene, album.photos, threads=settings.threads)
@@ -156,7 +159,6 @@ def prepare(
             located = replace(scene, points=triangulate(frames, shared.of_matches).known)
             notify(f"the scene has no 3D points; estimating its extent from {len(located.points)} triangulated ones")
         extent = choose_extent(located, settings, fills_frame=album.fills_frame)
-    device = torch.device(settings.device)
     pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
     camera = album.photos[0].frame.camera
     notify(

@@ -66,7 +66,7 @@ def evaluate_run(
 
     Args:
         run: the folder that `train_scene` wrote.
-        device: "auto", "cpu" or "cuda".
+        device: "auto", "cpu", "cuda" or "cuda:1".
         threads: of the CPU; 0 for all.
         overwrite: measure again.
         align_poses: also from a pose refined on the left half of each photo, measured on the right.

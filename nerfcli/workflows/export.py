@@ -64,7 +64,7 @@ def export_run(
         target: the file to write, whose suffix chooses among the formats of `to`; beside the run by default.
         to: one of `TARGETS`.
         settings: where and how fine a geometry is.
-        device: "auto", "cpu" or "cuda".
+        device: "auto", "cpu", "cuda" or "cuda:1".
         threads: of the CPU; 0 for all.
         overwrite: replace what stands at `target`.
         notify: takes lines for the user.

@@ -1,6 +1,7 @@
 """The processors and the device to work with."""
 
 import os
+import re
 
 from nerfcli.errors import UserError
 
@@ -15,17 +16,23 @@ def thread_count(threads: int) -> int:
 
 
 def device_name(device: str) -> str:
-    """Return the torch device for "auto", "cpu" or "cuda".
+    """Return the torch device for "auto", "cpu", "cuda" or "cuda:1".
 
     Raises:
-        UserError: CUDA is wanted and not there, or the name is unknown.
+        UserError: CUDA or this number of its devices is wanted and not there, or the name is unknown.
     """
     import torch
 
-    if device not in ("auto", "cpu", "cuda"):
-        raise UserError(f"unknown device {device!r}", "use --device auto, cpu or cuda", exit_code=2)
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UserError("--device cuda: torch finds no CUDA device", "use --device cpu, or install torch with CUDA")
+    named = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", device)
+    if named is None:
+        raise UserError(f"unknown device {device!r}", "use --device auto, cpu, cuda or cuda:1", exit_code=2)
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(
+            f"--device {device}: torch finds no CUDA device", "use --device cpu, or install torch with CUDA"
+        )
+    if named[1] is not None and int(named[1]) >= torch.cuda.device_count():
+        last = torch.cuda.device_count() - 1
+        raise UserError(f"--device {device}: there is no such device", f"the last one is cuda:{last}")
     if device == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     return device

@@ -56,7 +56,7 @@ def render_run(
         target: the folder to write; in RUN/renders by default, named after views and depth.
         views: which cameras; the held-out ones by default.
         settings: outputs, depth, files, videos, and how much work goes into a picture.
-        device: "auto", "cpu" or "cuda".
+        device: "auto", "cpu", "cuda" or "cuda:1".
         threads: of the CPU; 0 for all.
         step: length of the steps along rays, in those of the training.
         jobs: processes; 0 for `automatic_workers`.

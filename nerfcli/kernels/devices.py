@@ -1,0 +1,47 @@
+"""What a machine has to compute with, and which backend runs on each device."""
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import torch
+
+from nerfcli import __version__, kernels
+
+
+def describe_machine(processors: int) -> dict[str, Any]:
+    """Describe GPUs and versions, and which backend works on each device, as plain values.
+
+    Args:
+        processors: that this process may use.
+    """
+    described: dict[str, Any] = {
+        "nerfcli": __version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "triton": _version("triton"),
+        "system": f"{platform.system()} {platform.machine()}",
+        "processors": processors,
+        "backend on cpu": kernels.backend_for(torch.device("cpu"), torch.float32).name,
+    }
+    if not torch.cuda.is_available():
+        return {**described, "cuda": "torch finds no CUDA device"}
+    for index in range(torch.cuda.device_count()):
+        device = torch.device("cuda", index)
+        properties = torch.cuda.get_device_properties(device)
+        gigabytes = properties.total_memory / 1e9
+        described[str(device)] = (
+            f"{properties.name}, {gigabytes:.0f} GB, compute capability {properties.major}.{properties.minor}"
+        )
+        why_not = kernels.why_not_triton(device)
+        described[f"backend on {device}"] = (
+            f"triton_cuda, launched by {kernels.gpu_launcher()}" if why_not is None else f"reference, because {why_not}"
+        )
+    return {**described, "cuda of torch": torch.version.cuda, "cuda of the driver": kernels.driver_version()}
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
