@@ -185,6 +185,8 @@ def test_all_threads_are_the_processors_of_this_process():
         ("render x --video-format gif --fps 60", "60; a gif plays at 50 frames per second at most"),
         ("render x --video --loop 0", "0; only a gif can repeat forever"),
         ("render x --frames 200:100", "'200:100'; write START:STOP"),
+        ("render x --frames 0/8", "'0/8'; write START:STOP"),
+        ("render x --frames 9/8", "or K/N, such as 1/8"),
         ("render x --max-size 0", "--max-size"),
         ("run x --budget -1", "'-1' is not a time"),
     ],

@@ -35,6 +35,20 @@ def test_a_part_is_cut_out_of_the_whole_picture(finished):
     np.testing.assert_array_equal(part, whole[7:17, 5:25])
 
 
+def test_parts_of_an_array_job_together_equal_one_rendering(finished, tmp_path):
+    orbit = ("--cameras", "orbit", "--count", "5", "--max-size", "32", "--outputs", "rgb,depth", "--threads", "1")
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert nerfcli("render", finished, *orbit, "-o", whole).exit_code == 0
+    for task in ("1/3", "3/3", "2/3"):
+        result = nerfcli("render", finished, *orbit, "-o", parts, "--frames", task)
+        assert not parts.exists()
+    assert "5 of 5 frames are complete" in result.stderr
+    assert "resuming: 5 of 5 frames" in nerfcli("render", finished, *orbit, "-o", parts).stderr
+    files = [path.relative_to(whole) for path in whole.rglob("*.*") if path.suffix in (".png", ".tiff")]
+    assert len(files) == 15
+    assert all((whole / file).read_bytes() == (parts / file).read_bytes() for file in files)
+
+
 def test_depth_of_all_directions_is_along_the_rays(finished):
     refused = nerfcli("render", finished, *ONE, "--lens", "equirectangular", "--width", "32", "--depth-axis", "z")
     assert refused.exit_code == USAGE

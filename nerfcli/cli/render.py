@@ -117,7 +117,9 @@ def render(
     ] = None,
     frames: Annotated[
         str | None,
-        typer.Option(help="START:STOP[:STEP]: render only these views, counted from 0; write no videos."),
+        typer.Option(
+            help="START:STOP[:STEP], counted from 0, or K/N, every N-th from K: render only these; no videos."
+        ),
     ] = None,
     jobs: Annotated[
         int, typer.Option(help="Number of processes, which divide views and --threads; 0 chooses automatically.", min=0)
@@ -172,15 +174,15 @@ def render(
     \b
     Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos and previews of
     views that were already rendered are made without rendering again (add --overwrite to replace existing ones).
-    On a cluster, render --frames 0:100, --frames 100:200, ... in parallel; the same command without --frames then
-    assembles the videos.
+    On a cluster, render --frames 1/8, --frames 2/8, ... in parallel, as tasks of an array job; the same command without
+    --frames then assembles the videos.
 
     \b
     Examples:
       nerfcli render photos-scene-run --cameras test --outputs rgb,depth --depth median --depth-axis ray
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
       nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-layout side-by-side --video-format gif
-      nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 100:200 --jobs 4
+      nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8 --jobs 4
       nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
       nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/

@@ -176,15 +176,21 @@ def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[floa
 
 
 def frame_range(text: str) -> slice:
-    """START:STOP or START:STOP:STEP; START and STOP may be left out.
+    """Return the views of --frames: START:STOP or START:STOP:STEP, from 0 on, or K/N, every N-th from the K-th.
+
+    START and STOP may be left out; K counts from 1, as task numbers of array jobs do.
 
     Raises:
         typer.BadParameter: anything else, or nothing between start and stop.
     """
+    if one_of_many := re.fullmatch(r"(\d+)/(\d+)", text.strip()):
+        number, count = map(int, one_of_many.groups())
+        if 1 <= number <= count:
+            return slice(number - 1, None, count)
     match = re.fullmatch(r"(\d*):(\d*)(?::(\d+))?", text.strip())
     start, stop, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
     if match is None or step == 0 or (stop is not None and stop <= (start or 0)):
-        message = f"{text!r}; write START:STOP or START:STOP:STEP, for example 100:200 or 0:120:4"
+        message = f"{text!r}; write START:STOP or START:STOP:STEP, for example 100:200 or 0:120:4, or K/N, such as 1/8"
         raise typer.BadParameter(message, param_hint="--frames")
     return slice(start, stop, step)
 
