@@ -150,6 +150,32 @@ def test_a_picture_is_what_the_reference_gives_in_float64(name, count):
             )
 
 
+@pytest.mark.parametrize("negligible", [1e-3, 0.05, 0.5])
+def test_compiled_pictures_stay_within_their_bound(negligible):
+    """More rays than a thread carries at a time; the same rays alone give the same bits."""
+    field = field_of("compiled sizes", torch.float32, "numba_cpu")
+    rays, march = rays_and_march(700, torch.float32)
+    background = torch.rand(700, 3, generator=torch.Generator().manual_seed(1))
+    seen, whole = (
+        field.backend.trace_rays(
+            rays, march._replace(max_optical_depth=depth), field.medium(), background=background, negligible=negligible_
+        )
+        for depth, negligible_ in ((2.0, negligible), (1e9, 0.0))
+    )
+    apart = (seen.rgb - whole.rgb).abs().amax(-1)
+    assert (apart <= seen.truncation_error * (1 + 1e-4) + 1e-6).all()
+    assert float(apart.max()) > 0.1 * negligible  # something is left out
+    stopped = math.exp(-2.0) * 1.01
+    assert float(seen.truncation_error.max()) <= 0.5 * negligible + stopped
+    some = Rays(*(values[300:310] for values in rays if values is not None))
+    alone = field.backend.trace_rays(
+        some, march._replace(max_optical_depth=2.0), field.medium(), background=background[300:310],
+        negligible=negligible,
+    )  # fmt: skip
+    assert torch.equal(alone.rgb, seen.rgb[300:310])
+    assert torch.equal(alone.truncation_error, seen.truncation_error[300:310])
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_sums_along_rays_are_those_of_a_double_loop(dtype):
     """Of the samples that a trace is shown: colour, what passes, distortion, and how far light ends from its target."""

@@ -124,6 +124,20 @@ def test_hash_encode_takes_a_sink_and_known_values(generator):
     assert_close(sink, expected, "sink")
 
 
+def test_hash_encode_shows_coordinates_gone_bad(generator):
+    """NaN, infinite and huge coordinates, beside good ones in the same vector, on dense and hashed levels."""
+    table = torch.rand(2, 16, 4, generator=generator)
+    points = torch.rand(20, 3, generator=generator)
+    good = numba_cpu.hash_encode(points, table, (1, 64))
+    odd = points.clone()
+    odd[3, 1], odd[5, 0], odd[7, 2], odd[17] = torch.nan, torch.inf, -1e30, torch.nan
+    found = numba_cpu.hash_encode(odd, table, (1, 64))
+    assert found[[3, 17]].isnan().all()
+    assert found[[5, 7]].isfinite().all()
+    others = [i for i in range(20) if i not in (3, 5, 7, 17)]
+    assert torch.equal(found[others], good[others])
+
+
 def test_hash_encode_reads_no_row_that_is_no_vertex():
     table = torch.full((1, 512, 4), torch.nan)
     table[0, :125] = 1.0
