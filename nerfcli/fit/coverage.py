@@ -1,10 +1,11 @@
 """Space that several photos look into, and space that one photo alone does."""
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from nerfcli.cameras.rigid import apply, inverse
 from nerfcli.field.contraction import training_points
 from nerfcli.fit.point_depth import PointDepths
 from nerfcli.photos.pool import PixelPool
@@ -12,6 +13,7 @@ from nerfcli.photos.pool import PixelPool
 # Photos that have to look into a cell. One alone may fill it only behind this part of the median distance of what it
 # shows: whatever stands there looks right to that photo, and no other one contradicts.
 LEAST_PHOTOS, OWN_SPACE = 2, 1.0
+BEYOND_CORNER = 1.1
 
 
 def covered_cells(pool: PixelPool, side: int, contraction: str, known: PointDepths | None) -> Tensor:
@@ -36,13 +38,15 @@ def covered_cells(pool: PixelPool, side: int, contraction: str, known: PointDept
     count = np.zeros(side**3, dtype=np.int64)
     for camera, pose, own in zip(pool.cameras, pool.poses.double().cpu().numpy(), nearest, strict=True):
         left = np.flatnonzero(count < LEAST_PHOTOS)
-        seen = apply(inverse(pose), points[left])
-        pixels, valid = camera.project(seen)
+        away = points[left] - pose[:3, 3]
+        distances = np.linalg.norm(away, axis=1)
+        # No pixel is farther from the axis than this; lenses are asked about the rest only.
+        widest = min(180.0, math.hypot(*camera.fov_deg))
+        near_axis = away @ pose[:3, 2] >= distances * math.cos(math.radians(widest / 2 * BEYOND_CORNER))
+        left, distances = left[near_axis], distances[near_axis]
+        pixels, valid = camera.project(away[near_axis] @ pose[:3, :3])
         inside = valid & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
-        if not camera.is_spherical:
-            inside &= seen[:, 2] > 0
-        far = np.linalg.norm(seen, axis=1) >= OWN_SPACE * own
-        count[left] += np.where(inside, np.where(far, LEAST_PHOTOS, 1), 0)
+        count[left] += np.where(inside, np.where(distances >= OWN_SPACE * own, LEAST_PHOTOS, 1), 0)
     covered = torch.from_numpy(count >= LEAST_PHOTOS).reshape(side, side, side)
     return covered.to(pool.colours.device)
 

@@ -31,6 +31,8 @@ SECONDS_PER_PIXEL = 1.5e-6
 BEST_ANGLE_DEG, SMALLER_DEG, LARGER_DEG = 5.0, 1.0, 10.0
 # A point counts as seen by photos that look at it within this angle of a photo in which it was found.
 SAME_SIDE_COS = np.cos(np.radians(40.0))
+# More points take time and memory, and tell no more.
+MOST_POINTS = 20_000
 # Fewer points that two photos share do not make them neighbours.
 FEWEST_SHARED = 12
 # Depths are sought around the plane that fits a photo's points best, as far away from it as these percentiles of the
@@ -143,6 +145,8 @@ def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.nda
     rays = tracks.rays[found].T
     towards = np.stack([np.bincount(tracks.points[found], axis, count).astype(np.float64) for axis in rays], axis=-1)
     known = np.isfinite(surface.points).all(axis=1)
+    known = np.flatnonzero(known)
+    known = known[:: 1 + len(known) // MOST_POINTS]
     points, towards = surface.points[known], towards[known]
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     shown = np.zeros((len(photos), len(points)), dtype=bool)
@@ -158,7 +162,7 @@ def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.nda
 
 def _neighbours(points: np.ndarray, shown: np.ndarray, centres: np.ndarray) -> list[list[int]]:
     """Return the photos that each photo is matched with, the best first."""
-    rays = points - centres[:, None]
+    rays = (points - centres[:, None]).astype(np.float32)
     rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-12)
     found = []
     for index in range(len(centres)):

@@ -13,13 +13,15 @@ from nerfcli.fit.point_depth import PointDepths, point_depths, stereo_depths
 from nerfcli.multiview.correspondences import Shared
 from nerfcli.multiview.exposures import matched_log_gains
 from nerfcli.multiview.sky import sky_masks
-from nerfcli.multiview.stereo import LEAST_SIDE_PX, LONGER_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
+from nerfcli.multiview.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
 from nerfcli.photos.pool import Album, PixelPool
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
 
 # Of the budget, what stereo matching may take.
 STEREO_SHARE = 0.06
+# The same where there is no budget but of steps.
+MOST_SECONDS = 60.0
 
 
 class Evidence:
@@ -46,9 +48,9 @@ class Evidence:
         self._similarity, self.notify = extent.training_from_scene, notify
         self.stereo_seconds = 0.0
         budget = settings.budget_seconds
-        self.side_px = LONGER_SIDE_PX
-        if budget is not None:
-            self.side_px = affordable_side_px(album.photos, seconds=STEREO_SHARE * budget, threads=settings.threads)
+        # Steps have to be the same on all machines: without a budget, threads do not count.
+        seconds, threads = (MOST_SECONDS, 1) if budget is None else (STEREO_SHARE * budget, settings.threads)
+        self.side_px = affordable_side_px(album.photos, seconds=seconds, threads=threads)
 
     @cached_property
     def of_tracks(self) -> PointDepths:
