@@ -1,12 +1,17 @@
 """Exposures by pixels that photos have in common, on photos whose gains are known."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
-from test_stereo import OFFSETS, PINHOLE, photo, truth
+from test_stereo import OFFSETS, PINHOLE, photo, tracks, truth
 
 from nerfcli.multiview.exposures import matched_log_gains
 from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.train.evidence import Evidence
 
 GAINS = np.array([[0.0, 0.1, -0.1], [0.4, 0.4, 0.4], [-0.5, -0.4, -0.3], [0.1, -0.1, 0.0]])
 NOTHING = DenseDepth(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0))
@@ -50,3 +55,25 @@ def test_white_pixels_tell_nothing():
     found = matched_log_gains(photos, [depth(one) for one in photos])
     assert np.isnan(found[0]).all()
     assert found[1:] == pytest.approx(np.zeros((2, 3)), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("exif", "is_kept"),
+    [
+        ([-0.6, 0.6, -0.3, 0.3, 0.0, 0.1], True),
+        ([0.0] * 6, False),
+        ([np.nan] * 6, False),
+        ([0.6, -0.6, 0, 0.3, 0, 0], False),
+    ],
+    ids=["confirms", "all alike", "unknown", "contradicts"],
+)
+def test_exposures_count_where_exif_confirms_them(exif, is_kept, monkeypatch):
+    """What shines differs from photo to photo, too."""
+    gains = [-0.6, 0.6, -0.3, 0.3, 0.0, 0.1]
+    photos = [exposed(photo(0.12 * k, contrast=1.5), np.full(3, gain)) for k, gain in enumerate(gains)]
+    monkeypatch.setattr("nerfcli.train.evidence.log_exposures", lambda frames: np.array(exif))
+    shared: Any = SimpleNamespace(tracks=tracks(photos))
+    album, extent, pool = SimpleNamespace(photos=photos), SimpleNamespace(training_from_scene=None), None
+    evidence = Evidence(shared, album, pool, extent, TrainSettings(), lambda text: None)  # type: ignore[arg-type]
+    assert np.isfinite(evidence.log_gains).all() == is_kept
+    assert evidence.exposure_spread == pytest.approx(np.std(gains) if is_kept else 0.0, abs=0.03)

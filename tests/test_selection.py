@@ -551,7 +551,7 @@ def test_a_sky_and_exposures_are_kept_on_evidence():
     both = Components(points=0.1, stereo=True)
     assert with_evidence(Components(), facts)[0] == replace(both, exposure="learned", background="sphere")
     assert with_evidence(Components(), facts)[1][2].why == "photos differ in brightness by 30 % at the same points"
-    assert with_evidence(Components(), replace(facts, sky_share=0.02, exposure_spread=0.1))[0] == both
+    assert with_evidence(Components(), replace(facts, sky_share=0.04, exposure_spread=0.1))[0] == both
     fixed = replace(facts, fixed=("background", "exposure"))
     assert with_evidence(Components(exposure="exif"), fixed)[0] == replace(both, exposure="exif")
     # Behind an object that is cut out, there is nothing.

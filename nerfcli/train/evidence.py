@@ -14,6 +14,8 @@ from nerfcli.multiview.correspondences import Shared
 from nerfcli.multiview.exposures import matched_log_gains
 from nerfcli.multiview.sky import sky_masks
 from nerfcli.multiview.stereo import LEAST_SIDE_PX, DenseDepth, affordable_side_px, dense_depths
+from nerfcli.photos.exif_exposure import log_exposures
+from nerfcli.photos.held_out_exposure import exif_slope
 from nerfcli.photos.pool import Album, PixelPool
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
@@ -22,6 +24,8 @@ from nerfcli.runs.settings import TrainSettings
 STEREO_SHARE = 0.06
 # The same where there is no budget but of steps.
 MOST_SECONDS = 60.0
+# Fewer photos with EXIF do not confirm exposures.
+FEWEST_EXIF = 5
 
 
 class Evidence:
@@ -71,10 +75,18 @@ class Evidence:
 
     @cached_property
     def log_gains(self) -> np.ndarray:
-        """(photos, 3) logarithms of exposures by pixels that several photos share; NaN where unknown."""
+        """(photos, 3) logarithms of exposures by pixels that several photos share; NaN where unknown.
+
+        All are unknown where EXIF does not confirm them: what looks brighter from one side differs from photo to
+        photo as exposures do, and adds up along a ring.
+        """
         dense = self._dense
         began = time.perf_counter()
         found = matched_log_gains(self._album.photos, dense)
+        exif = log_exposures([photo.frame for photo in self._album.photos])
+        known = np.isfinite(found).all(1) & np.isfinite(exif)
+        if known.sum() < FEWEST_EXIF or exif_slope(np.flatnonzero(known), found[known], exif[known]) == 0.0:
+            found = np.full_like(found, np.nan)
         self.stereo_seconds += time.perf_counter() - began
         return found
 

@@ -280,7 +280,7 @@ def _search(
         exif=_exif(scene),
         log_focal=log_focal,
         known=evidence.sets(model) if facts.points else [],
-        log_gains=evidence.gains_or(torch.zeros(len(album.photos), 3)) if model.stereo else None,
+        log_gains=evidence.gains_or(torch.zeros(len(album.photos), 3)) if facts.exposure_spread else None,
         sky=evidence.sky if model.background == "sphere" else None,
         colours=album.colours,
         storage=storage,
