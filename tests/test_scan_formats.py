@@ -133,12 +133,12 @@ def test_a_scan_is_not_replaced_unless_one_says_so(tmp_path: Path) -> None:
     written = stack(tmp_path)
     out = tmp_path / "o"
     assert nerfcli("convert", written.path, out).exit_code == 0
-    assert "there already" in error_of(nerfcli("convert", written.path, out))[0]
+    assert "already exists" in error_of(nerfcli("convert", written.path, out))[0]
     assert nerfcli("convert", written.path, out, "--overwrite").exit_code == 0
     foreign = tmp_path / "mine"
     foreign.mkdir()
     (foreign / "diary.txt").write_text("dear diary")
-    assert "there already" in error_of(nerfcli("convert", written.path, foreign, "--overwrite"))[0]
+    assert "already exists" in error_of(nerfcli("convert", written.path, foreign, "--overwrite"))[0]
     assert (foreign / "diary.txt").exists()
 
 

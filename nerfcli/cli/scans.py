@@ -1,4 +1,4 @@
-"""What the commands do with scans by transmission: the options that make sense for them, and what is printed."""
+"""Options and printed results of commands for X-ray scans."""
 
 import functools
 import math
@@ -31,7 +31,7 @@ def reconstruction_settings(
     seed: int,
     threads: int,
 ) -> "ReconstructionSettings":
-    """The settings of a reconstruction by the options of train.
+    """Build the settings of a reconstruction from the options of train.
 
     Raises:
         UserError: a component of photos is named, or a field that scans do not have.
@@ -91,7 +91,7 @@ def is_of_scan(run: str, *, outputs: str | None, slices: list[str] | None) -> bo
 
 
 def scan_pictures(outputs: str | None, slices: list[str] | None, *, views: str) -> "Callable[..., list[Path]]":
-    """The rendering that the options of render ask for; takes the run, the target and how to report.
+    """Build the rendering function from the options of render.
 
     Raises:
         typer.BadParameter: the options do not fit scans.

@@ -1,4 +1,4 @@
-"""The geometry of a scan as ASTRA's vectors, for programs that reconstruct with it."""
+"""Export the geometry of a scan as ASTRA's vectors."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ _TYPES = {"cone": "cone_vec", "parallel": "parallel3d_vec"}
 
 
 def write_astra(scan: Scan, path: Path) -> Path:
-    """Write vectors (views x 12) as .npy or .txt, and what else `astra_create_proj_geom` wants as .json beside it.
+    """Write vectors (views x 12) as .npy or .txt, and the other parameters of `astra_create_proj_geom` as .json.
 
     Source or direction, detector's centre, column step, row step, in the unit of the scan. ASTRA counts in voxels of
     side 1: divide all but directions by the side of a voxel.

@@ -27,7 +27,7 @@ _CIRCULAR = 1e-3
 
 
 def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid) -> Tensor:
-    """Feldkamp's algorithm for a circle around z (parallel beams: filtered back-projection), ramp filter, not clipped.
+    """Reconstruct by Feldkamp's algorithm (parallel beams: filtered back-projection), ramp filter, not clipped.
 
     Args:
         geometry: views at equal steps, over a full turn, or half a turn for parallel beams.
@@ -89,7 +89,7 @@ def filtered_back_projection(geometry: ScanGeometry, integrals: np.ndarray, grid
 def sart_total_variation(
     geometry: ScanGeometry, integrals: np.ndarray, grid: VoxelGrid, *, rounds: int = SART_ROUNDS
 ) -> Tensor:
-    """SART, view by view with positivity, and a total variation denoising after each round over the views.
+    """Reconstruct by SART with positivity and total variation denoising after each round over the views.
 
     Args:
         geometry: of the views.

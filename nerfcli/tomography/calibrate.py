@@ -45,12 +45,12 @@ class Correction:
 
     @property
     def holds(self) -> bool:
-        """Whether the views that were not fitted speak for it."""
+        """Whether it predicts the views that were not fitted significantly better."""
         return self.gain > SIGNIFICANT * self.error
 
 
 def detector_tilt(scan: Scan) -> Correction:
-    """By how many radians the detector is turned in its plane, see `ScanGeometry.tilted`; 0 for a single row."""
+    """Estimate the rotation of the detector in its plane, see `ScanGeometry.tilted`; 0 for a single row."""
     if scan.geometry.rows < 8:
         return Correction(0.0, 0.0, 0.0)
     binning = max(1, scan.geometry.columns // 64)
@@ -62,7 +62,7 @@ def detector_tilt(scan: Scan) -> Correction:
 
 
 def air_factors(likelihood: Poisson, integrals: torch.Tensor, *, margin: float = 0.01) -> torch.Tensor:
-    """How bright the open beam of each view is against the scan's own, from pixels that look past the object.
+    """Estimate the brightness of each view relative to the open beam, from pixels beside the object.
 
     Formula: sum of counts over sum of expected counts, of pixels whose line integral is below `margin`, with
     `PRIOR_PHOTONS` added to both. Views without such pixels get 1.
@@ -79,7 +79,7 @@ def air_factors(likelihood: Poisson, integrals: torch.Tensor, *, margin: float =
 
 
 def _search(misfit: Callable[[float], np.ndarray], *, bound: float, steps: int, precise: float) -> Correction:
-    """The value whose misfit is smallest: by steps over the whole range, then between the neighbours of the best."""
+    """Minimise the misfit: by steps over the whole range, then between the neighbours of the best."""
     grid = np.linspace(-bound, bound, steps)
     means = [float(np.nanmean(misfit(float(value)))) for value in grid]
     best = int(np.argmin(means))
@@ -97,7 +97,7 @@ def _search(misfit: Callable[[float], np.ndarray], *, bound: float, steps: int, 
 
 
 def _prediction(scan: Scan, geometry: ScanGeometry, *, binning: int) -> np.ndarray:
-    """Mean deviance of each view that a volume fitted to the views between them leaves, (views,)."""
+    """Return the mean deviance (views,) of every second view, predicted by a volume fitted to the others."""
     views = scan.training_views
     views = views[:: max(1, len(views) // TRIAL_VIEWS)]
     coarse = geometry.binned(binning)

@@ -21,7 +21,7 @@ _PRECISE_PX = 0.02
 
 @dataclass(frozen=True)
 class Centre:
-    """Where the axis is, for one reading.
+    """The centre of rotation under one hypothesis.
 
     Args:
         shift: columns that the detector has to be moved by.
@@ -43,7 +43,7 @@ class Centre:
 
 
 def centre_of(row: Row, *, mirrored: bool = False) -> Centre:
-    """The shift of the detector that predicts best.
+    """Estimate the shift of the detector.
 
     By whole columns of a coarse row over the whole range, then by a parabola through the best of a finer one.
     """
@@ -73,7 +73,7 @@ def centre_of(row: Row, *, mirrored: bool = False) -> Centre:
 
 
 def _parabola(best: float, step: float, errors: Callable[[float], np.ndarray]) -> tuple[float, float]:
-    """The lowest point of a parabola through three shifts, and its standard error over views."""
+    """Return the minimum of a parabola through three shifts and its standard error over views."""
     low, middle, high = (errors(best + k * step) for k in (-1, 0, 1))
 
     def lowest(chosen: np.ndarray | slice) -> float:
@@ -91,7 +91,7 @@ def _parabola(best: float, step: float, errors: Callable[[float], np.ndarray]) -
 
 
 def margin(better: np.ndarray, worse: np.ndarray) -> tuple[float, float]:
-    """By how many standard errors over views one is better, and the ratio of rms.
+    """Compare two predictions: the difference in standard errors over views, and the ratio of rms.
 
     The larger of two tests: of the mean gain, and of signed ranks, which a few views with large gains do not weaken.
     Source of the second: Wilcoxon 1945, Individual comparisons by ranking methods, Biometrics Bulletin 1(6).

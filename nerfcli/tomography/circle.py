@@ -1,4 +1,4 @@
-"""What most scanners say of a scan: a source and a flat detector on a circle around an axis; and its way back.
+"""Circular scans as most scanners describe them: a source and a flat detector around an axis.
 
 `Circle.geometry` makes vectors of the statement, `circle_of` makes the statement of vectors, by other formulas: what
 was converted is proved by going there and back.
@@ -89,7 +89,7 @@ def circle_from_json(content: Mapping[str, Any]) -> Circle:
 
 
 def circle_of(geometry: ScanGeometry) -> tuple[Circle, float]:
-    """The circle that a geometry describes best, and how far its vectors are from it.
+    """Fit a circle to a geometry; also return the distance of its vectors from it.
 
     Returns:
         The circle, medians over views of all but the angles; and the largest distance between its vectors and the
@@ -138,7 +138,7 @@ def circle_of(geometry: ScanGeometry) -> tuple[Circle, float]:
 
 
 def differences(one: Circle, other: Circle) -> dict[str, float]:
-    """The largest differences of two statements: of angles in degrees, of lengths as parts of them, of pixels."""
+    """Return the largest differences of two circles: angles in degrees, lengths relative, shifts in pixels."""
     turn = np.angle(np.exp(1j * (np.array(one.angles) - np.array(other.angles))))
     lengths = ("pixel_width", "pixel_height", "source_origin", "source_detector")
     relative = [abs(getattr(one, n) - getattr(other, n)) / max(abs(getattr(one, n)), 1e-300) for n in lengths]

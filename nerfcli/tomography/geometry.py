@@ -1,4 +1,4 @@
-"""Where the source and the detector of a scan stand: one description for parallel, fan and cone beams.
+"""Geometry of a scan: one description for parallel, fan and cone beams.
 
 Per view: where rays come from, the detector's centre, and the two vectors from a pixel to its neighbours. These are
 the vectors of ASTRA (`parallel3d_vec`, `cone_vec`); every other description of a scan converts into them. The object
@@ -132,7 +132,7 @@ class ScanGeometry:
         return emitter.copy(), along_ray / np.linalg.norm(along_ray, axis=-1, keepdims=True)
 
     def pixel_of(self, view: int, points: np.ndarray) -> np.ndarray:
-        """Where points are seen in a view: (N, 2) column and row, 0 at the centre of the first pixel.
+        """Project points into a view: (N, 2) column and row, 0 at the centre of the first pixel.
 
         Formula: the point where the ray through the point meets the detector's plane, in units of its steps. The unit
         is pixels; points in the plane of the source give numbers that are not finite.

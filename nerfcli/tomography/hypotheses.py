@@ -1,4 +1,4 @@
-"""Which way the object turned, which side columns are numbered from, and where the axis is: judged by the data.
+"""Rank hypotheses about a scan by its data: direction of rotation, mirrored detector, centre of rotation.
 
 A wrong answer still gives a picture that looks right. So each hypothesis has to predict views that it was not fitted
 to, and the margin between hypotheses is told. What no data can decide is said: mirroring the detector and reversing
@@ -24,7 +24,7 @@ LEAST_RATIO = 1.05
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One reading of a scan.
+    """One hypothesis about a scan.
 
     Args:
         reversed: whether the object turned the other way than the scan says.
@@ -43,7 +43,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What the data say.
+    """The ranking and its verdict.
 
     Args:
         hypotheses: the best first.
@@ -78,14 +78,14 @@ class Judgement:
 
 
 def judge(scan: Scan, *, progress: Progress = lambda share, detail: None) -> Judgement:
-    """Rank readings of a scan by how well they predict views that they were not fitted to.
+    """Rank hypotheses by how well they predict views that they were not fitted to.
 
     Raises:
         UserError: there are too few views.
     """
     if scan.geometry.views < FEWEST_VIEWS:
         raise UserError(
-            f"{scan.geometry.views} views are too few to judge a geometry by", f"at least {FEWEST_VIEWS} are needed"
+            f"{scan.geometry.views} views are too few to judge the geometry", f"at least {FEWEST_VIEWS} are needed"
         )
     row = telling_row(scan).thinned()
     stated = axis_column(scan.geometry)

@@ -1,4 +1,4 @@
-"""How well line integrals explain what a detector measured: Poisson for counts, least squares for line integrals.
+"""Likelihoods of measurements given line integrals: Poisson for counts, least squares for line integrals.
 
 No logarithm of data is taken where there are counts: with few photons it is biased, and of none it does not exist.
 """
@@ -100,7 +100,7 @@ class Poisson:
         return replace(self, model_error=error)
 
     def found_model_error(self, integrals: Tensor, views: Tensor) -> float:
-        """The model error with which the mean deviance of predicted line integrals is 1; 0 where it is less already."""
+        """Estimate the model error that makes the mean deviance 1; 0 if it is below 1 without."""
         low, high = 0.0, 1.0
 
         def excess(error: float) -> float:
@@ -142,7 +142,7 @@ class Gaussian:
 
 
 def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson | Gaussian:
-    """The likelihood of some views of a scan, by what it measured.
+    """Build the likelihood of some views of a scan.
 
     Transmissions are counts of an open beam of 1 in photons. Where nobody knows how many photons a value stands for,
     it is estimated from the noise between neighbouring pixels, see `photons_per_value`.
@@ -180,7 +180,7 @@ def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson
 
 
 def photons_per_value(values: np.ndarray) -> float:
-    """How many photons a detector value stands for, by its noise: mean / variance.
+    """Estimate the photons per detector value from the noise: mean / variance.
 
     Args:
         values: (views, rows, columns) above the dark ones; NaN where not usable.
@@ -191,7 +191,7 @@ def photons_per_value(values: np.ndarray) -> float:
 
 
 def noise(values: np.ndarray) -> float:
-    """Standard deviation of the noise of pixels, by the fourth differences along rows, which smooth pictures lack.
+    """Estimate the standard deviation of the noise from fourth differences along rows, which vanish in smooth pictures.
 
     Args:
         values: (views, rows, columns); NaN where not usable.

@@ -1,4 +1,4 @@
-"""What the views of a scan cannot determine, voxel by voxel: values there come from the regularisation.
+"""Marks of voxels that the views of a scan do not determine: their values come from the regularisation.
 
 A mark is a sum: `UNSEEN` (no view sees the voxel), `TRUNCATED` (above or below the detector in some views: its value
 holds up to a smooth offset), `WEDGE` (directions are missing from the scan: edges along them are not seen) and
@@ -26,7 +26,7 @@ _BINS = 60
 
 
 def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
-    """The marks (Z, Y, X) uint8 of the views that were fitted.
+    """Compute the marks (Z, Y, X) uint8 for the fitted views.
 
     A voxel is seen by a view when its centre falls on the detector. The wedge is that of the middle of the grid: it
     differs little between voxels.
@@ -70,7 +70,7 @@ def marks(geometry: ScanGeometry, grid: VoxelGrid) -> np.ndarray:
 
 
 def marks_in_words(found: np.ndarray, chosen: tuple[int, ...] = tuple(MEANINGS)) -> list[str]:
-    """The share of the voxels of each kind that there are."""
+    """Describe the percentage of voxels with each mark."""
     shares = {mark: 100 * float(((found & mark) > 0).mean()) for mark in chosen}
     return [f"{share:.3g} % of the voxels: {MEANINGS[mark]}" for mark, share in shares.items() if share > 0]
 
@@ -88,7 +88,7 @@ def _bit(place: np.ndarray) -> np.ndarray:
 
 
 def missing_wedge_deg(geometry: ScanGeometry) -> float:
-    """The largest gap between the directions of the rays through the origin, as lines around z, in degrees.
+    """Return the largest gap between directions of rays through the origin, as lines around z, in degrees.
 
     0 where it is less than a few times the usual step: then the views go all around. A fan of rays fills gaps at the
     object's border that are left at the origin, so that this is the gap at the middle.

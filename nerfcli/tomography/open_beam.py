@@ -1,4 +1,4 @@
-"""What a detector shows without an object: flats and darks averaged, dead pixels, and photons per detector value."""
+"""The open beam from flats and darks: averages, dead pixels, photons per detector value."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""One row of a scan, reconstructed within a tenth of a second: to ask the data which geometry they follow.
+"""Quick reconstruction of one detector row, to test geometries.
 
 A volume fitted to every second view has to predict the others. It can only if rays meet where the geometry says.
 """
@@ -49,7 +49,7 @@ class Row:
 
 
 def telling_row(scan: Scan, views: np.ndarray | None = None) -> Row:
-    """The row that shows most of the object; of a cone beam among those in the plane of the source.
+    """Choose the row with the most contrast; for a cone beam near the plane of the source.
 
     Args:
         scan: the scan.
@@ -75,7 +75,7 @@ def telling_row(scan: Scan, views: np.ndarray | None = None) -> Row:
 
 
 def filled(scan: Scan, views: np.ndarray, row: int | None = None) -> np.ndarray:
-    """Line integrals of some views, (views, rows or 1, columns), unusable pixels interpolated along their row."""
+    """Return line integrals (views, rows or 1, columns) with unusable pixels interpolated along their row."""
     if row is not None:
         scan = _only_row(scan, row)
     integrals = scan.line_integrals(views)
@@ -92,7 +92,7 @@ def filled(scan: Scan, views: np.ndarray, row: int | None = None) -> np.ndarray:
 
 
 def misfit(row: Row, *, shift: float = 0.0, mirrored: bool = False) -> np.ndarray:
-    """How badly a reconstruction from every second view predicts the others: mean squares, (views // 2,).
+    """Measure how well a reconstruction from every second view predicts the others: mean squares, (views // 2,).
 
     Args:
         row: line integrals.

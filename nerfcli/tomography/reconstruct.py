@@ -39,7 +39,7 @@ SETTLED = 3e-4
 
 @dataclass(frozen=True)
 class Problem:
-    """What a volume is fitted to.
+    """Data and grid of a fit.
 
     Args:
         geometry: of the views that are fitted.
@@ -54,7 +54,7 @@ class Problem:
 
 @dataclass
 class Fit:
-    """A volume on its way.
+    """State of a fit.
 
     Args:
         volume: (Z, Y, X) attenuation, float32.
@@ -107,12 +107,12 @@ class Projector:
 
 
 def start(problem: Problem) -> Fit:
-    """A volume of one value, with which line integrals have the mean that the data suggest."""
+    """Return a constant volume whose mean line integral is that of the data."""
     return Fit(torch.full(problem.grid.shape, mean_attenuation(problem)), torch.zeros(3, *problem.grid.shape))
 
 
 def mean_attenuation(problem: Problem) -> float:
-    """Sum of the line integrals that the data suggest over the sum of chords, >= 0."""
+    """Return the sum of line integrals over the sum of chords, >= 0."""
     views = torch.arange(problem.geometry.views)
     projector = Projector(problem.geometry, problem.grid)
     ones = torch.ones(problem.grid.shape)
@@ -126,7 +126,7 @@ def mean_attenuation(problem: Problem) -> float:
 
 
 def finer(fit: Fit, grid: VoxelGrid) -> Fit:
-    """The same volume on a grid with voxels half as large, or any other over the same box, to go on there."""
+    """Interpolate a fit on another grid over the same box."""
     volume = interpolate(fit.volume[None, None], grid.shape, mode="trilinear")[0, 0]
     return Fit(volume, torch.zeros(3, *grid.shape), fit.passes, fit.seconds)
 
@@ -141,7 +141,7 @@ def reconstruct(
     progress: Callable[[float, str], None] | None = None,
     keep: Callable[[Fit], None] | None = None,
 ) -> Fit:
-    """Go on fitting until the passes are done, the time is over, or nothing changes any more.
+    """Continue a fit until the passes or the time are used up, or it has converged.
 
     Args:
         problem: what to fit to.
@@ -203,7 +203,7 @@ def reconstruct(
 
 
 def curvature_bound(problem: Problem, strength: float) -> tuple[Tensor, float]:
-    """A bound on the curvature along each voxel (Z, Y, X), and beta."""
+    """Return a bound on the curvature of each voxel (Z, Y, X), and beta."""
     projector = Projector(problem.geometry, problem.grid)
     ones = torch.ones(problem.grid.shape)
     bound, diagonal = torch.zeros(problem.grid.shape), torch.zeros(problem.grid.shape)

@@ -203,7 +203,7 @@ def load_scan(folder: Path) -> Scan:
 
 
 def held_out_views(views: int, every: int = HELD_OUT_EVERY) -> tuple[int, ...]:
-    """Every how-many-th view, beginning with the first: those that are held out where the scan does not say."""
+    """Return the views held out by default: every `HELD_OUT_EVERY`-th, beginning with the first."""
     return tuple(range(0, views, every)) if views > every else ()
 
 

@@ -1,4 +1,4 @@
-"""How good a reconstruction is: held-out projections against their noise, and a true volume where there is one."""
+"""Scores of a reconstruction: held-out projections, and a true volume if there is one."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""How much total variation a scan needs, and how far its model is off: by training views that a trial does not fit.
+"""Choice of the total variation weight and the model error, by training views that a trial leaves out.
 
 Predicting noisy projections rewards fitting their noise and the model's own errors for too long: where the prediction
 is best, the volume has been past its best by 1 to 4 dB on phantoms. The scale of `strength` already takes dose, unit

@@ -1,4 +1,4 @@
-"""The volume that a scan was made of, where its input has one: what reconstructions are measured against."""
+"""The true volume of a computed scan."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +11,7 @@ from nerfcli.tomography.grid import VoxelGrid
 
 
 def load_truth(history: Mapping[str, Any]) -> tuple[VoxelGrid, np.ndarray] | None:
-    """The true volume of a scan, by its history.
+    """Load the true volume that a scan names.
 
     Returns:
         Its grid and (Z, Y, X) float32 attenuation in the inverse of the scan's unit; None if the input had none.
@@ -36,10 +36,12 @@ def load_truth(history: Mapping[str, Any]) -> tuple[VoxelGrid, np.ndarray] | Non
     except (OSError, ValueError, KeyError) as error:
         raise UserError(
             f"the true volume {path} cannot be read: {error}",
-            "put it where it was, or convert the scan again without it",
+            "restore it, or convert the scan again without it",
         ) from error
     if volume.size != np.prod(shape):
-        raise UserError(f"{path} has {volume.size} values, expected {shape}", "it is another volume than it was")
+        raise UserError(
+            f"{path} has {volume.size} values, expected {shape}", "it is not the volume that the scan was made of"
+        )
     if stated["layout"] == "xyz":
         volume = volume.reshape(shape[::-1]).transpose(2, 1, 0)
     volume = volume.reshape(shape).astype(np.float32) * np.float32(stated["attenuation_per_value"])

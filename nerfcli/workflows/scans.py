@@ -1,4 +1,4 @@
-"""Scans by transmission: from a scanner's files to a scan folder, proved; and to ASTRA's vectors."""
+"""Conversion, checks and description of X-ray scans."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,9 +70,9 @@ def convert_scan(
         raise UserError(f"a scan cannot be written as {to}", f"scans are written as {' or '.join(WRITTEN)}")
     if target.exists() and not (overwrite and (target.is_file() or is_scan(target))):
         what = "use --overwrite to replace it" if target.is_file() or is_scan(target) else "choose another place"
-        raise UserError(f"{target} is there already", what)
+        raise UserError(f"{target} already exists", what)
     if target.exists() and target.resolve() == source.resolve():
-        raise UserError(f"{target} is what is converted", "choose another place")
+        raise UserError(f"{target} is the input itself", "choose another place")
     if to == ASTRA:
         scan = read_scan(source, given)
         facts = write_astra(scan, target)
@@ -95,7 +95,7 @@ def convert_scan(
 def detect_scan(
     source: Path, *, given: Given = Given(), notify: Notify = silent, progress: Progress = no_progress
 ) -> Judgement:
-    """Which direction, which side of the detector and which centre of rotation the data follow.
+    """Rank direction of rotation, mirroring and centre of rotation by the data.
 
     Raises:
         UserError: it cannot be read, or has too few views.
@@ -135,7 +135,7 @@ def scan_diagnosis_record(diagnosis: ScanDiagnosis) -> dict[str, Any]:
 
 
 def describe_scan(path: Path) -> dict[str, Any]:
-    """What a scan folder, or a scan in a format that is read, holds.
+    """Describe a scan folder, or a scan in a supported format.
 
     Raises:
         UserError: it cannot be read.
@@ -203,8 +203,8 @@ def _read_back(scan: Scan, stored: Scan) -> dict[str, float]:
         checks |= {**of_circle, "orbit_px": apart}
     if wrong:
         raise UserError(
-            f"what was written is not what the source says: {', '.join(f'{n} {checks[n]:.3g}' for n in wrong)}",
-            "this is a fault of nerfcli; please report it with the file",
+            f"the written scan differs from its source: {', '.join(f'{n} {checks[n]:.3g}' for n in wrong)}",
+            "this is a bug in nerfcli; please report it with the file",
             GATE_NOT_MET,
         )
     return checks

@@ -1,4 +1,4 @@
-"""From a scan to a reconstruction and its numbers: what `train`, `evaluate`, `render` and `export` do with scans."""
+"""Reconstruction of a scan: corrections, choice of weights, fit."""
 
 import math
 import platform
@@ -63,7 +63,7 @@ def train_scan(
     warn: Notify = warn_python,
     progress: Progress = no_progress,
 ) -> Reconstruction:
-    """Fit a volume to a scan, keep one that is there already, or refuse to touch another one.
+    """Fit a volume to a scan, keep one that already exists, or refuse to touch another one.
 
     Args:
         scan: a folder that `nerfcli convert` wrote.

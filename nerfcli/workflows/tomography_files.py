@@ -1,4 +1,4 @@
-"""From a reconstruction to files: projections, residuals and slices to look at, volumes for other programs."""
+"""Files of a reconstruction: projections, residuals, slices, volumes."""
 
 from pathlib import Path
 
@@ -124,7 +124,7 @@ def export_scan(
 
 
 def slice_of(result: Reconstruction, axis: str, at: float) -> np.ndarray:
-    """A slice across an axis at a position in the scan's unit, between layers by linear interpolation; NaN if unseen.
+    """Interpolate a slice across an axis at a position in the scan's unit; NaN where no view sees.
 
     Raises:
         UserError: it lies outside the volume.

@@ -1,4 +1,4 @@
-"""From a reconstruction to its numbers: held-out projections, a true volume, other methods with the same views."""
+"""Evaluation of a reconstruction: held-out projections, true volume, other methods on the same views."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -116,7 +116,7 @@ def evaluate_scan(
 
 
 def scan_of(result: Reconstruction, run: Path) -> Scan:
-    """The scan that a reconstruction was fitted to.
+    """Load the scan of a reconstruction.
 
     Raises:
         UserError: it is no longer there, or was changed.
@@ -133,7 +133,7 @@ def scan_of(result: Reconstruction, run: Path) -> Scan:
 
 
 def corrected(geometry: ScanGeometry, result: Reconstruction) -> ScanGeometry:
-    """The geometry with the centre and the tilt that a reconstruction used."""
+    """Apply the centre and tilt of a reconstruction to a geometry."""
     return corrected_by(geometry, result.used["centre"], result.used["tilt"])
 
 

@@ -17,7 +17,7 @@ _ROUND_PX = 1.0
 
 
 def truncation(sample: Sample) -> Finding:
-    """In how many views the object reaches the border of the detector."""
+    """Measure in how many views the object reaches the border of the detector."""
     reached = np.asarray(sample.border > sample.air_level)
     share = float(reached.any(axis=(1, 2)).mean())
     sides = reached[..., 0].any(), reached[..., 1].any()
@@ -30,16 +30,16 @@ def truncation(sample: Sample) -> Finding:
         verdict,
         f"the object reaches the border{which} in {100 * share:.3g} % of the views",
         share,
-        f"look from {100 * TRUNCATED_LOOK:g} %, bad from {100 * TRUNCATED_BAD:g} %; what is above a line integral of "
-        f"{sample.air_level:.2g} is object",
+        f"look from {100 * TRUNCATED_LOOK:g} %, bad from {100 * TRUNCATED_BAD:g} %; line integrals above "
+        f"{sample.air_level:.2g} count as object",
         ""
         if verdict == GOOD
-        else "values inside are right up to a smooth offset only: use a wider detector, or trust edges and no values",
+        else "values inside hold up to a smooth offset only: use a wider detector, or rely on edges rather than values",
     )
 
 
 def repeated_angles(sample: Sample) -> Finding | str:
-    """Whether views stand at one angle, as 0 and 360 degrees do."""
+    """Find views at the same angle, such as 0 and 360 degrees."""
     angles = _angles(sample.scan.geometry)
     if angles is None:
         return "the views are not on one circle"
@@ -60,11 +60,11 @@ def repeated_angles(sample: Sample) -> Finding | str:
     if leaks:
         advice = "one of them is held out and the other is not: hold out both, or leave one out (--holdout FILE)"
     elif pairs:
-        advice = "such a view counts twice: leave one out, above all where few views are chosen at equal steps"
+        advice = "such a view counts twice: leave one out"
     return Finding(
         "repeated angles",
         verdict,
-        f"{several(len(pairs), 'pair')} of views at one angle{example}",
+        f"{several(len(pairs), 'pair')} of views at the same angle{example}",
         float(len(pairs)),
         "look from 1 pair, bad where one of them is held out",
         advice,
@@ -72,7 +72,7 @@ def repeated_angles(sample: Sample) -> Finding | str:
 
 
 def missing_wedge(sample: Sample) -> Finding | str:
-    """Which directions no ray has."""
+    """Find the directions that no ray has."""
     geometry = sample.scan.geometry
     angles = _angles(geometry)
     if angles is None:
@@ -97,10 +97,12 @@ def missing_wedge(sample: Sample) -> Finding | str:
             f"views span {span_deg:.4g} degrees: a wedge of {missing_deg:.4g} degrees is missing, ray directions "
             f"{at[0]:.4g} to {at[1]:.4g}"
         )
-        advice = "edges along the missing directions cannot be seen: such parts of the volume are marked, not measured"
+        advice = "edges along the missing directions cannot be reconstructed; the volume is marked there"
     elif once:
         summary = f"views span {span_deg:.4g} degrees, less than 180 and the fan of {np.degrees(fan):.3g}"
-        advice = "some lines at the border of the object were not measured: scan further, or expect shading there"
+        advice = (
+            "some lines at the border of the object were not measured: scan a larger angle, or expect shading there"
+        )
     else:
         summary, advice = f"views span {span_deg:.4g} degrees, no direction is missing", ""
     return Finding(
@@ -114,7 +116,7 @@ def missing_wedge(sample: Sample) -> Finding | str:
 
 
 def few_views(sample: Sample) -> Finding:
-    """Whether there are enough views for the detector."""
+    """Compare the number of views with the width of the detector."""
     geometry = sample.scan.geometry
     views = len(sample.scan.training_views)
     wanted = np.pi / 2 * geometry.columns

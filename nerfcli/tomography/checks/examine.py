@@ -45,7 +45,7 @@ class ScanDiagnosis:
 
 
 def examine_scan(scan: Scan, *, progress: Callable[[float, str], None] = lambda share, detail: None) -> ScanDiagnosis:
-    """Make all checks of a scan. Deterministic."""
+    """Run all checks of a scan. Deterministic."""
     progress(0.0, "reading")
     sample = sample_of(scan)
     findings: list[Finding] = []

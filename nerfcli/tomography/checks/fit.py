@@ -17,7 +17,7 @@ ONE_MATERIAL = 0.97
 
 
 def centre(sample: Sample) -> Finding | str:
-    """Where the axis of rotation is."""
+    """Estimate the centre of rotation."""
     scan = sample.scan
     if scan.geometry.views < FEWEST_VIEWS:
         return "too few views"
@@ -28,19 +28,19 @@ def centre(sample: Sample) -> Finding | str:
     number = abs(found.shift) if found.is_off else 0.0
     verdict = verdict_above(number, look=CENTRE_LOOK, bad=CENTRE_BAD)
     pair = mirror_centre(row)
-    by_pair = f"; the pair of opposite views says {pair:.1f}" if pair is not None else ""
+    by_pair = f"; opposite views give {pair:.1f}" if pair is not None else ""
     return Finding(
         "centre of rotation",
         verdict,
-        f"the axis is at column {column:.2f} +- {found.error:.2f}, the scan says {stated:.2f}{by_pair}",
+        f"axis at column {column:.2f} ± {found.error:.2f}; the scan states {stated:.2f}{by_pair}",
         abs(found.shift),
-        f"look from {CENTRE_LOOK:g} columns, bad from {CENTRE_BAD:g}, where it predicts other views better for certain",
-        "" if verdict == GOOD else f"convert with --centre-of-rotation {column:.2f}, or let the fit find it",
+        f"look from {CENTRE_LOOK:g} columns, bad from {CENTRE_BAD:g}, if it predicts other views significantly better",
+        "" if verdict == GOOD else f"convert with --centre-of-rotation {column:.2f}, or let train estimate it",
     )
 
 
 def mirror_centre(row: Row) -> float | None:
-    """The column of the axis by two opposite views of a parallel beam, which mirror each other; None without such."""
+    """Estimate the column of the axis from two opposite views of a parallel beam; None if there are none."""
     geometry = row.geometry
     if geometry.beam != "parallel":
         return None
@@ -63,7 +63,7 @@ def mirror_centre(row: Row) -> float | None:
 
 
 def beam_hardening(sample: Sample) -> Finding | str:
-    """Whether line integrals grow less than path lengths through an object of one material."""
+    """Measure how far line integrals fall below path lengths through an object of one material."""
     if sample.scan.geometry.views < FEWEST_VIEWS:
         return "too few views"
     row = telling_row(sample.scan).thinned().binned(FINE)
@@ -73,7 +73,7 @@ def beam_hardening(sample: Sample) -> Finding | str:
     longest = float(np.quantile(lengths, 0.999))
     used = lengths > 0.1 * longest
     if longest <= 0 or used.sum() < 100:
-        return "there is no object to speak of"
+        return "no object found"
     length, p = lengths[used].astype(np.float64) / longest, row.integrals[used].astype(np.float64)
     (straight, bent), *_ = np.linalg.lstsq(np.stack([length, length**2], axis=1), p, rcond=None)
     left = p - straight * length - bent * length**2
@@ -85,8 +85,8 @@ def beam_hardening(sample: Sample) -> Finding | str:
     return Finding(
         "beam hardening",
         verdict,
-        f"behind the longest path the line integral is {100 * number:.3g} % lower than short paths promise "
-        f"({100 * explained:.4g} % explained)",
+        f"the line integral of the longest path is {100 * number:.3g} % below the trend of short paths "
+        f"(path length explains {100 * explained:.4g} % of the variance)",
         number,
         f"look from {100 * HARDENING_LOOK:g} %, bad from {100 * HARDENING_BAD:g} %",
         ""

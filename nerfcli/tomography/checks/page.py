@@ -1,4 +1,4 @@
-"""The page of a scan's checks: findings, a projection, the sinogram of a row."""
+"""HTML page of a scan's checks: findings, a projection, the sinogram of a row."""
 
 from html import escape
 from pathlib import Path
@@ -85,7 +85,7 @@ article h3,article p{margin:2px 0}.advice{font-weight:600}.threshold,figcaption{
 figure{margin:12px 0}img{max-width:100%}
 """
 _BODY = Template("""\
-<div class="top"><div><h1>$title</h1><p>nerfcli doctor: a scan by transmission</p></div></div>
+<div class="top"><div><h1>$title</h1><p>nerfcli doctor: an X-ray scan</p></div></div>
 <h2>Findings</h2>
 $findings
 <h2>Not checked</h2><ul>$not_checked</ul>

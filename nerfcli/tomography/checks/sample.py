@@ -1,4 +1,4 @@
-"""What the checks of a scan look at: line integrals of some rows of all views, noise and air."""
+"""Input of the checks: line integrals of some rows of all views, noise and air."""
 
 from dataclasses import dataclass
 
@@ -43,12 +43,12 @@ class Sample:
 
     @property
     def air_level(self) -> float:
-        """A line integral that is no object."""
+        """The line integral above which a pixel shows the object."""
         return max(0.05 * self.object_level, 4 * self.noise)
 
 
 def sample_of(scan: Scan) -> Sample:
-    """Look at a scan."""
+    """Prepare a scan for its checks."""
     rows = np.unique(np.linspace(0, scan.geometry.rows - 1, min(MOST_ROWS, scan.geometry.rows)).round().astype(int))
     count = scan.geometry.views
     views = np.unique(np.linspace(0, count - 1, min(MOST_VIEWS, count)).round().astype(int))

@@ -23,7 +23,7 @@ UNUSABLE_LOOK, UNUSABLE_BAD = 0.01, 0.2
 
 
 def above_open_beam(sample: Sample) -> Finding:
-    """How many pixels are brighter than without an object."""
+    """Count pixels brighter than the open beam."""
     p = sample.integrals
     negative = float((p < 0).mean())
     beyond = float((p < -BEYOND_NOISE * sample.noise).mean())
@@ -45,7 +45,7 @@ def above_open_beam(sample: Sample) -> Finding:
 
 
 def drift(sample: Sample) -> Finding | str:
-    """How much the air differs between views; in words why it cannot be told."""
+    """Measure how much the air differs between views; a text if that is impossible."""
     border = sample.border
     if float(np.median(border)) > sample.air_level:
         return "no column sees past the object"
@@ -61,7 +61,7 @@ def drift(sample: Sample) -> Finding | str:
     return Finding(
         "drift",
         verdict,
-        f"air changes by {100 * number:.2g} % between views, beyond the {100 * by_noise:.2g} % of noise",
+        f"air changes by {100 * number:.2g} % between views, of which noise explains {100 * by_noise:.2g} %",
         number,
         f"look from {100 * DRIFT_LOOK:g} %, bad from {100 * DRIFT_BAD:g} %",
         "" if verdict == "good" else "the source or the camera drifts: let the fit scale I0 per view",
@@ -69,7 +69,7 @@ def drift(sample: Sample) -> Finding | str:
 
 
 def rings(sample: Sample) -> Finding | str:
-    """How many columns are off their neighbours in all views."""
+    """Count columns that differ from their neighbours in all views."""
     views, _, columns = sample.integrals.shape
     if views < 16 or columns < 32:
         return "too few views or columns"
@@ -93,12 +93,12 @@ def rings(sample: Sample) -> Finding | str:
         + (f"; the worst is column {worst_column}" if share > 0 else ""),
         share,
         f"look from {100 * RINGS_LOOK:g} %, bad from {100 * RINGS_BAD:g} %",
-        "" if verdict == "good" else "they draw rings around the axis: take newer flats, or mark these pixels unusable",
+        "" if verdict == "good" else "they cause rings around the axis: take new flats, or mark these pixels unusable",
     )
 
 
 def counts(sample: Sample) -> Finding | str:
-    """How few photons come through the thickest part."""
+    """Estimate the photons behind the thickest part."""
     scan = sample.scan
     if scan.kind == "line_integral":
         return "line integrals do not tell how many photons were counted"
@@ -114,7 +114,7 @@ def counts(sample: Sample) -> Finding | str:
     return Finding(
         "counts",
         verdict,
-        f"an open pixel counts {photons:.3g} photons, behind the thickest part {least:.3g}",
+        f"{photons:.3g} photons per pixel in the open beam, {least:.3g} behind the thickest part",
         least,
         f"look below {PHOTONS_LOOK:g} photons, bad below {PHOTONS_BAD:g}",
         ""
@@ -124,7 +124,7 @@ def counts(sample: Sample) -> Finding | str:
 
 
 def unusable(sample: Sample) -> Finding:
-    """How many pixels are left out."""
+    """Count the values that are left out."""
     usable = sample.scan.usable
     share = 0.0 if usable is None else 1 - float(usable.mean())
     views = 0 if usable is None or len(usable) == 1 else int((~usable.any(axis=(1, 2))).sum())

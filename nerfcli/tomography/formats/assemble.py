@@ -1,4 +1,4 @@
-"""From what a reader found to a scan: values checked, dead ones marked, and what the user said taken in."""
+"""Build a scan from the output of a reader and the user's options: check values, mark dead pixels."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.errors import UserError
+from nerfcli.findings import several
 from nerfcli.holdout import names_held_out
 from nerfcli.tomography.circle import Circle
 from nerfcli.tomography.formats.given import MILLIMETRES, Given, check_pixel_size
@@ -25,7 +26,7 @@ _EMPTY = "the projections are empty: export them again"
 
 @dataclass(frozen=True)
 class Found:
-    """What a reader found.
+    """Output of a reader.
 
     Args:
         path: the file or folder, for errors.
@@ -59,7 +60,7 @@ class Found:
 
 
 def scan_of(found: Found, given: Given) -> Scan:
-    """The scan of what was found and said.
+    """Build the scan.
 
     Raises:
         UserError: views and geometry do not fit together, values are not what they should be, or what the user said
@@ -130,8 +131,8 @@ def _checked(found: Found) -> np.ndarray:
         )
     if found.kind == "line_integral" and high > MOST_INTEGRAL:
         raise UserError(
-            f"{found.path}: line integrals up to {high:.4g}, behind which no photon is left",
-            "these look like detector values, or like a unit that was multiplied in twice",
+            f"{found.path}: line integrals up to {high:.4g}, which no photon would pass",
+            "these look like detector values, or a unit was applied twice",
         )
     if float(np.ptp(values[finite])) == 0:
         raise UserError(f"{found.path}: all values are {values[finite][0]:g}", _EMPTY)
@@ -144,7 +145,9 @@ def _in_millimetres(found: Found, given: Given) -> tuple[str, Circle | ScanGeome
         return found.unit, found.geometry
     factor = MILLIMETRES.get(given.unit)
     if factor is None:
-        raise UserError(f"--unit {given.unit} is no unit of length", f"choose one of {', '.join(sorted(MILLIMETRES))}")
+        raise UserError(
+            f"--unit {given.unit} is not a unit of length", f"choose one of {', '.join(sorted(MILLIMETRES))}"
+        )
     factor /= found.stated_mm
     if isinstance(found.geometry, Circle):
         return "mm", found.geometry.scaled(factor)
@@ -163,7 +166,7 @@ def _in_millimetres(found: Found, given: Given) -> tuple[str, Circle | ScanGeome
 def _with_centre(placed: Circle | ScanGeometry, geometry: ScanGeometry, column: float) -> Circle | ScanGeometry:
     if not -geometry.columns < column < 2 * geometry.columns:
         raise UserError(
-            f"--centre-of-rotation {column:g} is far outside of the {geometry.columns} columns",
+            f"--centre-of-rotation {column:g} is far outside the {geometry.columns} columns",
             "give the column that the axis is projected to, 0 for the first pixel's centre",
         )
     moved = axis_column(geometry) - column
@@ -174,7 +177,7 @@ def _with_centre(placed: Circle | ScanGeometry, geometry: ScanGeometry, column: 
 
 
 def axis_column(geometry: ScanGeometry) -> float:
-    """The column that the frame's origin is projected to, median over views: the centre of rotation."""
+    """Return the column onto which the origin is projected, median over views: the centre of rotation."""
     origin = np.zeros((1, 3))
     return float(np.median([geometry.pixel_of(view, origin)[0, 0] for view in range(geometry.views)]))
 
@@ -184,19 +187,17 @@ def _usable(found: Found, values: np.ndarray, notes: list[str]) -> tuple[np.ndar
     finite = np.isfinite(values)
     usable = None if found.beam is None or found.beam.usable.all() else found.beam.usable
     if usable is not None:
-        notes.append(f"{int((~usable).sum())} dead pixels are left out")
+        notes.append(f"{several(int((~usable).sum()), 'dead pixel')} left out")
     # A shutter that stayed shut, a frame that was not written.
     empty = (
         (np.ptp(np.where(finite, values, 0), axis=(1, 2)) == 0) if values[0].size > 1 else np.zeros(len(values), bool)
     )
     if empty.all():
-        raise UserError(f"{found.path}: no projection shows anything", _EMPTY)
+        raise UserError(f"{found.path}: all projections are empty", _EMPTY)
     if empty.any():
-        notes.append(
-            f"{int(empty.sum())} projections without content are left out, the first is {_named(found, empty)}"
-        )
+        notes.append(f"{several(int(empty.sum()), 'empty projection')} left out; the first is {_named(found, empty)}")
     if not finite.all():
-        notes.append(f"{int((~finite).sum())} values that are not finite are left out")
+        notes.append(f"{several(int((~finite).sum()), 'non-finite value')} left out")
         neutral = {"counts": 0.0, "transmission": 1.0, "line_integral": 0.0}[found.kind]
         values = np.where(finite, values, np.float32(neutral))
     if not finite.all() or empty.any():
@@ -214,10 +215,10 @@ def _photons(found: Found, given: Given) -> float | None:
     """Photons per value of counts, else photons of a transmission of 1."""
     if given.photons is not None:
         if not (np.isfinite(given.photons) and given.photons > 0):
-            raise UserError(f"--photons {given.photons:g}", "give how many photons an open pixel counts, above 0")
+            raise UserError(f"--photons {given.photons:g}", "give the photons per pixel of the open beam, above 0")
         if found.kind == "line_integral":
             raise UserError(
-                "--photons says nothing of line integrals: their noise is not that of counting any more",
+                "--photons does not apply to line integrals: their noise is no longer that of counting",
                 "leave it out, or convert transmissions or counts",
             )
         if found.beam is not None:

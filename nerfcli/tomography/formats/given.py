@@ -1,4 +1,4 @@
-"""What the user says of a scan beyond its file, and lengths and angles in the units that files name."""
+"""The user's options for a scan; units of lengths and angles."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ _NARROW_DEG, _MANY_VIEWS = 6.5, 30
 
 @dataclass(frozen=True)
 class Given:
-    """What the user says.
+    """The user's options.
 
     Args:
         photons: that an open pixel counts in a view.
@@ -42,19 +42,19 @@ class Given:
 
 
 def millimetres(unit: str, *, where: str) -> float:
-    """How many millimetres a unit has.
+    """Return the millimetres of a unit.
 
     Raises:
-        UserError: it is no unit of length.
+        UserError: it is not a unit of length.
     """
     found = MILLIMETRES.get(unit.strip().lower())
     if found is None:
-        raise UserError(f"{where}: {unit!r} is no unit of length", "say with --unit which one it is: m, mm, um or nm")
+        raise UserError(f"{where}: {unit!r} is not a unit of length", "set it with --unit: m, mm, um or nm")
     return found
 
 
 def angles_in_radians(angles: np.ndarray, *, views: int, unit: str | None, where: str) -> np.ndarray:
-    """Angles of views as radians.
+    """Convert angles of views to radians.
 
     Args:
         angles: (V,).
@@ -69,24 +69,25 @@ def angles_in_radians(angles: np.ndarray, *, views: int, unit: str | None, where
     if len(values) != views:
         raise UserError(
             f"{where} has {len(values)} angles for {views} projections",
-            "each projection needs its angle; take out the frames or the angles that have no partner",
+            "each projection needs one angle: remove the frames or angles without a counterpart",
         )
     if not np.isfinite(values).all():
         bad = int(np.argmin(np.isfinite(values)))
-        raise UserError(f"{where}: angle {bad} is {values[bad]}", "write the angles of all projections again")
+        raise UserError(f"{where}: angle {bad} is {values[bad]}", "correct the angles in the file")
     span = float(np.ptp(values))
     if span == 0 and views > 1:
-        raise UserError(f"{where}: all {views} angles are {values[0]:g}", "write the angle of each projection")
+        raise UserError(f"{where}: all {views} angles are {values[0]:g}", "give the angle of each projection")
     name = "degrees" if unit is None else unit.strip().lower()
     if name in _RADIANS:
         if span > 8 * np.pi:
-            raise UserError(f"{where}: angles span {span:.4g} radians", "they look like degrees: mend their unit")
+            raise UserError(f"{where}: angles span {span:.4g} radians", "these look like degrees: correct their unit")
         return values
     if name not in _DEGREES:
-        raise UserError(f"{where}: {unit!r} is no unit of angles", "write degrees or radians")
+        raise UserError(f"{where}: {unit!r} is not a unit of angle", "write degrees or radians")
     if span < _NARROW_DEG and views >= _MANY_VIEWS:
         raise UserError(
-            f"{where}: {views} angles span {span:.4g} degrees", "they look like radians: mend their unit in the file"
+            f"{where}: {views} angles span {span:.4g} degrees",
+            "these look like radians: correct their unit in the file",
         )
     return np.radians(values)
 
@@ -100,5 +101,5 @@ def check_pixel_size(size_mm: float, *, where: str) -> None:
     if not np.isfinite(size_mm) or not PIXEL_MM[0] <= size_mm <= PIXEL_MM[1]:
         raise UserError(
             f"{where}: a pixel of {size_mm:g} mm",
-            f"between {PIXEL_MM[0]:g} and {PIXEL_MM[1]:g} mm are possible; say with --unit which unit lengths have",
+            f"between {PIXEL_MM[0]:g} and {PIXEL_MM[1]:g} mm are possible; set the unit of lengths with --unit",
         )

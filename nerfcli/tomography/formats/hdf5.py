@@ -119,12 +119,12 @@ def _parallel(
     unit = "mm" if sides is not None else UNKNOWN_UNIT
     if sides is None and given.unit is None:
         unit = "voxel"
-        notes.append("the file does not say how large a pixel is: lengths are in pixels")
+        notes.append("the file does not state the pixel size: lengths are in pixels")
     beam = None
     if flats is None:
         if float(np.nanquantile(data, 0.999)) > 1.5:
             raise UserError(
-                f"{path} has no flats: what the beam was without the object is not known",
+                f"{path} has no flats: the open beam is unknown",
                 "add them (data_white, or image_key 1), or store transmissions instead of detector values",
             )
         notes.append("there are no flats: values are taken as transmissions")
@@ -141,15 +141,15 @@ def _opened(path: Path) -> Any:
         return h5py.File(path, "r")
     except OSError as error:
         if not path.exists():
-            raise UserError(f"there is no {path}", "give the path of an HDF5 file") from error
-        raise UserError(f"{path} is no HDF5 file that can be read: {error}", "it is damaged: copy it again") from error
+            raise UserError(f"{path} does not exist", "give the path of an HDF5 file") from error
+        raise UserError(f"{path} cannot be read as HDF5: {error}", "it is damaged: copy it again") from error
 
 
 def _dataset(file: Any, name: str, path: Path, what: str) -> Any:
     import h5py
 
     if name not in file or not isinstance(file[name], h5py.Dataset):
-        raise UserError(f"{path} has no {name}", f"{what} should stand there: write the file again with them")
+        raise UserError(f"{path} has no {name}", f"it should hold {what}: write the file again with them")
     return file[name]
 
 

@@ -40,7 +40,8 @@ def read_heltomo(path: Path, given: Given = Given()) -> Scan:
     stated = int(getattr(parameters, "numDetectorsPost", columns))
     if stated != columns:
         raise UserError(
-            f"{path}: {columns} columns, where numDetectorsPost says {stated}", "the sinogram was cut: mend its size"
+            f"{path}: {columns} columns, but numDetectorsPost is {stated}",
+            "the sinogram was cropped: correct one of them",
         )
     pixel = unit * _number(parameters, "pixelSizePost", path)
     circle = Circle(
@@ -84,9 +85,9 @@ def _struct(path: Path) -> tuple[str, Any]:
     try:
         content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)
     except FileNotFoundError as error:
-        raise UserError(f"there is no {path}", "give the path of a .mat file") from error
+        raise UserError(f"{path} does not exist", "give the path of a .mat file") from error
     except Exception as error:  # loadmat raises what its parser meets: ValueError, TypeError, zlib.error, ...
-        raise UserError(f"{path} is no MATLAB file that can be read: {error}", _HINT) from error
+        raise UserError(f"{path} cannot be read as a MATLAB file: {error}", _HINT) from error
     for name, value in content.items():
         if hasattr(value, "sinogram") and hasattr(value, "parameters"):
             return name, value
@@ -107,5 +108,5 @@ def _number(parameters: Any, name: str, path: Path) -> float:
     except (TypeError, ValueError):
         number = float("nan")
     if not (np.isfinite(number) and number > 0):
-        raise UserError(f"{path}: {name} is {value!r}", "a length above 0 should stand there")
+        raise UserError(f"{path}: {name} is {value!r}", "expected a length above 0")
     return number

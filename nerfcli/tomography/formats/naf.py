@@ -68,11 +68,11 @@ def load_plain(path: Path) -> Any:
         return _PlainUnpickler(io.BytesIO(content)).load()
     except _RefusedError as error:
         raise UserError(
-            f"{path} wants to call {error}: it was not opened",
+            f"{path} tries to call {error} and was not opened",
             "pickles can run any program; only arrays, numbers, texts and plain containers are read",
         ) from error
     except Exception as error:  # a damaged pickle ends in any exception: EOFError, KeyError, ValueError, ...
-        raise UserError(f"{path} is no pickle that can be read: {error or 'it ends early'}", _HINT) from error
+        raise UserError(f"{path} cannot be read as a pickle: {error or 'it ends early'}", _HINT) from error
 
 
 def read_naf(path: Path, given: Given = Given()) -> Scan:
@@ -143,8 +143,8 @@ def _detector(
     if count == [rows, columns]:
         return (side[1], side[0]), (offset[1], offset[0])
     raise UserError(
-        f"{path}: projections of {columns} x {rows} pixels, where nDetector says {count[0]} x {count[1]}",
-        "the pickle does not belong together: export it again",
+        f"{path}: projections of {columns} x {rows} pixels, but nDetector is {count[0]} x {count[1]}",
+        "its parts do not fit together: export it again",
     )
 
 
@@ -183,5 +183,5 @@ def _numbers(value: Any) -> np.ndarray:
 def _number(data: Mapping[str, Any], name: str, path: Path) -> float:
     value = _numbers(_entry(data, name, path))
     if len(value) != 1 or not (np.isfinite(value[0]) and value[0] > 0):
-        raise UserError(f"{path}: {name} is {data[name]!r}", "a distance in mm above 0 should stand there")
+        raise UserError(f"{path}: {name} is {data[name]!r}", "expected a distance in mm above 0")
     return float(value[0])

@@ -83,7 +83,7 @@ def _angles(fields: Statement, views: int, recorded: np.ndarray | None, notes: l
         if apart <= abs(step) / 2:
             turned = measured
         else:
-            notes.append(f"recorded angles are up to {apart:.3g} degrees off those of AngularStep, which are used")
+            notes.append(f"recorded angles are up to {apart:.3g} degrees off AngularStep; the recorded ones are used")
     return angles_in_radians(first + turned, views=views, unit="degrees", where=where)
 
 
@@ -103,7 +103,7 @@ def _recorded_angles(path: Path, views: int) -> np.ndarray | None:
     if len(angles) != views:
         raise UserError(
             f"{place} lists {len(angles)} angles for {views} projections",
-            f"each projection needs its angle; without {place.name} those of AngularStep are taken",
+            f"each projection needs its angle; without {place.name} the angles of AngularStep are used",
         )
     return np.array(angles)
 
@@ -117,7 +117,7 @@ def _projections(path: Path, fields: Statement, views: int) -> list[Path]:
     paths = numbered(folder, f"{stem}*") or numbered(folder)
     if len(paths) != views:
         raise UserError(
-            f"{folder} holds {len(paths)} projections, {path.name} says {views}",
+            f"{folder} holds {len(paths)} projections; {path.name} states {views}",
             f"expected TIFF files named {stem}_0001.tif and so on beside the .xtekct, all of them",
         )
     return paths

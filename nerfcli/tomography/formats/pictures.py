@@ -21,7 +21,7 @@ def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) ->
         without: a regular expression of names to pass over.
 
     Raises:
-        UserError: a number between the first and the last one is missing, or is there twice.
+        UserError: a number between the first and the last one is missing, or is listed twice.
     """
     paths = [
         path
@@ -36,13 +36,13 @@ def numbered(folder: Path, pattern: str = "*", *, without: str | None = None) ->
     if twice:
         raise UserError(
             f"{folder} has several pictures with the same number: {', '.join(twice[:_NAMES_SHOWN])}",
-            "keep the projections of one scan in a folder of their own",
+            "keep the projections of each scan in a folder of their own",
         )
     steps = np.diff(sorted(present))
     if (steps != np.median(steps)).any():
         first = sorted(present)[int(np.argmax(steps != np.median(steps)))]
         raise UserError(
-            f"{folder}: after number {first} the numbers of the pictures jump",
+            f"{folder}: after number {first} the numbering of the pictures has a gap",
             "a projection is missing; without it the angles of the others are wrong",
         )
     return [path for _, path in sorted(zip(present, paths, strict=True))]
@@ -61,7 +61,7 @@ def read_stack(paths: Sequence[Path]) -> np.ndarray:
                 raise UserError(
                     f"{path} has {frame.shape[1]} x {frame.shape[0]} pixels, the first projection "
                     f"{frames[0].shape[1]} x {frames[0].shape[0]}",
-                    "all projections of a scan have one size; take out what is no projection",
+                    "all projections of a scan have the same size: remove other pictures",
                 )
             frames.append(frame)
     return np.stack(frames)
@@ -82,9 +82,9 @@ def _pages(path: Path) -> np.ndarray:
                 raise ValueError("no picture that OpenCV knows")
             array = np.asarray(read)
     except FileNotFoundError as error:
-        raise UserError(f"there is no {path}", "the description of the scan names it: put it there") from error
+        raise UserError(f"{path} does not exist", "it is listed in the description of the scan: restore it") from error
     except Exception as error:  # tifffile raises what its decoders raise
-        raise UserError(f"{path} cannot be read: {error}", "it is damaged or no picture: export it again") from error
+        raise UserError(f"{path} cannot be read: {error}", "it is damaged or not a picture: export it again") from error
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.shape[-1] in (3, 4):

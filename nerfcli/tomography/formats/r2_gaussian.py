@@ -52,8 +52,8 @@ def read_r2_gaussian(path: Path, given: Given = Given()) -> Scan:
         height, width = size[0] / count[0], size[1] / count[1]
     if (round(count[0]), round(count[1])) != (rows, columns):
         raise UserError(
-            f"{file}: projections of {columns} x {rows} pixels, where nDetector says {count[1]:g} x {count[0]:g}",
-            "nDetector is [rows, columns]: mend it, or the projections",
+            f"{file}: projections of {columns} x {rows} pixels, but nDetector is {count[1]:g} x {count[0]:g}",
+            "nDetector is [rows, columns]: correct it, or the projections",
         )
     if not (width > 0 and height > 0):
         raise UserError(f"{file}: pixels of {width:g} x {height:g}", "sDetector has to be above 0")
@@ -87,7 +87,7 @@ def _projection(file: Path, frame: dict[str, Any]) -> np.ndarray:
     try:
         array = np.load(place, allow_pickle=False)
     except FileNotFoundError as error:
-        raise UserError(f"there is no {place}", f"{NAME} names it: put the projection there") from error
+        raise UserError(f"{place} does not exist", f"{NAME} lists it: restore the projection") from error
     except (OSError, ValueError, EOFError) as error:
         raise UserError(f"{place} cannot be read: {error}", "it is damaged: export it again") from error
     if array.ndim != 2:
@@ -133,7 +133,7 @@ def _mapping(value: Any, name: str, file: Path) -> dict[str, Any]:
 
 def _list(value: Any, name: str, file: Path) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise UserError(f"{file}: {name} is no list of projections", _HINT)
+        raise UserError(f"{file}: {name} is not a list of projections", _HINT)
     return value
 
 
@@ -147,5 +147,5 @@ def _numbers(value: Any) -> list[float]:
 def _pair(fields: Statement, name: str, default: tuple[float, float] | None = None) -> tuple[float, float]:
     value = _numbers(fields.value(name, default))
     if len(value) < 2 or not np.isfinite(value).all():
-        raise UserError(f"{fields.path}: {name} is {fields.value(name)!r}", "two numbers should stand there")
+        raise UserError(f"{fields.path}: {name} is {fields.value(name)!r}", "expected two numbers")
     return value[0], value[1]

@@ -1,4 +1,4 @@
-"""Which format a file or folder has, and its scan."""
+"""Recognise the format of a scan and read it."""
 
 import json
 from collections.abc import Callable
@@ -35,7 +35,7 @@ FORMATS_READ = (OWN, *READERS)
 
 
 def recognise(path: Path) -> str | None:
-    """The name of the format of a scan; None for what is none, such as a folder of photos.
+    """Return the format of a scan; None for anything else, such as a folder of photos.
 
     Raises:
         UserError: it looks like a scan and cannot be read, or a folder holds several.
@@ -67,17 +67,17 @@ def recognise(path: Path) -> str | None:
 
 
 def read_scan(path: Path, given: Given = Given()) -> Scan:
-    """The scan of a file or folder in any format.
+    """Read a scan in any supported format.
 
     Raises:
         UserError: it is no scan, or cannot be read.
     """
     form = recognise(path)
     if form is None:
-        raise UserError(f"{path} is no scan", f"the formats read are {', '.join(FORMATS_READ)}")
+        raise UserError(f"{path} is not a scan in a supported format", f"supported formats: {', '.join(FORMATS_READ)}")
     if form == OWN:
         if given != Given():
-            raise UserError(f"{path} is a scan that was converted already", "give its options when converting")
+            raise UserError(f"{path} is a scan that was converted already", "set options when converting it")
         return load_scan(path if path.is_dir() else path.parent)
     return READERS[form](_file_of(path, form), given)
 

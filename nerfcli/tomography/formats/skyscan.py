@@ -37,8 +37,8 @@ def read_skyscan(path: Path, given: Given = Given()) -> Scan:
     at_object = fields.positive("Image Pixel Size (um)") * 1e-3
     if fields.text("Flat Field Correction", "ON").upper() == "OFF":
         raise UserError(
-            f"{path}: Flat Field Correction=OFF, so that the open beam is not known",
-            "correct the projections by flats with the scanner's program, or describe them in a scan.json with flats",
+            f"{path}: Flat Field Correction=OFF, so the open beam is unknown",
+            "correct the projections with flats in the scanner's program, or describe them in a scan.json with flats",
         )
     paths = _projections(path, fields)
     values = read_stack(paths)
@@ -47,7 +47,7 @@ def read_skyscan(path: Path, given: Given = Given()) -> Scan:
         if name in fields and fields.whole(name) != size:
             raise UserError(
                 f"{path}: {name} is {fields.whole(name)}, the projections have {size}",
-                "the projections were cut or binned after the scan: mend the log, and its pixel size",
+                "the projections were cut or binned after the scan: correct the log, including its pixel size",
             )
     to_detector = fields.positive("Camera to Source (mm)") if "Camera to Source (mm)" in fields else to_object
     pixel = at_object * to_detector / to_object
@@ -68,8 +68,8 @@ def read_skyscan(path: Path, given: Given = Given()) -> Scan:
     notes = []
     if fields.number("Postalignment", 0.0) != 0:
         notes.append(
-            f"the log has a postalignment of {fields.number('Postalignment'):g} pixels, which is not taken over: "
-            "--detect finds the centre of rotation"
+            f"the log has a postalignment of {fields.number('Postalignment'):g} pixels, which is ignored: "
+            "--detect estimates the centre of rotation"
         )
     white = _white(fields, values, notes)
     return scan_of(Found(path, "skyscan", values / white, "transmission", circle, "mm", notes=notes), given)
@@ -91,7 +91,7 @@ def _projections(path: Path, fields: Statement) -> list[Path]:
     # Some scanners count a last file that repeats the first angle, or do not.
     if len(paths) not in (count, count - 1) or len(paths) == 0:
         raise UserError(
-            f"{path.parent} holds {len(paths)} projections, {path.name} says {count}",
+            f"{path.parent} holds {len(paths)} projections; {path.name} states {count}",
             f"expected TIFF or PNG files named {prefix}0000.tif and so on beside the log, all of them",
         )
     return paths

@@ -60,7 +60,7 @@ def read_stated_stack(path: Path, given: Given = Given()) -> Scan:
     fields = read_object(file, hint=_HINT)
     unknown = [name for name in fields.names if name not in _KEYS]
     if unknown:
-        raise UserError(f"{file}: {unknown[0]!r} is no key of a scan", f"the keys are {', '.join(_KEYS)}")
+        raise UserError(f"{file}: {unknown[0]!r} is not a key of scan.json", f"the keys are {', '.join(_KEYS)}")
     kind = _one_of(fields, "kind", KINDS)
     beam_kind: Beam = "cone" if _one_of(fields, "beam", ("cone", "parallel")) == "cone" else "parallel"
     values = _pictures(file, fields.text("projections"), "projections")
@@ -98,7 +98,7 @@ def _circle(fields: Statement, beam: Beam, *, views: int, rows: int, columns: in
     try:
         numbers = np.asarray(stated, dtype=np.float64).reshape(-1)
     except (TypeError, ValueError) as error:
-        raise UserError(f"{where}: {name} is no list of numbers", _HINT) from error
+        raise UserError(f"{where}: {name} is not a list of numbers", _HINT) from error
     angles = angles_in_radians(numbers, views=views, unit=name.removeprefix("angles_"), where=f"{where}: {name}")
     direction = str(fields.value("direction", "counter-clockwise"))
     if direction not in ("counter-clockwise", "clockwise"):

@@ -40,21 +40,21 @@ class Statement:
         text = self.text(name)
         found = re.match(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text.replace(",", "."))
         if not found:
-            raise UserError(f"{self.path}: {name} is {text!r}", "a number should stand there")
+            raise UserError(f"{self.path}: {name} is {text!r}", "expected a number")
         return float(found[0])
 
     def positive(self, name: str) -> float:
         """A number above 0."""
         value = self.number(name)
         if not (np.isfinite(value) and value > 0):
-            raise UserError(f"{self.path}: {name} is {value:g}", "a number above 0 should stand there")
+            raise UserError(f"{self.path}: {name} is {value:g}", "expected a number above 0")
         return value
 
     def whole(self, name: str) -> int:
         """A count, above 0."""
         value = self.positive(name)
         if value != round(value):
-            raise UserError(f"{self.path}: {name} is {value:g}", "a whole number should stand there")
+            raise UserError(f"{self.path}: {name} is {value:g}", "expected a whole number")
         return round(value)
 
     def value(self, name: str, default: Any = None) -> Any:
@@ -91,7 +91,7 @@ def read_object(path: Path, *, hint: str) -> Statement:
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}", hint) from error
     except ValueError as error:
-        raise UserError(f"{path} is no JSON: {error}", hint) from error
+        raise UserError(f"{path} is not JSON: {error}", hint) from error
     if not isinstance(content, dict):
         raise UserError(f"{path} holds a {type(content).__name__}", hint)
     return Statement(path, content, hint=hint)

@@ -40,7 +40,7 @@ def read_transmission_transforms(path: Path, given: Given = Given()) -> Scan:
     expected = stated.value("n_projections")
     if isinstance(expected, int) and expected != len(frames):
         raise UserError(
-            f"{folder}: {len(frames)} frames in the transforms, where {NAME} says {expected}", "a transform is missing"
+            f"{folder}: {len(frames)} frames in the transforms, but {NAME} states {expected}", "a transform is missing"
         )
     poses = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
     if poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
@@ -51,7 +51,7 @@ def read_transmission_transforms(path: Path, given: Given = Given()) -> Scan:
         if abs(lens.positive(name) * pitch - distance) > 1e-6 * distance:
             raise UserError(
                 f"{folder}: {name} is {lens.positive(name):g} px of {pitch:g}, the detector {distance:g} away",
-                "both say how far the detector is: mend one of them",
+                "both give the distance of the detector: correct one of them",
             )
     geometry = ScanGeometry("cone", source, source - distance * back, pitch * right, -pitch * up, rows, columns)
     geometry = geometry.shifted(columns / 2 - lens.number("cx"), rows / 2 - lens.number("cy"))
@@ -90,7 +90,7 @@ def _frames(folder: Path) -> tuple[list[dict[str, Any]], Statement]:
     names = [frame["file_path"] for frame in frames]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise UserError(f"{folder}: {twice} is there twice", "no view may be trained on and held out")
+        raise UserError(f"{folder}: {twice} is listed twice", "no view may be trained on and held out")
     return sorted(frames, key=lambda frame: str(frame["file_path"])), lens
 
 
