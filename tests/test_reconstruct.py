@@ -10,17 +10,18 @@ from ellipsoids import attenuation_of_voxels, bean, line_integrals
 from scipy.ndimage import binary_erosion
 
 from nerfcli.errors import UserError
+from nerfcli.tomography import reconstruct as reconstruction
 from nerfcli.tomography.baselines import filtered_back_projection, sart_total_variation
 from nerfcli.tomography.calibrate import air_factors, detector_tilt
 from nerfcli.tomography.centre import centre_of
 from nerfcli.tomography.geometry import ScanGeometry, circular_cone, circular_parallel
-from nerfcli.tomography.grid import VoxelGrid, centred_grid
+from nerfcli.tomography.grid import VoxelGrid, centred_grid, grid_of_scan
 from nerfcli.tomography.hash_fit import ARRAYS, fit_hash, hash_volume, new_arrays, total_variation
 from nerfcli.tomography.hash_fit import line_integrals as hash_line_integrals
 from nerfcli.tomography.likelihood import Gaussian, Poisson, likelihood_of, noise, photons_per_value
 from nerfcli.tomography.marks import OUTSIDE, TRUNCATED, UNSEEN, WEDGE, marks, missing_wedge_deg
 from nerfcli.tomography.quick import telling_row
-from nerfcli.tomography.reconstruct import Problem, mean_attenuation, reconstruct, start
+from nerfcli.tomography.reconstruct import Problem, Projector, mean_attenuation, reconstruct, start
 from nerfcli.tomography.scan import Scan, held_out_views, load_scan, save_scan
 from nerfcli.tomography.scores import resampled, score_volume
 from nerfcli.tomography.strength import STRENGTHS, choose_strength
@@ -89,6 +90,31 @@ def test_fit_beats_the_baselines_with_the_same_views(scan: Scan, grid: VoxelGrid
     psnr = {name: score_volume(volume, grid, true, grid).psnr for name, volume in found.items()}
     assert psnr["fit"] > psnr["sart"] + 0.5
     assert psnr["sart"] > psnr["fdk"] + 1
+
+
+def test_many_views_over_a_limited_angle_do_not_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
+    """60 subsets with momentum diverge on 300 views over 90 degrees, as 30 did on a measured disc (chi-square 1,700):
+    fewer subsets, and halving them when the objective rises, each prevent it.
+    """
+    angles, sizes = np.arange(300) * np.pi / 600, {"pixel_width": 0.8, "pixel_height": 0.8, "rows": 1, "columns": 140}
+    geometry = circular_cone(angles, source_origin=410, source_detector=553, **sizes)  # type: ignore[arg-type]
+    integrals = line_integrals(bean(4.0), *geometry.rays())
+    noisy = integrals + 0.01 * np.random.default_rng(0).normal(size=integrals.shape)
+    grid = grid_of_scan(geometry, 0.8)
+    problem = problem_of(Scan(geometry, "line_integral", noisy.astype(np.float32)), grid)
+    every = np.arange(300)
+
+    def chi_square() -> float:
+        fit = reconstruct(problem, start(problem), strength=0.1, passes=8)
+        predicted = Projector(geometry, grid).forward(fit.volume, every)
+        return float(problem.likelihood.deviance(predicted, torch.from_numpy(every)).nanmean())
+
+    few = chi_square()
+    monkeypatch.setattr(reconstruction, "MOST_SUBSETS", 1000)
+    halved = chi_square()
+    monkeypatch.setattr(reconstruction, "RISE", np.inf)
+    diverged = chi_square()
+    assert max(few, halved) < 0.3 * diverged, (few, halved, diverged)
 
 
 def test_rays_of_pixels_are_those_of_whole_views() -> None:

@@ -10,6 +10,7 @@ Ramani and Fessler 2015, Combining ordered subsets and momentum, IEEE TMI 34(1);
 Teboulle 2009.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,12 +22,17 @@ from torch.nn.functional import interpolate
 
 from nerfcli import kernels
 from nerfcli.kernels import Backend
+from nerfcli.kernels.reference import total_variation
 from nerfcli.tomography.geometry import ScanGeometry
 from nerfcli.tomography.grid import VoxelGrid
 from nerfcli.tomography.likelihood import Likelihood
 
 # About how many views a subset has: fewer make more steps of a pass, and each of them a worse likeness of all views.
 VIEWS_OF_SUBSET = 5
+# More subsets diverge with momentum: on a scan of 90 degrees 30 did, 11 did not.
+MOST_SUBSETS = 12
+# The objective of a pass may be this many times that of the best one; beyond, subsets are halved and the fit restarts.
+RISE = 1.05
 # Steps of the dual of total variation per step: it goes on from where the last step left it.
 DENOISING_STEPS = 3
 # Voxels that few rays meet would move far at once; their curvature counts as this share of the median at least.
@@ -159,20 +165,23 @@ def reconstruct(
     begun = time.perf_counter()
     projector = Projector(problem.geometry, problem.grid)
     count = problem.geometry.views
-    subsets = _subsets(count)
+    subsets = _subsets(count, min(MOST_SUBSETS, count // VIEWS_OF_SUBSET))
     curvature, beta = curvature_bound(problem, strength)
     threshold = beta / curvature
     backend = kernels.backend_for(torch.device("cpu"), torch.float32)
     volume, dual = fit.volume.clone(), fit.dual.clone()
     ahead, inertia = volume, 1.0
     done, settled = 0, False
+    best, best_volume = math.inf, volume
     while True:
-        before = volume
+        before, objective = volume, beta * float(total_variation(volume))
         spent = time.perf_counter() - begun
         settling = seconds is not None and spent > (1 - SETTLING) * seconds
         for number, views in enumerate(subsets):
             index = torch.from_numpy(views)
-            slope = problem.likelihood.slope(projector.forward(ahead, views), index)
+            integrals = projector.forward(ahead, views)
+            objective += float(problem.likelihood.deviance(integrals, index).nansum()) / 2
+            slope = problem.likelihood.slope(integrals, index)
             gradient = projector.backward(slope, views) * (count / len(views))
             target = ahead - gradient / curvature
             if strength > 0:
@@ -192,6 +201,11 @@ def reconstruct(
                     f"pass {fit.passes + done + 1}",
                 )
         done += 1
+        if objective < best:
+            best, best_volume = objective, before
+        elif objective > RISE * best and len(subsets) > 1:
+            subsets = _subsets(count, len(subsets) // 2)
+            ahead, volume, inertia = best_volume, best_volume, 1.0
         settled = float((volume - before).norm()) <= SETTLED * max(float(volume.norm()), 1e-30)
         spent = time.perf_counter() - begun
         if keep is not None:
@@ -207,7 +221,7 @@ def curvature_bound(problem: Problem, strength: float) -> tuple[Tensor, float]:
     projector = Projector(problem.geometry, problem.grid)
     ones = torch.ones(problem.grid.shape)
     bound, diagonal = torch.zeros(problem.grid.shape), torch.zeros(problem.grid.shape)
-    for views in _subsets(problem.geometry.views):
+    for views in _subsets(problem.geometry.views, problem.geometry.views // VIEWS_OF_SUBSET):
         curvature = problem.likelihood.curvature(torch.from_numpy(views))
         bound += projector.backward(curvature * projector.forward(ones, views), views)
         diagonal += projector.backward(curvature, views)
@@ -218,9 +232,9 @@ def curvature_bound(problem: Problem, strength: float) -> tuple[Tensor, float]:
     return bound.clamp_min(LEAST_CURVATURE * float(bound[met].median())), beta
 
 
-def _subsets(count: int) -> list[np.ndarray]:
+def _subsets(count: int, number: int) -> list[np.ndarray]:
     """Views in subsets that each go all around, in an order in which neighbours are far apart."""
-    number = max(1, count // VIEWS_OF_SUBSET)
+    number = max(1, number)
     order = sorted(range(number), key=lambda s: int(format(s, "016b")[::-1], 2))
     return [np.arange(s, count, number) for s in order]
 

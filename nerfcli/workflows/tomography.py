@@ -46,8 +46,8 @@ COARSE_SHARE = 0.1
 COARSE_PASSES = 6
 # Passes where only a number of seconds ends the fit, and the other way round.
 MOST_PASSES = 200
-# Of a fit: volume, momentum, gradient, curvature, threshold and the three duals, with copies on the way.
-BYTES_OF_VOXEL = 48
+# Of a fit: volume, momentum, gradient, curvature, threshold, the best volume and the three duals, with copies.
+BYTES_OF_VOXEL = 52
 # Scatter of the open beam between views, in standard errors, from which it counts as drift.
 DRIFT = 3.0
 
