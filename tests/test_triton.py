@@ -23,6 +23,7 @@ import torch
 
 pytest.importorskip("triton", reason="Triton is for Linux")
 
+import triton
 from triton.backends import nvidia
 from triton.runtime.jit import JITFunction
 
@@ -71,12 +72,11 @@ def interpreted(tmp_path_factory: pytest.TempPathFactory) -> Interpreted:
 
 
 @pytest.fixture
-def kernel_cache(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch) -> None:
+def kernel_cache(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Keep machine code from one run of the tests to the next."""
     assert pytestconfig.cache is not None
-    folder = pytestconfig.cache.mkdir("kernels")
-    monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(folder))
-    monkeypatch.setenv("TRITON_CACHE_DIR", str(folder / "triton"))
+    monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(pytestconfig.cache.mkdir("kernels")))
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path / "triton"))  # it keeps every intermediate form
 
 
 def test_kernels_agree_with_the_reference_in_the_interpreter(interpreted):
@@ -265,6 +265,12 @@ def test_an_error_of_the_driver_is_named(device, kernel_cache):
 def test_old_devices_are_refused(device):
     here = device(FakeDriver(), (7, 5))
     assert launch.choose_launcher(here) == "it has compute capability 7.5, and 8.0 or newer is needed"
+
+
+def test_an_old_triton_is_refused(device, monkeypatch):
+    here = device(FakeDriver())
+    monkeypatch.setattr(triton, "__version__", "3.5.1")
+    assert launch.choose_launcher(here) == "Triton 3.5.1 is too old, 3.6 or newer is needed"
 
 
 def test_a_device_on_which_neither_way_works_is_refused_with_both_reasons(device, kernel_cache, monkeypatch):

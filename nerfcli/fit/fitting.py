@@ -55,7 +55,7 @@ class StepResult:
 
 
 class Fitting:
-    """The state of a training. Same seed, threads and device give the same numbers, step for step.
+    """The state of a training. On a CPU, same seed and threads give the same numbers, step for step.
 
     Args:
         pool: the training photos.

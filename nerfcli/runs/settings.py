@@ -35,7 +35,7 @@ class TrainSettings:
         learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
         warmup_steps: steps over which the learning rate rises from 0.
         levels, log2_rows, width: size of a hash grid; see `HashFieldSettings`. There are compiled kernels for 8 levels
-            and width 32; other sizes train in plain torch, many times slower.
+            and width 32, on a GPU also 64; other sizes train in plain torch, many times slower.
         components: what is in the model and in its loss.
         field: what the field is made of, one of `kinds.KINDS`.
         field_memory_bytes: what the field's numbers may take; None for what suits the kind, see `sizes.chosen_size`.

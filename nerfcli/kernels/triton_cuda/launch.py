@@ -16,8 +16,8 @@ from torch import Tensor
 from nerfcli.kernels.triton_cuda import cubin, driver
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET", "").lower() in ("1", "true", "on", "yes", "y")
-# The oldest compute capability that Triton supports.
-LEAST_CAPABILITY = (8, 0)
+# The oldest compute capability that Triton supports, and the oldest Triton that these kernels compile with.
+LEAST_CAPABILITY, LEAST_TRITON = (8, 0), (3, 6)
 # Names of types in Triton's signatures.
 TYPES = {
     torch.float32: "fp32",
@@ -110,6 +110,8 @@ def choose_launcher(device: torch.device) -> str | None:
     capability = torch.cuda.get_device_capability(device)
     if capability < LEAST_CAPABILITY:
         return f"it has compute capability {capability[0]}.{capability[1]}, and 8.0 or newer is needed"
+    if tuple(int(part) for part in triton.__version__.split(".")[:2]) < LEAST_TRITON:
+        return f"Triton {triton.__version__} is too old, 3.6 or newer is needed"
     failures = []
     for _with_triton in (False, True):
         try:
