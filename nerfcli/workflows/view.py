@@ -114,9 +114,9 @@ class RunShow:
         Raises:
             UserError: it is none.
         """
-        from nerfcli.runs.config import no_run
-
         if not (self._path / CONFIG).exists():
+            from nerfcli.runs.config import no_run
+
             raise no_run(self._path)
 
     def tick(self, server: PageServer) -> None:
