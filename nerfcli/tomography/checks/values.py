@@ -61,7 +61,7 @@ def drift(sample: Sample) -> Finding | str:
     return Finding(
         "drift",
         verdict,
-        f"air changes by {100 * number:.2g} % between views, of which noise explains {100 * by_noise:.2g} %",
+        f"air changes by {100 * number:.2g} % between views, in addition to {100 * by_noise:.2g} % of noise",
         number,
         f"look from {100 * DRIFT_LOOK:g} %, bad from {100 * DRIFT_BAD:g} %",
         "" if verdict == "good" else "the source or the camera drifts: let the fit scale I0 per view",
