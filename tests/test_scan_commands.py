@@ -91,6 +91,9 @@ def test_render_writes_projections_residuals_and_slices(bean_run: Path, tmp_path
     picture = tifffile.imread(tmp_path / "slices" / "z=0.3.tif")
     result = load_reconstruction(bean_run)
     np.testing.assert_array_equal(picture[::-1], slice_of(result, "z", 0.3))
+    marked = tifffile.imread(tmp_path / "slices" / "z=0.3-marks.tif")
+    np.testing.assert_array_equal(marked[::-1], result.marks[int(np.argmin(np.abs(result.grid.axis("z") - 0.3)))])
+    assert out.splitlines() == [str(tmp_path / "slices" / f"z=0.3{end}.tif") for end in ("", "-marks")]
     code, _, err = call("render", bean_run, "--slices", "z=400")
     assert code == 3
     assert "outside the volume" in err

@@ -41,7 +41,7 @@ def render_scan(
         target: the folder to write.
         outputs: some of `OUTPUTS`: line integrals, transmissions, and (measured - predicted) in units of the noise.
         views: "test" for the held-out ones, "train" for the fitted ones.
-        slices: axis and position in the scan's unit; if there are any, no projections are written.
+        slices: axis and position in the scan's unit, with their marks beside them; projections are not written then.
         threads: of the CPU; 0 for all.
         overwrite: replace files that are there.
         notify: takes lines for the user.
@@ -57,7 +57,7 @@ def render_scan(
     torch.set_num_threads(thread_count(threads))
     result = load_reconstruction(run)
     if slices:
-        return [_write_slice(result, target, axis, at, overwrite=overwrite) for axis, at in slices]
+        return [path for axis, at in slices for path in _write_slice(result, target, axis, at, overwrite=overwrite)]
     scan = scan_of(result, run)
     chosen = np.array(scan.held_out, dtype=int) if views == "test" else scan.training_views
     if len(chosen) == 0:
@@ -155,13 +155,18 @@ def residual_of(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Te
     return -torch.sign(likelihood.slope(integrals, views)) * likelihood.deviance(integrals, views).sqrt()
 
 
-def _write_slice(result: Reconstruction, target: Path, axis: str, at: float, *, overwrite: bool) -> Path:
-    values = slice_of(result, axis, at)
-    path = target / f"{axis}={at:g}.tif"
+def _write_slice(result: Reconstruction, target: Path, axis: str, at: float, *, overwrite: bool) -> list[Path]:
+    """Write a slice, and the marks of its nearest layer if there are any."""
     top = float(np.nanquantile(np.asarray(result.volume), 0.999))
-    # Rows go down on screens, and up along the second axis.
-    _write_picture(path, values[::-1].copy(), 0.0, top, overwrite=overwrite)
-    return path
+    layer = int(np.argmin(np.abs(result.grid.axis(axis) - at)))
+    found = np.take(result.marks, layer, "zyx".index(axis)).astype(np.float32)
+    pictures = {f"{axis}={at:g}": (slice_of(result, axis, at), top)}
+    if found.any():
+        pictures[f"{axis}={at:g}-marks"] = (found, float(sum(MEANINGS)))
+    for name, (values, high) in pictures.items():
+        # Rows go down on screens, and up along the second axis.
+        _write_picture(target / f"{name}.tif", values[::-1].copy(), 0.0, high, overwrite=overwrite)
+    return [target / f"{name}.tif" for name in pictures]
 
 
 def _write_picture(path: Path, values: np.ndarray, low: float, high: float, *, overwrite: bool) -> None:
