@@ -402,7 +402,9 @@ GROUPS: tuple[Group, ...] = (
         (),
         (
             Mutant("unseen[ray] + weight <= negligible", "weight <= negligible"),
-            Mutant("weight <= PART * negligible", "weight <= negligible"),
+            Mutant(
+                "weight <= PART * negligible", "weight <= negligible", "the bound holds: only other samples go without"
+            ),
             Mutant("colours[ray[i], channel] += weight[i] *", "colours[ray[i], channel] +="),
             Mutant("waiting_ray[waiting], waiting_weight[waiting] = ray, weight", "waiting_ray[waiting] = ray"),
             Mutant("harmonics[ray, j]", "harmonics[0, j]"),
