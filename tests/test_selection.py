@@ -33,6 +33,7 @@ from nerfcli.search.selection import (
     may_use_stereo,
     proposals,
     removals,
+    rules,
     select,
     with_evidence,
     with_known_cameras,
@@ -546,13 +547,26 @@ def test_depths_of_stereo_matching_come_with_evidence_and_as_the_user_says():
     assert may_use_stereo(Components(stereo=True), replace(facts, fixed=("stereo",)), has_time=False)
 
 
-def test_a_sky_and_exposures_are_kept_on_evidence():
-    facts = replace(FITTED, points=900, stereo=80_000, sky_share=0.2, exposure_spread=0.26)
+def test_exposures_are_kept_on_evidence():
+    facts = replace(FITTED, points=900, stereo=80_000, exposure_spread=0.26)
     both = Components(points=0.1, stereo=True)
-    assert with_evidence(Components(), facts)[0] == replace(both, exposure="learned", background="sphere")
+    assert with_evidence(Components(), facts)[0] == replace(both, exposure="learned")
     assert with_evidence(Components(), facts)[1][2].why == "photos differ in brightness by 30 % at the same points"
-    assert with_evidence(Components(), replace(facts, sky_share=0.04, exposure_spread=0.1))[0] == both
-    fixed = replace(facts, fixed=("background", "exposure"))
+    assert with_evidence(Components(), replace(facts, exposure_spread=0.1))[0] == both
+    fixed = replace(facts, fixed=("exposure",))
     assert with_evidence(Components(exposure="exif"), fixed)[0] == replace(both, exposure="exif")
-    # Behind an object that is cut out, there is nothing.
     assert with_evidence(Components(), replace(facts, has_alpha=True))[0] == Components()
+    learned = replace(both, exposure="learned")
+    tried, _ = proposals(learned, signs(0.3, 0.0), replace(facts, has_exif=True))
+    assert [change for change in tried if change[0] == "exposure"] == []
+
+
+def test_a_sky_that_pixels_look_like_is_tried_and_kept_if_it_does_not_lose():
+    change = ("background", "sphere")
+    nearby = signs(0.0, 0.0)
+    assert change not in proposals(Components(), nearby, replace(FITTED, sky_share=0.04))[0]
+    facts = replace(FITTED, sky_share=0.2)
+    assert change in proposals(Components(), nearby, facts)[0]
+    assert rules([change], nearby, facts) == {change: judge_supported}
+    assert change not in proposals(Components(), nearby, replace(facts, has_alpha=True))[0]
+    assert change not in proposals(Components(), nearby, replace(facts, fixed=("background",)))[0]

@@ -142,8 +142,8 @@ def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bo
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
     """The model with what photos tell before any training, where that is not decided; and the decisions about it.
 
-    Rays end at the points that photos share and not before the sky, and photos have the exposures that shared pixels
-    tell. All of it is in the model from the first step on: later, light has ended elsewhere already.
+    Rays end at the points that photos share, and photos have the exposures that shared pixels tell. All of it is in
+    the model from the first step on: later, light has ended elsewhere already.
     """
     wanted: list[tuple[Change, str]] = []
     if facts.points and may_use_points(requested, facts):
@@ -154,9 +154,6 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
             per_cent = 100.0 * math.expm1(facts.exposure_spread)
             reason = f"photos differ in brightness by {per_cent:.0f} % at the same points"
             wanted.append((("exposure", "learned"), reason))
-    if facts.sky_share > LEAST_SKY_SHARE and not facts.has_alpha:
-        reason = f"{100.0 * facts.sky_share:.0f} % of the pixels look like a sky: plain, and alike in all photos"
-        wanted.append((("background", "sphere"), reason))
     wanted = [(change, reason) for change, reason in wanted if change[0] not in facts.fixed]
     model = replace(requested, **dict(change for change, _ in wanted))
     return model, [untried(*change, reason, kept=True) for change, reason in wanted]
@@ -193,7 +190,7 @@ def proposals(start: Components, signs: Diagnostics, facts: Facts) -> tuple[list
         declined.append(untried("cameras", "poses", reason))
     else:
         candidates.append(("cameras", "poses"))
-    against_sky = _against_sky(signs)
+    against_sky = None if facts.sky_share > LEAST_SKY_SHARE else _against_sky(signs)
     if not facts.has_alpha and against_sky is None:
         candidates.append(("background", "sphere"))
     elif not facts.has_alpha:
@@ -225,7 +222,9 @@ def rules(candidates: Sequence[Change], signs: Diagnostics, facts: Facts) -> dic
     for change in candidates:
         if change[0] == "cameras" and facts.cameras is not None:
             found[change] = judge_supported  # photos disagree
-        if change[0] == "background" and signs.far_share > LIKELY_FAR_SHARE:
+        if change[0] == "background" and facts.sky_share > LEAST_SKY_SHARE:
+            found[change] = judge_supported  # pixels look like a sky
+        elif change[0] == "background" and signs.far_share > LIKELY_FAR_SHARE:
             found[change] = judge_likely
         if change[0] == "exposure" and signs.exposure_spread > LIKELY_EXPOSURE_SPREAD:
             found[change] = judge_likely

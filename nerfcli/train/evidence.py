@@ -19,6 +19,7 @@ from nerfcli.photos.held_out_exposure import exif_slope
 from nerfcli.photos.pool import Album, PixelPool
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
+from nerfcli.search.selection import LEAST_SKY_SHARE
 
 # Of the budget, what stereo matching may take.
 STEREO_SHARE = 0.06
@@ -102,10 +103,19 @@ class Evidence:
         return float(known.mean(1).std()) if len(known) else 0.0
 
     @cached_property
-    def sky(self) -> Tensor:
-        """(pixels,) bool, those of the pool that look like a sky."""
+    def _plain(self) -> Tensor:
         masks = sky_masks(self._album.photos, threads=self._settings.threads)
         return torch.from_numpy(np.concatenate([mask.ravel() for mask in masks])).to(self._pool.colours.device)
+
+    @property
+    def sky_share(self) -> float:
+        """Of the pixels, those that look like a sky."""
+        return float(self._plain.float().mean())
+
+    @property
+    def sky(self) -> Tensor | None:
+        """(pixels,) bool, those of the pool that look like a sky; None where they are too few to be one."""
+        return self._plain if self.sky_share > LEAST_SKY_SHARE else None
 
     @cached_property
     def of_stereo(self) -> PointDepths:

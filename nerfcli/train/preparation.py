@@ -233,7 +233,7 @@ def _facts(
         fixed=settings.fixed,
     )
     if not facts.has_alpha and "background" not in facts.fixed:
-        facts = replace(facts, sky_share=float(evidence.sky.float().mean()))
+        facts = replace(facts, sky_share=evidence.sky_share)
     if may_use_points(settings.components, facts) and (shared.of_model.count or has_time or settings.components.points):
         facts = replace(facts, points=len(evidence.of_tracks.numbers))
         if may_use_stereo(settings.components, facts, has_time=bool(evidence.side_px)):
@@ -281,7 +281,7 @@ def _search(
         log_focal=log_focal,
         known=evidence.sets(model) if facts.points else [],
         log_gains=evidence.gains_or(torch.zeros(len(album.photos), 3)) if facts.exposure_spread else None,
-        sky=evidence.sky if model.background == "sphere" else None,
+        sky=None if facts.has_alpha else evidence.sky,
         colours=album.colours,
         storage=storage,
     )
