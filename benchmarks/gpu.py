@@ -214,6 +214,26 @@ def fitting_of(capture: Path, device: Any, batch: int, log2_rows: int) -> tuple[
     return fitting, extent.training_from_scene
 
 
+def same_losses(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
+    """How far the losses of the first six steps are from those in plain torch, relatively; float16 makes about 1e-4.
+
+    Raises:
+        RuntimeError: more than 1e-2.
+    """
+    from nerfcli.kernels.reference.backend import ReferenceBackend
+
+    losses = []
+    for plain in (False, True):
+        fitting, _ = fitting_of(capture, device, 2 * sizes.batches[0], sizes.log2_rows[0])
+        if plain:
+            fitting.field.backend = ReferenceBackend(device)
+        losses.append([fitting.advance(0.3 + 0.1 * step).loss for step in range(6)])
+    apart = [abs(fast - exact) / exact for fast, exact in zip(*losses, strict=True)]
+    if max(apart) > 1e-2:
+        raise RuntimeError(f"losses {losses[0]} instead of {losses[1]}")
+    return {"first step": apart[0], "largest": max(apart)}
+
+
 def whole_step(capture: Path, device: Any, batch: int, sizes: Sizes) -> dict[str, float]:
     """Millions of samples per second of whole steps, with their quartiles, after some training."""
     import torch
@@ -357,6 +377,7 @@ def main(
         for log2_rows in sizes.log2_rows:
             name = f"ns per sample, {samples} samples, 2^{log2_rows} rows"
             results.measure(name, lambda n=samples, rows=log2_rows: stages(n, rows, where, sizes.repeats), needs=30)
+    results.measure("losses of six steps", lambda: same_losses(capture, where, sizes), needs=60)
     results.measure("one step", lambda: launches(capture, where, sizes), needs=30)
     for batch in sizes.batches:
         name = f"whole steps of {batch} samples"

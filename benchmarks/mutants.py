@@ -4,8 +4,8 @@
 
 A mutant is one text of one file replaced by another (a sign, an index, a factor, a missing clamp) in a copy of the
 program; the tests of that file run against it until the first fails. It is killed if one fails, survives if none does.
-What survives needs a test, or a reason why no test can tell. The lists of mutants stand in `mutant_list.py` and
-`mutant_list_training.py`.
+What survives needs a test, or a reason why no test can tell. The lists of mutants stand in `mutant_list.py`,
+`mutant_list_training.py` and `mutant_list_triton.py`.
 """
 
 import csv
@@ -31,6 +31,7 @@ import torch
 import typer
 from mutant_list import GROUPS, Group, Mutant
 from mutant_list_training import TRAINING
+from mutant_list_triton import TRITON
 from rich.console import Console
 from rich.table import Table
 
@@ -64,6 +65,8 @@ def run_tests(tree: Path, group: Group, log: Path) -> None:
     os.chdir(tree)
     sys.path[:0] = [str(tree), str(tree / "tests")]
     keep_machine_code(tree / "nerfcli" / "kernels" / "numba_cpu")
+    if any("triton" in test for test in group.tests):
+        os.environ["TRITON_INTERPRET"] = "1"
     selected = ("-k", group.selected) if group.selected else ()
     with log.open("w") as file, redirect_stdout(file), redirect_stderr(file):
         code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--tb=line", *selected, *group.tests])
@@ -112,9 +115,9 @@ def main(
 ) -> None:
     torch.set_num_threads(2)
     console, table = Console(), Table("file", "what is broken", "verdict", "s")
-    chosen = [(group, mutant) for group in (*GROUPS, *TRAINING) if only in group.file for mutant in group.mutants][
-        skip:
-    ]
+    chosen = [
+        (group, mutant) for group in (*GROUPS, *TRAINING, *TRITON) if only in group.file for mutant in group.mutants
+    ][skip:]
     rows = []
     for group, mutant in chosen:
         verdict, seconds = verdict_of(mutant, group)
