@@ -138,9 +138,10 @@ def strides_of(width: int, height: int, seconds_per_ray: float) -> list[int]:
 
 def tiles_of(view: View, stride: int, seconds_per_ray: float) -> list[Tile]:
     """Return the tiles of a picture, from its middle out; the whole where that is quick."""
-    camera = view.coarse(stride).camera
-    width, height = camera.width, camera.height
-    if width * height * seconds_per_ray <= max(TILE_SECONDS, COARSE_SECONDS) or stride == COARSEST:
+    small = view.coarse(stride).camera
+    width, height = small.width, small.height
+    camera = view.frame.camera
+    if camera.width * camera.height / stride**2 * seconds_per_ray <= COARSE_SECONDS or stride == COARSEST:
         return [Tile(stride, 0, 0, width, height)]
     side = max(SMALLEST_SIDE, math.isqrt(max(0, int(TILE_SECONDS / seconds_per_ray) - _TILE_RAYS)))
     tiles = [

@@ -160,8 +160,8 @@ class Remote {
     }
     const far = FAR * this.scene.size, scale = this.scene.training_from_scene.scale;
     for (let y = 0; y < height; y++) for (let x = 0; x < width; x++) {
-      const [layer, i] = this.at((x + 0.5) / factor, (y + 0.5) / factor), median = layer.ends[4 * i + 2];
-      distances[y * width + x] = median < 0 ? far : median / scale;
+      const found = this.at((x + 0.5) / factor, (y + 0.5) / factor), median = found ? found[0].ends[4 * found[1] + 2] : NaN;
+      distances[y * width + x] = median < 0 ? far : median / scale;  // NaN where nothing has come yet
     }
     const colours = new Uint32Array(context.getImageData(0, 0, width, height).data.buffer);
     return { width, height, factor, colours, distances, view: this.view };
@@ -182,7 +182,7 @@ class Remote {
       const px = z1 * (turn[0][0] * a + turn[0][1] * b + turn[0][2]) + shift[0];
       const py = z1 * (turn[1][0] * a + turn[1][1] * b + turn[1][2]) + shift[1];
       const pz = z1 * (turn[2][0] * a + turn[2][1] * b + turn[2][2]) + shift[2];
-      if (pz <= 1e-6 * z1) continue;
+      if (!(pz > 1e-6 * z1)) continue;
       // As wide as the pixel is now and a little more, so that no cracks open; beside its middle it gives way to others.
       const half = Math.min(4, 0.65 * z1 / pz * to[0] / from[0]), u = to[2] + to[0] * px / pz, v = to[3] + to[1] * py / pz;
       const middleX = Math.floor(u), middleY = Math.floor(v), last = Math.min(high - 1, Math.floor(v + half));
