@@ -102,7 +102,7 @@ def is_volume_file(path: Path) -> bool:
     try:
         with tifffile.TiffFile(path) as tiff:
             return {"first", "spacing"} <= set(tiff.imagej_metadata or {})
-    except (OSError, ValueError, IndexError, tifffile.TiffFileError):
+    except (OSError, ValueError, IndexError, struct.error, tifffile.TiffFileError):  # damaged, or no TIFF
         return False
 
 
