@@ -78,6 +78,27 @@ def test_evaluate_compares_with_other_methods(bean_run: Path) -> None:
     assert len(own["projections"]["chi_square_of_view"]) == 5
 
 
+def test_a_reconstruction_is_compared_with_a_reference_that_is_no_truth(bean_run: Path) -> None:
+    code, out, err = call("evaluate", bean_run, "--reference", bean_run, "--json", "--overwrite")
+    assert code == 0, err
+    assert f"the reference {bean_run} is a reconstruction, not the truth" in err
+    metrics = json.loads(out.splitlines()[-1])
+    assert metrics["reference"]["run"] == str(bean_run)
+    assert metrics["methods"]["nerfcli"]["against_reference"]["psnr"] > 200  # itself
+    other = metrics["methods"]["SART with total variation"]
+    assert 10 < other["against_reference"]["psnr"] < 60
+    assert other["against_reference"]["psnr"] != other["volume"]["psnr"]
+    assert call("evaluate", bean_run, "--reference", bean_run)[0] == 0  # kept
+    assert call("evaluate", bean_run)[0] == 0
+    code, _, err = call("evaluate", bean_run, "--reference", bean_run.parent / "other")
+    assert code == 3
+    code, _, err = call("evaluate", bean_run, "--overwrite")
+    assert code == 0
+    code, _, err = call("evaluate", bean_run, "--reference", bean_run)
+    assert code == 3
+    assert "was measured without the reference" in err
+
+
 def test_render_writes_projections_residuals_and_slices(bean_run: Path, tmp_path: Path) -> None:
     code, out, err = call("render", bean_run, "--outputs", "projection,residual", "-o", tmp_path / "pictures")
     assert code == 0, err

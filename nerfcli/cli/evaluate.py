@@ -37,6 +37,12 @@ def evaluate(
     save_predictions: Annotated[
         str | None, typer.Option(help="png: save the compared pictures in RUN/predictions; float: also unrounded.")
     ] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            help="Scans: run folder of a reconstruction from more views, to compare with; it is not the truth."
+        ),
+    ] = None,
     require: Require = None,
     device: Device = "auto",
     threads: Threads = 0,
@@ -62,6 +68,7 @@ def evaluate(
       nerfcli evaluate photos-scene-run --align pose --save-predictions png --overwrite
       nerfcli evaluate photos-scene-run --seeds 3
       nerfcli evaluate first-run second-run third-run
+      nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
     from nerfcli.evaluate.predictions import KINDS
     from nerfcli.runs.run import Run
@@ -86,7 +93,14 @@ def evaluate(
         from nerfcli.workflows.tomography_scores import evaluate_scan
 
         with console.progress("evaluate") as update:
-            scan = evaluate_scan(folder, threads=cores, overwrite=overwrite, notify=console.note, progress=update)
+            scan = evaluate_scan(
+                folder,
+                threads=cores,
+                overwrite=overwrite,
+                reference=reference,
+                notify=console.note,
+                progress=update,
+            )
         print_scan_numbers(folder, scan, console)
         console.result(scan.path, scan.metrics)
 
@@ -110,6 +124,8 @@ def evaluate(
         if is_reconstruction(folder):
             measure_scan(folder)
             return
+        if reference is not None:
+            raise typer.BadParameter(f"{folder} is no reconstruction of a scan", param_hint="--reference")
         check_requirements(Run(folder), measure(folder), requirements)
 
     if seeds == 1 and len(runs) == 1:

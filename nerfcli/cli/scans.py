@@ -111,20 +111,26 @@ def print_scan_numbers(run: Path, evaluation: "ScanEvaluation", console: Console
     metrics = evaluation.metrics
     console.note(f"{run}: {metrics['fitted_views']} fitted views, {metrics['held_out_views']} held out")
     rows = []
+    columns = ["", "rms of line integrals", "dB", "chi-square", "volume dB", "SSIM"]
+    if metrics["reference"] is not None:
+        columns += ["dB to reference", "SSIM"]
     for name, found in metrics["methods"].items():
-        projections, volume = found["projections"], found["volume"]
-        rows.append(
-            (
-                name,
-                *(("-",) * 3 if projections is None else _projection_cells(projections)),
-                *(("-",) * 2 if volume is None else (f"{volume['psnr']:.2f}", f"{volume['ssim']:.3f}")),
-            )
-        )
-    columns = ("", "rms of line integrals", "dB", "chi-square", "volume dB", "SSIM")
+        cells = [
+            *(("-",) * 3 if found["projections"] is None else _projection_cells(found["projections"])),
+            *_volume_cells(found["volume"]),
+            *_volume_cells(found["against_reference"]),
+        ]
+        rows.append((name, *cells[: len(columns) - 1]))
     console.table(columns, rows, styles={})
+    if metrics["reference"] is not None:
+        console.note(f"the reference {metrics['reference']['run']} is a reconstruction, not the truth")
     peaks = {found["projections"]["peak"] for found in metrics["methods"].values() if found["projections"]}
     if peaks:
         console.note(f"dB of projections refer to a line integral of {max(peaks):.3g}; chi-square: 1 is noise alone")
+
+
+def _volume_cells(scores: dict | None) -> tuple[str, str]:
+    return ("-", "-") if scores is None else (f"{scores['psnr']:.2f}", f"{scores['ssim']:.3f}")
 
 
 def _projection_cells(projections: dict) -> tuple[str, str, str]:

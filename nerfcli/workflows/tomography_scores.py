@@ -45,6 +45,7 @@ def evaluate_scan(
     threads: int = 0,
     overwrite: bool = False,
     baselines: bool = True,
+    reference: str | Path | None = None,
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> ScanEvaluation:
@@ -55,18 +56,24 @@ def evaluate_scan(
         threads: of the CPU; 0 for all.
         overwrite: measure again.
         baselines: whether filtered back-projection and SART with total variation are computed from the same views.
+        reference: folder of another reconstruction, usually from more views, to compare volumes with. It is no truth:
+            it has errors of its own, and errors that both share do not show.
         notify: takes lines for the user.
         progress: takes the share done and a few words.
 
     Raises:
-        UserError: there is no reconstruction, or its scan is no longer what it was.
+        UserError: there is no reconstruction, its scan is no longer what it was, or the reference has another unit.
     """
     run = Path(run)
     torch.set_num_threads(thread_count(threads))
     result = load_reconstruction(run)
+    compared = None if reference is None else _reference_of(Path(reference), result.unit)
+    described = None if compared is None else {"run": str(reference), "passes": compared.passes}
     path = run / METRICS
     if path.exists() and not overwrite:
         kept = read_json(path, needed=("methods",), hint="measure again with --overwrite")
+        if described not in (None, kept.get("reference")):
+            raise UserError(f"{path} was measured without the reference {reference}", "measure again with --overwrite")
         if kept.get("scan_digest") == result.scan_digest and kept.get("passes") == result.passes:
             notify(f"{path} is kept; add --overwrite to measure again")
             return ScanEvaluation(path, kept, True)
@@ -82,6 +89,9 @@ def evaluate_scan(
         methods[name] = {
             "projections": None if projections is None else asdict(projections),
             "volume": None if truth is None else asdict(score_volume(volume, result.grid, truth[1], truth[0])),
+            "against_reference": None
+            if compared is None
+            else asdict(score_volume(volume, result.grid, compared.volume, compared.grid)),
         }
 
     progress(0.0, "held-out views")
@@ -109,10 +119,20 @@ def evaluate_scan(
         "held_out_views": len(scan.held_out),
         "fitted_views": len(scan.training_views),
         "missing_wedge_deg": result.missing_wedge_deg,
+        "reference": described,
         "methods": methods,
     }
     write_json(path, metrics)
     return ScanEvaluation(path, metrics, False)
+
+
+def _reference_of(run: Path, unit: str) -> Reconstruction:
+    reference = load_reconstruction(run)
+    if reference.unit != unit:
+        raise UserError(
+            f"the reference {run} has lengths in {reference.unit}, expected {unit}", "use a reference of the same scan"
+        )
+    return reference
 
 
 def scan_of(result: Reconstruction, run: Path) -> Scan:
