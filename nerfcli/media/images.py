@@ -49,6 +49,8 @@ _FORMATS = "JPEG, PNG, TIFF, WebP or BMP"
 _SRGB = ImageCms.createProfile("sRGB")
 # Two colour spaces that agree within this many of 255 levels on a grid of colours are the same one.
 _SAME_COLOUR_LEVELS = 2
+# Of zlib: for a rendered picture, files are 1 % larger than at the usual 6, in less than half the time.
+_PNG_LEVEL = 4
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,7 @@ def write_png(path: Path, image: np.ndarray, *, metadata: dict[str, str] | None 
     for key, value in (metadata or {}).items():
         chunks.add_text(key, value)
     with atomic_path(path) as partial:
-        Image.fromarray(image).save(partial, format="PNG", pnginfo=chunks)
+        Image.fromarray(image).save(partial, format="PNG", pnginfo=chunks, compress_level=_PNG_LEVEL)
 
 
 def _check_pixels(image: np.ndarray) -> None:
