@@ -50,7 +50,7 @@ MAY_IMPORT = {
     "render": {"field", "kernels", "cameras"},
     "tomography": {"findings", "holdout", "kernels", "media", "pages"},
     "photos": {"runs", "render", "kernels", "cameras", "media"},
-    "multiview": {"photos", "scene", "cameras"},
+    "multiview": {"photos", "scene", "cameras", "media"},
     "runs": {"render", "field", "kernels", "scene", "cameras"},
     "fit": {"multiview", "runs", "photos", "render", "field", "kernels", "scene", "cameras"},
     "search": {"fit", "multiview", "runs", "photos", "field"},

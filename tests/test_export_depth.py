@@ -22,8 +22,8 @@ from nerfcli.export.order import Order
 from nerfcli.export.settings import MEASURED, ExportSettings, depth_meta, floor_of
 from nerfcli.media.depth_pictures import DepthMeta
 from nerfcli.media.descriptions import depth_meta_of
-from nerfcli.media.exr import linear_light
 from nerfcli.media.float_tiff import write_tiff
+from nerfcli.media.srgb import linear_light
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
 

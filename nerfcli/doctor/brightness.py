@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from nerfcli.media.srgb import linear_light
+
 # Levels of 255 from which on, and up to which, a channel holds nothing that could be told apart.
 WHITE_LEVEL = 253
 BLACK_LEVEL = 3
 
-# Linear light of the levels of sRGB, IEC 61966-2-1.
-_LEVELS = np.arange(256) / 255
-_LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
+# Linear light of the levels of sRGB.
+_LINEAR = linear_light(np.arange(256) / 255).astype(np.float32)
 _WINDOW_PX = 4.0
 _CLIPPED_WINDOW_PX = 15
 # Linear light below which noise and black level decide.

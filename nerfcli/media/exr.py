@@ -27,6 +27,7 @@ from nerfcli import __version__
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 from nerfcli.media.depth_pictures import KEY, DepthMeta, check_map
+from nerfcli.media.srgb import linear_light
 
 CHANNELS = {"depth": "Z", "opacity": "opacity.V", "spread": "spread.V", "disagreement": "disagreement.V"}
 
@@ -119,10 +120,3 @@ def _colour_channels(srgb: np.ndarray) -> dict[str, np.ndarray]:
     alpha = srgb[..., 3]
     colours = {name: linear[..., index] * alpha for index, name in enumerate("RGB")}
     return colours | {"A": np.ascontiguousarray(alpha)}
-
-
-def linear_light(srgb: np.ndarray) -> np.ndarray:
-    """sRGB in [0, 1] as linear light. Source: IEC 61966-2-1."""
-    low = srgb / 12.92
-    high = ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4
-    return np.where(srgb <= 0.04045, low, high).astype(srgb.dtype)

@@ -14,6 +14,7 @@ import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
+from nerfcli.media.srgb import linear_light
 
 KEY = "nerfcli"
 _WORDS = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int", "u2": "ushort"}
@@ -189,7 +190,7 @@ def write_glb(
         middle = np.zeros(3)
     positions = (vertices - middle).astype("<f4")
     light = np.full((len(vertices), 4), 65535, "<u2")
-    light[:, :3] = np.rint(65535 * _linear(colours / 255.0))
+    light[:, :3] = np.rint(65535 * linear_light(colours / 255.0))
     parts = [positions.tobytes(), normals.astype("<f4").tobytes(), light.tobytes(), faces.astype("<u4").tobytes()]
     starts = np.cumsum([0, *(len(part) for part in parts)])
     turn = np.eye(4)
@@ -257,8 +258,3 @@ def _triangles(faces: np.ndarray) -> np.ndarray:
     table = np.zeros(len(faces), [("count", "u1"), ("vertices", "<i4", 3)])
     table["count"], table["vertices"] = 3, faces
     return table
-
-
-def _linear(levels: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB, IEC 61966-2-1."""
-    return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from nerfcli.cameras.rigid import apply, inverse
+from nerfcli.media.srgb import linear_light
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.photos.loading import LoadedPhoto
@@ -14,17 +15,21 @@ from nerfcli.photos.loading import LoadedPhoto
 MOST_PIXELS, OTHERS = 2000, 12
 # Two depths of a point agree within this part of them. Levels between which a ratio tells the exposure.
 CONSISTENT, DARKEST, BRIGHTEST = 0.02, 20, 240
-# Pairs with fewer common pixels tell nothing; more than the other number tell no more, as their errors are shared.
+# Pairs with fewer common pixels are ignored; the weight of a pair stops growing at the other number, as errors of
+# neighbouring pixels are correlated.
 FEWEST, MOST_WEIGHT = 50, 500
 # Around each pixel, so that details which do not lie on one another to the pixel cancel.
 WINDOW_PX = 3
 ROUNDS = 5
+# Of sRGB from 0 to 1, so that logarithms exist.
+LEAST_LIGHT = 1e-3
 
 
 def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]) -> np.ndarray:
-    """Estimate the logarithms (P, 3) of the gains of photos in linear light, per channel, with the mean 0.
+    """Estimate the logarithms (P, 3) of the gains of photos in linear light, per channel, with mean 0.
 
-    A pair's is the median over common pixels; those of the photos have the least sum of absolute differences to these.
+    The log ratio of a pair is the median over its common pixels; gains minimise the sum of absolute differences to
+    these log ratios.
 
     Args:
         photos: with pixels in sRGB.
@@ -33,8 +38,9 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
     Returns:
         NaN for photos that share too little with the others to be compared.
     """
-    light = [_linear(cv2.blur(np.ascontiguousarray(photo.pixels[..., :3]), (WINDOW_PX, WINDOW_PX))) for photo in photos]
-    levels = [photo.pixels[..., :3] for photo in photos]
+    levels = [np.ascontiguousarray(photo.pixels[..., :3]) for photo in photos]
+    around = [cv2.blur(pixels, (WINDOW_PX, WINDOW_PX)).astype(np.float64) / 255.0 for pixels in levels]
+    light = [linear_light(np.maximum(pixels, LEAST_LIGHT)) for pixels in around]
     maps = []
     for photo, depth in zip(photos, dense, strict=True):
         known = np.full(photo.pixels.shape[:2], np.nan)
@@ -92,9 +98,3 @@ def _gains(count: int, pairs: np.ndarray, ratios: np.ndarray, weights: np.ndarra
             robust = 1.0 / np.maximum(np.abs(design[:-1] @ found - wanted[:-1]), 0.01)
         gains[group, channel] = found
     return gains
-
-
-def _linear(levels: np.ndarray) -> np.ndarray:
-    """Return the linear light of sRGB levels, uint8."""
-    values = np.maximum(levels.astype(np.float64) / 255.0, 1e-3)
-    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)

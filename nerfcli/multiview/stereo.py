@@ -22,7 +22,7 @@ from nerfcli.photos.undistorted import pinhole_of, undistorted
 # Photos that each photo is matched with, and how many of these have to agree on a depth. On the desk, 44 % of the
 # pixels are within 1 % of the truth with three and 52 % with four, in 1.3 times the time.
 NEIGHBOURS, LEAST_AGREEING = 4, 2
-# Pictures are matched at most at this size; below the other one, matching tells too little. The time per pixel on one
+# Pictures are matched at most at this size; below the other one, matching finds too little. The time per pixel on one
 # thread, as measured, decides about the size, and is no promise.
 LONGER_SIDE_PX, LEAST_SIDE_PX = 480, 160
 SECONDS_PER_PIXEL = 1.5e-6
@@ -31,7 +31,7 @@ SECONDS_PER_PIXEL = 1.5e-6
 BEST_ANGLE_DEG, SMALLER_DEG, LARGER_DEG = 5.0, 1.0, 10.0
 # A point counts as seen by photos that look at it within this angle of a photo in which it was found.
 SAME_SIDE_COS = np.cos(np.radians(40.0))
-# More points take time and memory, and tell no more.
+# More points take time and memory, and change nothing.
 MOST_POINTS = 20_000
 # Fewer points that two photos share do not make them neighbours.
 FEWEST_SHARED = 12
@@ -99,12 +99,12 @@ def dense_depths(
     """Estimate the distance of the pixels of each photo on which several of its neighbours agree.
 
     Each photo is rectified with up to `NEIGHBOURS` others and matched by semi-global matching. A depth counts where
-    `LEAST_AGREEING` neighbours tell it within its error (one, where there is only one), and where the depth of a
+    `LEAST_AGREEING` neighbours give it within its error (one, where there is only one), and where the depth of a
     neighbour at the same place confirms it; it is their mean weighted by inverse variance.
 
     Args:
         photos: to train on.
-        tracks: sparse points, which tell the neighbours and the range of depths.
+        tracks: sparse points, which determine the neighbours and the range of depths.
         longer_side_px: of the pictures that are matched.
         threads: photos at a time.
 
@@ -144,10 +144,9 @@ def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.nda
     count = tracks.count
     rays = tracks.rays[found].T
     towards = np.stack([np.bincount(tracks.points[found], axis, count).astype(np.float64) for axis in rays], axis=-1)
-    known = np.isfinite(surface.points).all(axis=1)
-    known = np.flatnonzero(known)
-    known = known[:: 1 + len(known) // MOST_POINTS]
-    points, towards = surface.points[known], towards[known]
+    finite = np.flatnonzero(np.isfinite(surface.points).all(axis=1))
+    finite = finite[:: 1 + len(finite) // MOST_POINTS]
+    points, towards = surface.points[finite], towards[finite]
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     shown = np.zeros((len(photos), len(points)), dtype=bool)
     for index, photo in enumerate(photos):
@@ -207,9 +206,9 @@ class _Map:
 
 def _map(view: _View, others: Sequence[_View], points: np.ndarray) -> _Map:
     """Match a view with its neighbours; `points` (P, 3) are those that it shows."""
-    told = [found for other in others if (found := _matched(view, other, points)) is not None]
-    rho, errors, agreeing = _agreed(told, view.grey.shape)
-    rho[(agreeing < max(1, min(LEAST_AGREEING, len(told)))) | ~view.shown | ~_has_texture(view.grey)] = np.nan
+    matched = [found for other in others if (found := _matched(view, other, points)) is not None]
+    rho, errors, agreeing = _agreed(matched, view.grey.shape)
+    rho[(agreeing < max(1, min(LEAST_AGREEING, len(matched)))) | ~view.shown | ~_has_texture(view.grey)] = np.nan
     return _Map(rho, errors)
 
 
@@ -248,7 +247,7 @@ def _has_texture(grey: np.ndarray) -> np.ndarray:
 
 
 def _matched(one: _View, other: _View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return inverse depths (h * w,) that a pair tells of the first view's pixels, NaN where none, and their errors.
+    """Return inverse depths (h, w) of the first view's pixels by matching a pair, NaN where unknown, and their errors.
 
     None where the pair cannot be rectified. Both pictures are turned so that the baseline is along their rows: a point
     at z in the turned axes then has the disparity f * baseline / z. The second one is then stretched so that the plane
@@ -360,15 +359,15 @@ def _bounds(view: _View, turned: np.ndarray, focal: float) -> tuple[np.ndarray, 
 
 
 def _agreed(
-    told: Sequence[tuple[np.ndarray, np.ndarray]], shape: tuple[int, ...]
+    matched: Sequence[tuple[np.ndarray, np.ndarray]], shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return inverse depths (h, w) that most estimates agree on, their standard errors, and how many agree."""
     best, error = (np.full(shape, np.nan, np.float32) for _ in range(2))
     agreeing = np.zeros(shape, np.int8)
-    for one, (rho, errors) in enumerate(told):
+    for one, (rho, errors) in enumerate(matched):
         number = np.zeros(shape, np.int8)
         total, mean = (np.zeros(shape, np.float32) for _ in range(2))
-        for other, (other_rho, other_errors) in enumerate(told):
+        for other, (other_rho, other_errors) in enumerate(matched):
             within = AGREE_ERRORS * (errors + other_errors) + AGREE_PART * rho
             with np.errstate(invalid="ignore"):  # no estimate agrees with none
                 agree = np.abs(other_rho - rho) <= within

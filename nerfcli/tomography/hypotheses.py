@@ -1,7 +1,7 @@
 """Rank hypotheses about a scan by its data: direction of rotation, mirrored detector, centre of rotation.
 
 A wrong answer still gives a picture that looks right. So each hypothesis has to predict views that it was not fitted
-to, and the margin between hypotheses is told. What no data can decide is said: mirroring the detector and reversing
+to, and the margin between hypotheses is reported, as is what no data can decide: mirroring the detector and reversing
 the direction together only mirror the object, and parallel beams allow each of them alone.
 """
 

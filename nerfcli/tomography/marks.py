@@ -21,7 +21,7 @@ MEANINGS = {
 # A gap between directions counts as a wedge when it is this many times the usual step, and this many degrees.
 WEDGE_STEPS = 4
 WEDGE_DEG = 10.0
-# Directions over half a turn are told apart in so many bins, one for each bit of an integer.
+# Number of bins of directions over half a turn, one for each bit of an integer.
 _BINS = 60
 
 

@@ -30,13 +30,13 @@ FEWEST_EXIF = 5
 
 
 class Evidence:
-    """What training photos tell of depth, exposures and sky before any training, computed on first use.
+    """Depth, exposures and sky as estimated from the training photos alone, each on first use.
 
     Args:
         shared: features and points of the photos.
         album, pool: the photos, and their pixels in the training frame.
         extent: of the field.
-        settings: of the training; the budget tells how large the pictures are that are matched.
+        settings: of the training; its budget decides the size of the pictures that are matched.
         notify: takes lines for the user.
     """
 

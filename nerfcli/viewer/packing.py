@@ -84,7 +84,7 @@ def quantised(values: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[str, Any]]:
-    """Cells per axis of each grid, their rows, the blocks of the networks, and what the shader is told of the kind."""
+    """Cells per axis of each grid, their rows, the blocks of the networks, and the constants of the shader."""
     field = model.field
     if isinstance(field, HashField):
         settings = field.settings

@@ -12,7 +12,7 @@ CENTRE_LOOK, CENTRE_BAD = 0.3, 1.0
 # Views of a parallel beam that are half a turn apart to this part of a step show the same lines from the other end.
 _OPPOSITE = 1.01
 HARDENING_LOOK, HARDENING_BAD = 0.05, 0.25
-# Below this part of the variance explained, the object is not of one material, and hardening cannot be told from it.
+# Below this part of the variance explained, the object is not of one material, whose effect looks like beam hardening.
 ONE_MATERIAL = 0.97
 
 
