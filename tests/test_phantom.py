@@ -9,7 +9,9 @@ import pytest
 import tifffile
 import torch
 from ellipsoids import Ellipsoid, attenuation_at, attenuation_of_voxels, bean, line_integrals, sphere
+from typer.testing import CliRunner
 
+from nerfcli.cli import app
 from nerfcli.tomography.formats.read import read_scan
 from nerfcli.tomography.likelihood import likelihood_of
 from nerfcli.tomography.truth import load_truth
@@ -75,3 +77,10 @@ def test_the_sample_scan_follows_its_statement(monkeypatch: pytest.MonkeyPatch, 
         np.testing.assert_array_equal(tifffile.imread(tmp_path / name), tifffile.imread(PHANTOM / name))
     np.testing.assert_array_equal(np.load(tmp_path / "truth" / "volume.npy"), np.load(PHANTOM / "truth" / "volume.npy"))
     assert (tmp_path / "scan.json").read_text() == (PHANTOM / "scan.json").read_text()
+
+
+def test_train_asks_to_convert_the_sample_scan(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["train", str(PHANTOM), "-o", str(tmp_path / "run")])
+    assert result.exit_code == 3
+    assert "convert it first: nerfcli convert" in result.stderr
+    assert not (tmp_path / "run").exists()

@@ -145,8 +145,10 @@ def train(
       nerfcli train photos-scene --field voxels --field-memory 16MB
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
+    from nerfcli.errors import UserError
     from nerfcli.runs.components import Components, choose
     from nerfcli.runs.settings import TrainSettings, sizes_for
+    from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
     from nerfcli.workflows.train import train_scene
 
@@ -228,6 +230,10 @@ def train(
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
         if is_scan(folder):
             train_one_scan(folder, run)
+        elif recognise(folder):
+            raise UserError(
+                f"{folder} is a scan in a scanner's format", f"convert it first: nerfcli convert {folder} SCAN"
+            )
         else:
             train_one_scene(folder, run)
         console.result(run)
