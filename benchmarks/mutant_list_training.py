@@ -178,7 +178,7 @@ TRAINING: tuple[Group, ...] = (
             Mutant("(surface.misses_px[kept] / HALF_ERROR_PX) ** 2", "surface.misses_px[kept] / HALF_ERROR_PX"),
             Mutant("(trust * off_target).mean()", "off_target.mean()"),
             Mutant("1.0 - fraction / LAST_SHARE", "1.0 - fraction"),
-            Mutant("// PIXELS_PER_POINT // len(self.known)", "// PIXELS_PER_POINT"),
+            Mutant("// PIXELS_PER_POINT // len(self.sets)", "// PIXELS_PER_POINT"),
         ),
     ),
     Group(

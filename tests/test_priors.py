@@ -224,7 +224,7 @@ def test_a_short_training_takes_known_points_without_a_trial(capture, tmp_path):
     prepared = prepare(capture, settings, run=tmp_path, memory_bytes=None, begun=None, notify=told.append)
     assert prepared.settings.components == Components(points=0.1)
     assert prepared.points is not None
-    assert [len(known.numbers) for known in prepared.points.known] == [3]
+    assert [len(depths.numbers) for depths in prepared.points.sets] == [3]
     assert "points=0.1: kept, 3 pixels see a 3D point at a known distance" in told
 
 

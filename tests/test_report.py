@@ -82,7 +82,7 @@ def seen() -> tuple[list[Seen], np.ndarray]:
     photo = np.full((8, 10, 3), 128, np.uint8)
     shares: list[float] = []
     held_out = [HeldOutPhoto(camera_at(name, (0.0, 0.0, -2.0)), photo, None) for name in ("a.png", EVIL)]
-    look = look_through(model, held_out, depth=DEPTH, on_share=shares.append)
+    look = look_through(model, held_out, depth=DEPTH, on_progress=shares.append)
     assert shares == [0.5, 1.0]
     return look, photo
 

@@ -53,8 +53,8 @@ def test_steps_that_are_too_large_end_with_exit_5_and_a_file_that_repeats_the_fa
     description, bad = replay(tmp_path / "run" / "failure-2.safetensors")
     assert bad is not None
     assert bad.name == "colour of samples"
-    assert bad.name in description["told"]
-    assert f"{bad.count} of {bad.total}" in description["told"]
+    assert bad.name in description["message"]
+    assert f"{bad.count} of {bad.total}" in description["message"]
     assert not (tmp_path / "run" / "field.safetensors").exists()
 
 

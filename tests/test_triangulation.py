@@ -54,7 +54,7 @@ def scene_of(photos: list[LoadedPhoto]) -> Scene:
 def found_in(photos: list[LoadedPhoto], *, threads: int = 1) -> np.ndarray:
     """Points that photos agree on by their own features."""
     tracks = tracks_of_matches(photos, match(photos, threads=threads))
-    return triangulate([photo.frame for photo in photos], tracks).known
+    return triangulate([photo.frame for photo in photos], tracks).found
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +182,7 @@ def test_photos_that_do_not_agree_tell_nothing():
     surface = triangulate(frames_at(centres), replace(tracks, rays=rays))
     assert np.isfinite(surface.points).all(axis=1).tolist() == [True, False, False, False, False, True]
     assert np.isfinite(surface.misses_px).reshape(6, 2).all(axis=1).tolist() == [True, False, False, False, False, True]
-    assert triangulate(frames_at(centres), Tracks(*(column[:0] for column in vars(tracks).values()))).known.shape == (
+    assert triangulate(frames_at(centres), Tracks(*(column[:0] for column in vars(tracks).values()))).found.shape == (
         0,
         3,
     )

@@ -58,7 +58,7 @@ def align_robustly(x: np.ndarray, y: np.ndarray) -> Alignment:
     """`align`, over the points that are within the 99.9 % quantile of the noise, which is estimated too.
 
     It starts from the one of 200 alignments of three points each with the least median residual (Rousseeuw 1984), so
-    that up to half of the points may be wrong. Below 5 points nothing can be told apart, and all count. Deterministic.
+    that up to half of the points may be wrong. Below 5 points outliers cannot be found, and all count. Deterministic.
 
     Args:
         x, y: (N, 3), N >= 2.

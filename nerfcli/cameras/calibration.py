@@ -96,11 +96,11 @@ def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str
             f"{calibration.path} does not list {what}, and {len(fitting)} of its cameras have that size",
             "give a file that lists the photos by name, or one with a single camera of this size",
         )
-    known = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in calibration.cameras))
-    more = f" and {len(known) - _SIZES_SHOWN} more" if len(known) > _SIZES_SHOWN else ""
+    listed_sizes = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in calibration.cameras))
+    more = f" and {len(listed_sizes) - _SIZES_SHOWN} more" if len(listed_sizes) > _SIZES_SHOWN else ""
     raise UserError(
         f"{calibration.path} has no camera for {what}: it does not list it, and its cameras are for "
-        f"{', '.join(known[:_SIZES_SHOWN])}{more}",
+        f"{', '.join(listed_sizes[:_SIZES_SHOWN])}{more}",
         "intrinsics are for a particular aspect ratio; give the intrinsics of these photos, or remove --intrinsics",
     )
 

@@ -14,7 +14,7 @@ def frames_named(frames: Sequence[Frame], names: Sequence[str]) -> tuple[Frame, 
     or photo for images/photo.jpg.
 
     Raises:
-        UserError: no frame has the name, or several end so; the nearest names are told.
+        UserError: no frame has the name, or several end so; the error lists the nearest names.
     """
     whole = {frame.name: frame for frame in frames}
     endings: dict[str, list[Frame]] = {}

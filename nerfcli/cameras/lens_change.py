@@ -48,12 +48,12 @@ def changed(camera: Camera, names: Sequence[str], values: np.ndarray) -> Camera:
 
 def pixels_by_change(camera: Camera, names: Sequence[str], by_parameters: np.ndarray) -> np.ndarray:
     """d pixel / d change (N, 2, K) of a camera, from its d pixel / d parameters (N, 2, P)."""
-    known = parameter_names(camera.model)
-    focal = [index for index, name in enumerate(known) if name in _FOCAL_NAMES]
+    parameters = parameter_names(camera.model)
+    focal = [index for index, name in enumerate(parameters) if name in _FOCAL_NAMES]
     columns = [
         by_parameters[..., focal] @ np.array(camera.params)[focal]
         if name == FOCAL
-        else by_parameters[..., known.index(name)]
+        else by_parameters[..., parameters.index(name)]
         for name in names
     ]
     return np.stack(columns, axis=-1)

@@ -1,7 +1,7 @@
 """Camera axes by name, and conventions that override those of a file format.
 
-Axes are told by three letters, of the directions in which +x, +y and +z of the camera point: r(ight) or l(eft), d(own)
-or u(p), f(orward) or b(ackward). OpenCV's are rdf. Some have names.
+Axes are written as three letters, of the directions in which +x, +y and +z of the camera point: r(ight) or l(eft),
+d(own) or u(p), f(orward) or b(ackward). OpenCV's are rdf. Some have names.
 """
 
 from collections.abc import Callable, Collection, Iterator

@@ -1,6 +1,6 @@
 """Detect the convention of a capture: hypotheses, each compared with the photos.
 
-Four questions: the axes of the cameras and the direction of the transforms (which are asked together, with the size
+Four questions: the axes of the cameras and the direction of the transforms (which are tested together, with the size
 for which the intrinsics are), then the size alone, then the half pixel. Each question's answers are compared with the
 other questions answered best.
 """
@@ -98,7 +98,7 @@ def detect(capture: Capture, *, axes: str, progress: Callable[[float, str], None
     Args:
         capture: as it was parsed, by its format's own convention.
         axes: the camera axes that the format prescribes.
-        progress: told the share of the work that is done.
+        progress: called with the fraction of the work that is done.
 
     Raises:
         UserError: there is nothing to judge by.

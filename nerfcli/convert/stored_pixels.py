@@ -66,7 +66,7 @@ def measure_of(capture: Capture) -> Measure:
 def in_pixels(capture: Capture, pixels: str) -> Turned:
     """The capture with cameras, poses and observations for stored or upright pixels, at the cameras' own size.
 
-    Frames without a photo on disk are left as they are, and told.
+    Frames without a photo on disk are left as they are, and reported.
 
     Raises:
         UserError: a photo that cannot be read, that is mirrored by its orientation, or that has another shape than its
@@ -149,7 +149,7 @@ def _turn(frame: Frame, pixels: str) -> int:
 
 def _fits(mask: Path, camera: Camera, before: Camera, pixels: str) -> bool:
     """Whether a mask serves after a camera was turned: it lies as the turned picture does, or it lies as the one before
-    where that can be told by its shape, since nerfcli then turns it (`media.masks.read_mask`)."""
+    where its shape shows that, since nerfcli then turns it (`media.masks.read_mask`)."""
     return _lies_as(mask, camera, before) or (pixels == UPRIGHT and _lies_as(mask, before, camera))
 
 

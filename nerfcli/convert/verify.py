@@ -124,9 +124,9 @@ def verify_points(
     fault = "" if shift == 0 else f"its points are off by {shift:.3g} of the scene"
     if not fault and capture.colours is not None:
         fault = "" if colours is not None and np.array_equal(capture.colours, colours) else "its colours differ"
-    told = unreadable(capture, fault, tolerance_px=tolerance_px)
+    failure = unreadable(capture, fault, tolerance_px=tolerance_px)
     return replace(
-        told, max_px=0.0, max_deg=0.0, max_centre_shift=0.0, max_point_shift=shift, num_points=len(capture.points)
+        failure, max_px=0.0, max_deg=0.0, max_centre_shift=0.0, max_point_shift=shift, num_points=len(capture.points)
     )
 
 

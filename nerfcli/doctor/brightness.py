@@ -7,7 +7,7 @@ import numpy as np
 
 from nerfcli.media.srgb import linear_light
 
-# Levels of 255 from which on, and up to which, a channel holds nothing that could be told apart.
+# Levels of 255 from which on, and up to which, a channel shows no detail.
 WHITE_LEVEL = 253
 BLACK_LEVEL = 3
 

@@ -14,9 +14,9 @@ _LEAST_RANGE = 1.0
 
 def bars(names: Sequence[str], values: np.ndarray, *, marked: np.ndarray, unit: str) -> str:
     """A bar per photo up or down from 0, as SVG; marked ones are coloured, NaN is left out."""
-    known = values[~np.isnan(values)]
-    low = min(-_LEAST_RANGE / 2, float(known.min(initial=0.0)) * 1.1)
-    high = max(_LEAST_RANGE / 2, float(known.max(initial=0.0)) * 1.1)
+    measured = values[~np.isnan(values)]
+    low = min(-_LEAST_RANGE / 2, float(measured.min(initial=0.0)) * 1.1)
+    high = max(_LEAST_RANGE / 2, float(measured.max(initial=0.0)) * 1.1)
     step = (_WIDTH - _LEFT) / max(len(values), 1)
 
     def row(value: float) -> float:

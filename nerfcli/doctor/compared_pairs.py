@@ -123,5 +123,5 @@ def focal_px(features: PhotoFeatures, exif: Exif) -> float:
 
 
 def _median(values: np.ndarray) -> float:
-    known = values[~np.isnan(values)]
-    return float(np.median(known)) if len(known) >= _LEAST_COMPARED else float("nan")
+    measured = values[~np.isnan(values)]
+    return float(np.median(measured)) if len(measured) >= _LEAST_COMPARED else float("nan")

@@ -27,9 +27,9 @@ def potentials(
     Returns:
         v (count,), NaN for photos without any pair that tells; and for each the number of pairs that tell.
     """
-    known = ~np.isnan(differences)
-    i, j = np.array([pair for pair, told in zip(pairs, known, strict=True) if told], dtype=np.int64).reshape(-1, 2).T
-    differences, trust = differences[known], trust[known]
+    measured = ~np.isnan(differences)
+    i, j = np.asarray(pairs, dtype=np.int64).reshape(-1, 2)[measured].T
+    differences, trust = differences[measured], trust[measured]
     backing = np.bincount(np.concatenate([i, j]), minlength=count)
     values = np.zeros(count)
     weights = trust / max(trust.mean(), 1e-9) if len(trust) else trust
@@ -47,7 +47,7 @@ def potentials(
         weights = trust / trust.mean() / np.maximum(residuals, _TYPICAL_ERROR) if len(trust) else trust
     values[backing == 0] = np.nan
     for members in connected_groups(range(count), zip(i.tolist(), j.tolist(), strict=True)):
-        told = [member for member in members if backing[member]]
-        if told:
-            values[told] -= np.median(values[told])
+        backed = [member for member in members if backing[member]]
+        if backed:
+            values[backed] -= np.median(values[backed])
     return values, backing

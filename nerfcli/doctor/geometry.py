@@ -36,12 +36,12 @@ def baselines(count: int, pairs: Sequence[Pair]) -> np.ndarray:
 def movement(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> Finding | None:
     """Check whether the camera moved sideways between photos, or only turned; None without usable pairs."""
     largest = baselines(len(photos), pairs)
-    known = ~np.isnan(largest)
-    if not known.any():
+    measured = ~np.isnan(largest)
+    if not measured.any():
         return None
-    middle = float(np.median(largest[known]))
-    standing = [i for i in np.argsort(np.where(known, largest, np.inf)) if known[i] and largest[i] < BASELINE_BAD]
-    fraction = len(standing) / int(known.sum())
+    middle = float(np.median(largest[measured]))
+    standing = [i for i in np.argsort(np.where(measured, largest, np.inf)) if measured[i] and largest[i] < BASELINE_BAD]
+    fraction = len(standing) / int(measured.sum())
     verdict = worst([verdict_below(middle, look=BASELINE_LOOK, bad=BASELINE_BAD), LOOK if fraction > 0.1 else GOOD])
     summary = f"median baseline / depth {middle:.2f}"
     if verdict == BAD:

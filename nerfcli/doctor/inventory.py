@@ -64,13 +64,13 @@ def size(photos: Sequence[PhotoFacts]) -> Finding:
     longer = [max(photo.exif.width, photo.exif.height) for photo in photos]
     smallest = min(longer)
     sizes = Counter(f"{photo.exif.width} x {photo.exif.height}" for photo in photos)
-    told = ", ".join(f"{text} ({number})" for text, number in sizes.most_common(3))
+    listed = ", ".join(f"{text} ({number})" for text, number in sizes.most_common(3))
     verdict = verdict_below(smallest, look=SMALL_PX, bad=_TINY_PX)
     small = [(photo.name, f"{side} px") for photo, side in zip(photos, longer, strict=True) if side < SMALL_PX]
     return Finding(
         "size",
         verdict,
-        told + (f" and {len(sizes) - 3} other sizes" if len(sizes) > 3 else ""),
+        listed + (f" and {len(sizes) - 3} other sizes" if len(sizes) > 3 else ""),
         smallest,
         f"longer side: look below {SMALL_PX} px, bad below {_TINY_PX} px",
         "" if verdict == GOOD else "use the original files, not previews or downloads from a messenger",
@@ -196,7 +196,7 @@ def _camera_groups(photos: Sequence[PhotoFacts]) -> dict[str, list[str]]:
         parts = [body, exif.lens] if body or exif.lens else ["unknown (no EXIF)"]
         focal = exif.focal_mm or exif.focal_35mm
         if focal:
-            focal = next((known for known in focals if abs(math.log(focal / known)) < _SAME_FOCAL), focal)
+            focal = next((other for other in focals if abs(math.log(focal / other)) < _SAME_FOCAL), focal)
             focals.append(focal)
             parts.append(f"{focal:.3g} mm")
         if exif.focal_mm and exif.focal_35mm:  # also tells digital zoom

@@ -88,7 +88,7 @@ def read_all(
 
     Args:
         threads: photos that are held at full size at a time.
-        progress: told how many are read.
+        progress: called with how many have been read.
     """
     facts: list[PhotoFacts] = []
     unreadable: dict[str, str] = {}

@@ -125,22 +125,22 @@ def stops(photos: Sequence[PhotoFacts], pairs: Sequence[Pair]) -> tuple[np.ndarr
 
 def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
     """Check whether the same points are about equally bright in all photos; reports EXIF's exposures."""
-    known = ~np.isnan(lighter)
-    spread = float(np.ptp(lighter[known])) if known.any() else float("nan")
+    measured = ~np.isnan(lighter)
+    spread = float(np.ptp(lighter[measured])) if measured.any() else float("nan")
     settings = [
         float(np.log2(photo.exif.exposure_seconds * photo.exif.iso))
         for photo in photos
         if photo.exif.exposure_seconds and photo.exif.iso
     ]
     text = f"; EXIF: {np.ptp(settings):.1f} stops in time and ISO" if len(settings) > 1 else ""
-    off = [i for i in np.argsort(-np.abs(np.nan_to_num(lighter))) if known[i] and abs(lighter[i]) > STOPS_LOOK / 2]
-    verdict = verdict_above(spread, look=STOPS_LOOK, bad=STOPS_BAD) if known.any() else GOOD
-    if not known.any() and len(settings) > 1:
+    off = [i for i in np.argsort(-np.abs(np.nan_to_num(lighter))) if measured[i] and abs(lighter[i]) > STOPS_LOOK / 2]
+    verdict = verdict_above(spread, look=STOPS_LOOK, bad=STOPS_BAD) if measured.any() else GOOD
+    if not measured.any() and len(settings) > 1:
         verdict = verdict_above(float(np.ptp(settings)), look=STOPS_LOOK, bad=STOPS_BAD)
     fixed = len(settings) == len(photos) and np.ptp(settings) < 0.1
     seen = (
         f"brightness differs by up to {spread:.1f} stops at the same points"
-        if known.any()
+        if measured.any()
         else "no matches to compare brightness"
     )
     advice = (
@@ -164,15 +164,15 @@ def exposure(photos: Sequence[PhotoFacts], lighter: np.ndarray) -> Finding:
 
 def white_balance(photos: Sequence[PhotoFacts], redder: np.ndarray) -> Finding:
     """Check whether the same points have the same colour in all photos."""
-    known = ~np.isnan(redder)
-    spread = float(np.ptp(redder[known])) if known.any() else float("nan")
-    verdict = verdict_above(spread, look=_BALANCE_LOOK, bad=_BALANCE_BAD) if known.any() else GOOD
-    off = [i for i in np.argsort(-np.abs(np.nan_to_num(redder))) if known[i] and abs(redder[i]) > _BALANCE_LOOK / 2]
+    measured = ~np.isnan(redder)
+    spread = float(np.ptp(redder[measured])) if measured.any() else float("nan")
+    verdict = verdict_above(spread, look=_BALANCE_LOOK, bad=_BALANCE_BAD) if measured.any() else GOOD
+    off = [i for i in np.argsort(-np.abs(np.nan_to_num(redder))) if measured[i] and abs(redder[i]) > _BALANCE_LOOK / 2]
     seen = f"the red/blue ratio differs by up to {spread:.2f} stops at the same points"
     return Finding(
         "white balance",
         verdict,
-        seen if known.any() else "no matches to compare colours",
+        seen if measured.any() else "no matches to compare colours",
         spread,
         f"look from {_BALANCE_LOOK:g} stops, bad from {_BALANCE_BAD:g}",
         "" if verdict == GOOD else "fix the white balance in the camera; avoid coloured light",

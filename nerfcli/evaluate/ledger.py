@@ -81,9 +81,9 @@ def _cameras(history: Mapping[str, Any] | None, kind: str) -> list[Entry]:
         return [Entry(stage, False, how) for stage in stages]
     how = "estimated from all photos (nerfcli poses without --strict)"
     given = history.get("intrinsics") or {}
-    known = given.get("use") == "fixed"
+    fixed = given.get("use") == "fixed"
     return [
         Entry("poses", True, how),
-        Entry("intrinsics", False, "given and kept fixed") if known else Entry("intrinsics", True, how),
+        Entry("intrinsics", False, "given and kept fixed") if fixed else Entry("intrinsics", True, how),
         Entry("points", True, how),
     ]

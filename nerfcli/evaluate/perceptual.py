@@ -1,6 +1,6 @@
 """LPIPS: how different two pictures look to a network that was trained on people's judgements. It may not be there.
 
-The network's weights are no part of any package: torchvision downloads AlexNet's (230 MB) when it is first asked. Where
+The network's weights are no part of any package: torchvision downloads AlexNet's (230 MB) on first use. Where
 torchmetrics, torchvision or the weights cannot be had, there is no LPIPS, and that is said once.
 """
 

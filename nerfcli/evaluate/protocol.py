@@ -279,14 +279,14 @@ def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
 def _protocol_name(held_out: Sequence[HeldOutPhoto], extras: Extras) -> str:
     sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in held_out})
     names = hashlib.sha256("\n".join(photo.frame.name for photo in held_out).encode()).hexdigest()[:12]
-    told = any(any(photo.log_gains) for photo in held_out)
-    known = ", exposures by EXIF or training photos around" if told else ""
+    matched = any(any(photo.log_gains) for photo in held_out)
+    exposures = ", exposures by EXIF or training photos around" if matched else ""
     alpha = ", RGBA on white" if any(photo.pixels.shape[-1] == 4 for photo in held_out) else ""
     lpips = f"{LPIPS_NAME} (torchmetrics)" if extras.perceptual is not None else "no LPIPS"
     pose = ", pose_aligned: refined on the left half, measured on the right" if extras.align_poses else ""
     return (
         f"{PROTOCOL}: {len(held_out)} held-out photos (names sha256 {names}) at {' '.join(sizes)}, area-averaged, "
-        f"sRGB 8 bit{alpha}{known}, mean of per-image values; PSNR; SSIM with Gaussian window 1.5, 11 x 11, of "
+        f"sRGB 8 bit{alpha}{exposures}, mean of per-image values; PSNR; SSIM with Gaussian window 1.5, 11 x 11, of "
         f"windows inside the picture that hold no masked pixel (scikit-image); {lpips}; float: before rounding; "
         f"colour_aligned: quadratic colour correction fitted to the held-out photo (multinerf){pose}"
     )

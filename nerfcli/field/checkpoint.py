@@ -64,9 +64,9 @@ def tensors_of(content: bytes, path: Path, device: str) -> tuple[dict[str, Tenso
         (length,) = struct.unpack_from("<Q", content)
         metadata = json.loads(content[8 : 8 + length]).get("__metadata__") or {}
         entry = metadata[_ENTRY]
-        told = json.loads(entry)
-        sealed = isinstance(told, list)
-        digest, description = told if sealed else (metadata.get(_DIGEST), told)
+        stored = json.loads(entry)
+        sealed = isinstance(stored, list)
+        digest, description = stored if sealed else (metadata.get(_DIGEST), stored)
     except (SafetensorError, KeyError, ValueError) as error:
         raise _unreadable(path, error) from error
     if (sealed or digest is not None) and digest != _digest(tensors, json.dumps(description) if sealed else entry):

@@ -71,5 +71,5 @@ class Adam:
         """Restore the state from `state`; other tensors are ignored. Parameters without state have not been stepped."""
         for index, entry in enumerate(self._state):
             for name, value in entry.items():
-                known = tensors.get(f"{prefix}.{index}.{name}")
-                entry[name] = torch.zeros_like(value) if known is None else known
+                stored = tensors.get(f"{prefix}.{index}.{name}")
+                entry[name] = torch.zeros_like(value) if stored is None else stored

@@ -16,7 +16,7 @@ LEAST_PHOTOS, OWN_SPACE = 2, 1.0
 BEYOND_CORNER = 1.1
 
 
-def covered_cells(pool: PixelPool, side: int, contraction: str, known: PointDepths | None) -> Tensor:
+def covered_cells(pool: PixelPool, side: int, contraction: str, depths: PointDepths | None) -> Tensor:
     """Return which cells of a grid over the unit cube photos may fill.
 
     A cell is covered where the middle lies in the view of two photos, or in that of one and at least `OWN_SPACE` of the
@@ -26,7 +26,7 @@ def covered_cells(pool: PixelPool, side: int, contraction: str, known: PointDept
         pool: the training photos.
         side: cells per axis.
         contraction: of the field.
-        known: pixels at known distances; without any in a photo, the median of all holds for it.
+        depths: pixels at known distances; without any in a photo, the median of all holds for it.
 
     Returns:
         (side, side, side) bool, indexed [z, y, x].
@@ -34,13 +34,13 @@ def covered_cells(pool: PixelPool, side: int, contraction: str, known: PointDept
     numbers = torch.arange(side**3)
     place = torch.stack([numbers % side, numbers // side % side, numbers // side**2], dim=-1)
     points = training_points((place + 0.5) / side, contraction).double().numpy()
-    nearest = _median_distances(pool, known)
+    nearest = _median_distances(pool, depths)
     count = np.zeros(side**3, dtype=np.int64)
     for camera, pose, own in zip(pool.cameras, pool.poses.double().cpu().numpy(), nearest, strict=True):
         left = np.flatnonzero(count < LEAST_PHOTOS)
         away = points[left] - pose[:3, 3]
         distances = np.linalg.norm(away, axis=1)
-        # No pixel is farther from the axis than this; lenses are asked about the rest only.
+        # No pixel is farther from the axis than this; lenses project the rest only.
         widest = min(180.0, math.hypot(*camera.fov_deg))
         near_axis = away @ pose[:3, 2] >= distances * math.cos(math.radians(widest / 2 * BEYOND_CORNER))
         left, distances = left[near_axis], distances[near_axis]
@@ -51,12 +51,12 @@ def covered_cells(pool: PixelPool, side: int, contraction: str, known: PointDept
     return covered.to(pool.colours.device)
 
 
-def _median_distances(pool: PixelPool, known: PointDepths | None) -> np.ndarray:
+def _median_distances(pool: PixelPool, depths: PointDepths | None) -> np.ndarray:
     """Return the median known distance of each photo; infinite where none is known at all."""
     count = len(pool.cameras)
-    if known is None or len(known.numbers) == 0:
+    if depths is None or len(depths.numbers) == 0:
         return np.full(count, np.inf)
-    photos, distances = pool.photo_of(known.numbers).cpu().numpy(), known.distances.cpu().numpy()
+    photos, distances = pool.photo_of(depths.numbers).cpu().numpy(), depths.distances.cpu().numpy()
     medians = np.full(count, np.median(distances))
     for photo in np.unique(photos):
         medians[photo] = np.median(distances[photos == photo])

@@ -56,7 +56,7 @@ class NewtonSteps(nn.Module):
         Args:
             slope: (P, 6) the sum of the gradients of a step's rays.
             so_far: (P, 6) how far the poses are from the given ones.
-            damping: of each number by itself; what can hardly be told from the others goes slowly.
+            damping: of each number by itself; poorly determined ones move slowly.
             holding: how strongly what is less than a pixel is held.
         """
         curvature = self.curvature / self.weight.clamp_min(_FLOOR)

@@ -58,18 +58,18 @@ class PointRays:
     """Pixels at known distances that are added to each step.
 
     Args:
-        known: sets of pixels, one at least; as many are drawn from each, however large it is.
+        sets: pixels, one at least; as many are drawn from each, however large it is.
         pool: what they are pixels of.
     """
 
-    def __init__(self, known: Sequence[PointDepths], pool: PixelPool):
-        self.known = [depths for depths in known if len(depths.numbers)]
+    def __init__(self, sets: Sequence[PointDepths], pool: PixelPool):
+        self.sets = [depths for depths in sets if len(depths.numbers)]
         self._pool = pool
 
     def added_to(self, drawn: Drawn, generator: torch.Generator) -> Drawn:
         """Append pixels at known distances to the sampled ones. Their colours count like all others."""
-        count = max(1, len(drawn.numbers) // PIXELS_PER_POINT // len(self.known))
-        chosen = reduce(PointDepths.joined, [known.draw(count, generator) for known in self.known])
+        count = max(1, len(drawn.numbers) // PIXELS_PER_POINT // len(self.sets))
+        chosen = reduce(PointDepths.joined, [depths.draw(count, generator) for depths in self.sets])
         both = self._pool.rays_of(torch.cat([drawn.numbers, chosen.numbers]))
         weights = drawn.weights
         if len(weights):

@@ -275,7 +275,7 @@ class Refinement(nn.Module):
     ) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
         """Both sets, refined: the poses of training photos, and the lenses of all photos that were taken with them.
 
-        Nothing of a held-out photo enters: it has the pose that it had, and a lens that training photos have told.
+        No held-out photo is used: it keeps its pose, and the lens estimated from the training photos.
 
         Args:
             training: of the photos of the pool, in its order; their pictures may be of another size.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-# Of the sums of squares, so that what can hardly be told from the rest does not move far: CamP's choice.
+# Of the sums of squares, so that poorly determined parameters do not move far: CamP's choice.
 DAMPING = 0.1
 _FLOOR = 1e-8
 BETAS = (0.9, 0.99)

@@ -39,8 +39,8 @@ def description_of(path: Path) -> dict[str, Any] | None:
     suffix = path.suffix.lower()
     reader = _READERS.get(suffix)
     if reader is None:
-        known = ", ".join(sorted(_READERS))
-        raise UserError(f"{path} is not a supported depth, picture or video file", f"give one of: {known}")
+        suffixes = ", ".join(sorted(_READERS))
+        raise UserError(f"{path} is not a supported depth, picture or video file", f"give one of: {suffixes}")
     try:
         text = reader(path)
     except FileNotFoundError as error:

@@ -77,19 +77,19 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
         content = path.read_bytes()
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}", "give an OpenEXR file") from error
-    with _told_on_stderr() as told:
+    with _captured_stderr() as message:
         try:
             file = OpenEXR.File(io.BytesIO(content), separate_channels=True)
             return {name: np.array(channel.pixels) for name, channel in file.channels().items()}
         except (RuntimeError, ValueError, TypeError) as error:
-            reason = told() or str(error)
+            reason = message() or str(error)
             raise UserError(
                 f"{path} is damaged or not an OpenEXR file: {reason}", "render the picture again"
             ) from error
 
 
 @contextlib.contextmanager
-def _told_on_stderr() -> Iterator[Callable[[], str]]:
+def _captured_stderr() -> Iterator[Callable[[], str]]:
     """Keep what OpenEXR prints while it reads a damaged file, which says more than its exceptions, off the terminal.
 
     Yields:

@@ -34,8 +34,8 @@ def east_north_up(positions: Sequence[Position]) -> tuple[np.ndarray, tuple[floa
     without altitude is taken to be at the median altitude of the others.
     """
     latitude, longitude = (np.array([position[i] for position in positions], dtype=np.float64) for i in (0, 1))
-    known = [position[2] for position in positions if position[2] is not None]
-    middle = float(np.median(known)) if known else 0.0
+    heights = [position[2] for position in positions if position[2] is not None]
+    middle = float(np.median(heights)) if heights else 0.0
     height = np.array([middle if position[2] is None else position[2] for position in positions])
     earth = ecef(latitude, longitude, height)
     lat, lon = np.radians(latitude[0]), np.radians(longitude[0])

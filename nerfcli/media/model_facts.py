@@ -101,9 +101,9 @@ def volume_facts(volume: Volume, form: str) -> dict[str, Any]:
     facts |= {"voxels": "x".join(map(str, shape)), "first_centre": volume.origin.tolist()}
     facts["last_centre"] = (volume.origin + volume.voxel_size * (np.array(shape) - 1)).tolist()
     for name, values in volume.maps.items():
-        known = values[np.isfinite(values)] if values.dtype.kind == "f" else values
-        span = f", {known.min():.6g} to {known.max():.6g}" if known.size else ", no numbers"
-        facts[name] = f"{values.dtype}{span}, {100 * known.size / values.size:.1f} % known"
+        finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+        span = f", {finite.min():.6g} to {finite.max():.6g}" if finite.size else ", no numbers"
+        facts[name] = f"{values.dtype}{span}, {100 * finite.size / values.size:.1f} % known"
     # A map's own name may be a word of the description, which says what its numbers are.
     described = dict(volume.description or {"note": NOT_STATED})
     meanings = {f"{name}_is": described.pop(name) for name in volume.maps if name in described}

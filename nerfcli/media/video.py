@@ -38,7 +38,7 @@ class VideoFormat:
     Args:
         suffix: of the files; two formats never share one, so that their videos stand side by side.
         encoder: the name that `ffmpeg -encoders` lists.
-        crf: constant quality that is hardly told from the pictures, 0 is best; None where there is no such scale.
+        crf: constant quality that is visually close to the pictures, 0 is best; None where there is no such scale.
         worst_crf: the end of that scale.
         arguments: of ffmpeg besides.
     """
@@ -111,7 +111,7 @@ def write_video(
         form: one of `FORMATS`.
         fps: frames per second, > 0.
         crf: constant quality from 0, best, to `form.worst_crf`; the format's own if None.
-        plays: times the clip is shown: repeated in the file, or told to the player of a gif, where 0 is for ever.
+        plays: times the clip is shown: repeated in the file, or written for the player of a gif, where 0 is for ever.
         comment: what the container's comment shall say.
 
     Raises:

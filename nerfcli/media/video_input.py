@@ -102,7 +102,7 @@ def measure_frames(
         video: from `open_video`.
         measure: gets uint8 (height, width): the frame in grey, averaged down where it is larger than `longer_side`.
         longer_side: pixels.
-        progress: told the share that is done, 0...1, where the video states its duration and frame rate.
+        progress: called with the fraction that is done, 0...1, where the video states its duration and frame rate.
 
     Raises:
         UserError: the video is cut short, or cannot be decoded.

@@ -98,8 +98,8 @@ class _Pair:
             at_nodes = [changed(frame.camera, (FOCAL,), np.array([node])).bearings(pixels[::every]) for node in NODES]
             bearings = np.array([np.where(valid[:, None], bearings, np.nan) for bearings, valid in at_nodes])
             rays.append(bearings @ frame.world_from_cam[:3, :3].T)
-        known = np.isfinite(rays[0]).all((0, 2)) & np.isfinite(rays[1]).all((0, 2))
-        self._rays = [ray[:, known] for ray in rays]
+        finite = np.isfinite(rays[0]).all((0, 2)) & np.isfinite(rays[1]).all((0, 2))
+        self._rays = [ray[:, finite] for ray in rays]
 
     def misses(self, log_focal: float) -> np.ndarray:
         """(N,) angles between rays and the planes they should lie in, in units of MISS_PX."""

@@ -43,9 +43,9 @@ def matched_log_gains(photos: Sequence[LoadedPhoto], dense: Sequence[DenseDepth]
     light = [linear_light(np.maximum(pixels, LEAST_LIGHT)) for pixels in around]
     maps = []
     for photo, depth in zip(photos, dense, strict=True):
-        known = np.full(photo.pixels.shape[:2], np.nan)
-        known[depth.pixels[:, 1], depth.pixels[:, 0]] = depth.distances
-        maps.append(known)
+        distances = np.full(photo.pixels.shape[:2], np.nan)
+        distances[depth.pixels[:, 1], depth.pixels[:, 0]] = depth.distances
+        maps.append(distances)
     centres = np.array([photo.frame.centre for photo in photos])
     pairs, ratios, counts = [], [], []
     generator = np.random.default_rng(0)

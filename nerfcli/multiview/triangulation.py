@@ -31,7 +31,7 @@ class Surface:
     misses_px: np.ndarray
 
     @property
-    def known(self) -> np.ndarray:
+    def found(self) -> np.ndarray:
         """(N, 3): the points that there are."""
         return self.points[np.isfinite(self.points).all(axis=1)]
 
@@ -80,7 +80,7 @@ def _nearest(origins: np.ndarray, tracks: Tracks, used: np.ndarray) -> np.ndarra
     )
     along = np.einsum("oi,oi->o", rays, origins)
     sums = np.stack([summed(origins[:, i] - rays[:, i] * along) for i in range(3)], axis=-1)
-    told = np.linalg.eigvalsh(matrices)[:, 0] > 1.0 - np.cos(LEAST_ANGLE_RAD)
+    determined = np.linalg.eigvalsh(matrices)[:, 0] > 1.0 - np.cos(LEAST_ANGLE_RAD)
     points = np.full((tracks.count, 3), np.nan)
-    points[told] = np.linalg.solve(matrices[told], sums[told][:, :, None])[..., 0]
+    points[determined] = np.linalg.solve(matrices[determined], sums[determined][:, :, None])[..., 0]
     return points

@@ -2,8 +2,8 @@
 
 Two errors are kept apart. What was left out for speed (the early stop, colours of negligible samples) is bounded for
 every pixel. That density and colour are taken as constant inside each interval is measured: some rays are rendered
-again with every interval cut into 2 and into 4, the field asked anew in each part. Both are about the rendering of the
-field. How far the field is from the scene, only photos and depths that it has not seen can tell.
+again with every interval cut into 2 and into 4, the field evaluated anew in each part. Both are about the rendering of
+the field. How far the field is from the scene, only photos and depths that it has not seen can tell.
 """
 
 from dataclasses import dataclass
@@ -103,13 +103,13 @@ def measure_error(
     rgb, distances = (
         values.double().cpu().numpy() for values in _renderings(model, frame, pixels, depth=depth, tolerance=tolerance)
     )
-    asked = depth is not None
+    with_depth = depth is not None
     return MeasuredError(
         colour=_spread(np.abs(rgb[1] - rgb[3]).max(-1)),
         colour_halved=_spread(np.abs(rgb[2] - rgb[3]).max(-1)),
-        depth=_spread(np.abs(distances[1] - distances[3])) if asked else None,
-        depth_halved=_spread(np.abs(distances[2] - distances[3])) if asked else None,
-        depth_stop=_spread(np.abs(distances[0] - distances[1])) if asked else None,
+        depth=_spread(np.abs(distances[1] - distances[3])) if with_depth else None,
+        depth_halved=_spread(np.abs(distances[2] - distances[3])) if with_depth else None,
+        depth_stop=_spread(np.abs(distances[0] - distances[1])) if with_depth else None,
     )
 
 

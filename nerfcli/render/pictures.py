@@ -181,7 +181,7 @@ def _render_tile(
     if depth is None:
         return colours
     far = (depth.background_distance or 0.0) * scale * pixels.to_background
-    asked = requested(depth, pixels.ends, background_distance=far)
-    maps = (asked, spread(depth, pixels.ends), disagreement(depth, pixels.ends))
+    distances = requested(depth, pixels.ends, background_distance=far)
+    maps = (distances, spread(depth, pixels.ends), disagreement(depth, pixels.ends))
     defined = pixels.valid & ahead.view(-1, count).all(1)
     return *colours, *(torch.where(defined, values, torch.nan) for values in maps)

@@ -48,8 +48,8 @@ def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, de
         hashes: of their fields.
         views, depth: how many held-out photos, and which depth of them.
     """
-    told = [[run.label, run.config.to_json(), run.log, run.metrics, run.poses] for run in runs]
-    return digest([__version__, list(hashes), told, views, asdict(depth)])
+    facts = [[run.label, run.config.to_json(), run.log, run.metrics, run.poses] for run in runs]
+    return digest([__version__, list(hashes), facts, views, asdict(depth)])
 
 
 def page_html(
@@ -121,14 +121,14 @@ def _views_html(
         ]
         first = seen[0][1]
         height, width = first.photo.shape[:2]
-        told = "; ".join(
+        facts = "; ".join(
             f"{run.label + ': ' if len(runs) > 1 else ''}{view.psnr:.2f} dB, SSIM {_structure(view)}, "
             f"depth in {100 * view.with_depth:.0f} % of the pixels"
             for run, view, _ in seen
         )
         figures.append(
             f'<figure class="compare" data-view="{len(layers)}">'
-            f"<figcaption><b>{escape(name)}</b> {escape(told)}</figcaption>"
+            f"<figcaption><b>{escape(name)}</b> {escape(facts)}</figcaption>"
             f'<div class="stage" style="aspect-ratio:{width}/{height}"><img alt=""><img alt="">'
             '<div class="line"></div></div><input type="range" min="0" max="100" value="50" aria-label="border">'
             '<div class="layers"><select aria-label="left"></select><select aria-label="right"></select></div></figure>'

@@ -57,7 +57,7 @@ def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
 
 
 def look_at(
-    model: Model, held_out: Sequence[HeldOutPhoto], *, depth: DepthRequest, on_share: Callable[[float], None]
+    model: Model, held_out: Sequence[HeldOutPhoto], *, depth: DepthRequest, on_progress: Callable[[float], None]
 ) -> list[Seen]:
     """Render held-out photos of a run.
 
@@ -65,7 +65,7 @@ def look_at(
         model: the trained model.
         held_out: the photos, whose masks leave pixels to compare.
         depth: which depth to show.
-        on_share: called with how much of it is done, in [0, 1].
+        on_progress: called with how much of it is done, in [0, 1].
     """
     views = []
     for photo in held_out:
@@ -85,7 +85,7 @@ def look_at(
                 ssim=ssim(rendered, compared.photo, used=used),
             )
         )
-        on_share(len(views) / len(held_out))
+        on_progress(len(views) / len(held_out))
     return views
 
 

@@ -118,9 +118,9 @@ def scale_from_charuco(frames: Sequence[Frame], board: CharucoBoard) -> ScaleEst
 
 
 def _dictionary(name: str) -> cv2.aruco.Dictionary:
-    known = sorted(key for key in vars(cv2.aruco) if key.startswith("DICT_"))
-    if name not in known:
-        raise UserError(f"unknown dictionary of markers {name!r}", f"OpenCV has {', '.join(known)}")
+    dictionaries = sorted(key for key in vars(cv2.aruco) if key.startswith("DICT_"))
+    if name not in dictionaries:
+        raise UserError(f"unknown dictionary of markers {name!r}", f"OpenCV has {', '.join(dictionaries)}")
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 

@@ -91,9 +91,9 @@ def scale_from_distances(distances: Sequence[KnownDistance]) -> ScaleEstimate:
         raise ValueError("scale_from_distances needs at least one distance")
     logs = np.log([distance.metres / distance.units for distance in distances])
     tolerances = [distance.tolerance for distance in distances]
-    told = np.array([t / d.metres for t, d in zip(tolerances, distances, strict=True) if t is not None])
-    weighted = len(told) == len(distances)
-    weights = told**-2.0 if weighted else np.ones(len(distances))
+    relative = np.array([t / d.metres for t, d in zip(tolerances, distances, strict=True) if t is not None])
+    weighted = len(relative) == len(distances)
+    weights = relative**-2.0 if weighted else np.ones(len(distances))
     log_scale = float(weights @ logs / weights.sum())
     scale = math.exp(log_scale)
     free = len(distances) - 1

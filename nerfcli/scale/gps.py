@@ -95,12 +95,12 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
         )
     fit = align_robustly(x, y)
     keep = fit.follows
-    told = int(keep.sum()) >= _ENOUGH_TO_TELL
-    sigma = fit.sigma if told else float(np.fmax(fit.sigma, _TYPICAL_NOISE))
+    enough = int(keep.sum()) >= _ENOUGH_TO_TELL
+    sigma = fit.sigma if enough else float(np.fmax(fit.sigma, _TYPICAL_NOISE))
     spread = float(np.sqrt(np.mean(np.sum((y[keep] - y[keep].mean(axis=0)) ** 2, axis=1))))
     noise = float(np.sqrt(3)) * sigma
     if not spread >= _SPREAD_PER_NOISE * noise:
-        how = "estimated from the fit to the poses" if told else f"as assumed for {int(keep.sum())} photos"
+        how = "estimated from the fit to the poses" if enough else f"as assumed for {int(keep.sum())} photos"
         raise UserError(
             f"GPS is too inaccurate for a scale: the photos are spread over {spread:.2g} m, and the GPS error is "
             f"{noise:.2g} m ({how})",
@@ -123,7 +123,7 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
 
 
 def _spans_a_plane(metres: np.ndarray, sigma: float) -> bool:
-    """Whether points (N, 3) are as far off their best line as noise needs to be told from it."""
+    """Whether points (N, 3) are as far off their best line as noise requires."""
     off = np.linalg.svd(metres - metres.mean(axis=0), compute_uv=False)[1] if len(metres) >= 3 else 0.0
     return bool(off > _SPREAD_PER_NOISE * sigma)
 

@@ -67,9 +67,9 @@ def diagnose(
             common = ratios[good].mean(-1)
             deviation = _OF_DEVIATION * np.median(np.abs(common - np.median(common)))
             errors[photo] = _OF_MEDIAN * deviation / np.sqrt(good.sum())
-    known = np.isfinite(errors)
-    if known.sum() < 2:
+    finite = np.isfinite(errors)
+    if finite.sum() < 2:
         return Diagnostics(torch.zeros(count, 3), 0.0, far_share, sky_psnr)
-    gains[known] -= gains[known].mean(0)
-    excess = gains[known].mean(-1).var(ddof=1) - np.square(errors[known]).mean()
+    gains[finite] -= gains[finite].mean(0)
+    excess = gains[finite].mean(-1).var(ddof=1) - np.square(errors[finite]).mean()
     return Diagnostics(torch.tensor(gains, dtype=torch.float32), float(np.sqrt(max(0.0, excess))), far_share, sky_psnr)

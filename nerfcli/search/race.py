@@ -73,7 +73,7 @@ class Race:
     Args:
         trials, start: what they go on from.
         budget: what the trials may cost.
-        asked: the model that has to be bettered.
+        requested: the components of the model to better.
     """
 
     def __init__(self, trials: Trials, start: TrialStart, budget: SearchBudget, requested: Components):

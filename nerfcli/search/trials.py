@@ -104,7 +104,7 @@ class Trials:
         settings: of the training that the trials are for; seed and components are given with each trial.
         exif: (photos,) logarithms of the exposures that EXIF tells, relative to their mean.
         log_focal: see `Fitting`.
-        known: sets of pixels whose distance is known.
+        depths: sets of pixels whose distance is known.
         log_gains: (photos, 3) of exposures that learn, where matched pixels tell them.
         sky: see `Fitting`.
         colours, storage: see `PixelPool`.
@@ -121,7 +121,7 @@ class Trials:
         settings: TrainSettings,
         exif: np.ndarray,
         log_focal: float = 0.0,
-        known: Sequence[PointDepths] = (),
+        depths: Sequence[PointDepths] = (),
         log_gains: Tensor | None = None,
         sky: Tensor | None = None,
         colours: np.ndarray | None = None,
@@ -142,8 +142,8 @@ class Trials:
         self._settings = replace(settings, samples_per_step=settings.first_samples_per_step)
         self._exif = torch.from_numpy(exif).to(torch.float32)[:, None].expand(-1, 3)
         self._log_focal = log_focal
-        points = PointRays([depths.among(self._pool) for depths in known], self._pool)
-        self._points = points if points.known else None
+        points = PointRays([one.among(self._pool) for one in depths], self._pool)
+        self._points = points if points.sets else None
         self._room = storage
         self._log_gains, self._sky = log_gains, sky
 

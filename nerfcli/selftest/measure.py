@@ -129,8 +129,8 @@ def _beyond(row: Row) -> float:
     """How many times its bounds the textbook's errors are."""
     assert row.textbook is not None
     pairs = ((row.textbook.value, row.bounds.value), (row.textbook.gradient, row.bounds.gradient))
-    known = [(error, bound) for error, bound in pairs if error is not None and bound is not None]
-    return max(error / bound if bound else math.inf * error if error else 0.0 for error, bound in known)
+    bounded = [(error, bound) for error, bound in pairs if error is not None and bound is not None]
+    return max(error / bound if bound else math.inf * error if error else 0.0 for error, bound in bounded)
 
 
 def largest_error(values: Any, wanted: Any, *, tiny: float, scale: Any = None) -> float:

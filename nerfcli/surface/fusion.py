@@ -71,13 +71,13 @@ class Fused:
         return filled[0], filled[1]
 
 
-def fuse(views: Sequence[DepthView], grid: Grid, *, on_share: Callable[[float], None] = lambda share: None) -> Fused:
+def fuse(views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda share: None) -> Fused:
     """Fuse depth maps.
 
     Args:
         views: what the cameras see.
         grid: the voxels.
-        on_share: called with how much is done.
+        on_progress: called with how much is done.
     """
     index = _blocks_near(views, grid)
     corners = np.stack(np.nonzero(index >= 0), axis=-1)[np.argsort(index[index >= 0], kind="stable")] * SIDE
@@ -86,7 +86,7 @@ def fuse(views: Sequence[DepthView], grid: Grid, *, on_share: Callable[[float], 
     inside = torch.from_numpy(np.stack(np.unravel_index(np.arange(SIDE**3), (SIDE,) * 3), axis=-1).astype(np.float32))
     for count, view in enumerate(views):
         _add(view, grid, corners, inside=inside, distance=distance, weight=weight)
-        on_share((count + 1) / len(views))
+        on_progress((count + 1) / len(views))
     shape = (-1, SIDE, SIDE, SIDE)
     return Fused(grid, index, distance.numpy().reshape(shape), weight.numpy().reshape(shape))
 

@@ -35,19 +35,19 @@ class Mesh:
     colours: np.ndarray | None = None
 
 
-def surface_of(fused: Fused, *, seen: float = SEEN, on_share: Callable[[float], None] = lambda share: None) -> Mesh:
+def surface_of(fused: Fused, *, seen: float = SEEN, on_progress: Callable[[float], None] = lambda share: None) -> Mesh:
     """Return where the signed distance is 0, between voxels that were seen.
 
     Args:
         fused: the distances.
         seen: weight of a voxel at least; cubes with a corner below it hold no surface.
-        on_share: called with how much is done.
+        on_progress: called with how much is done.
     """
     keys, vertices, faces, count = [], [], [], 0
     bricks = np.argwhere(_any_block(fused.index)) * _BRICK
     for done, first in enumerate(bricks):
         found = _march(fused, first, seen)
-        on_share((done + 1) / len(bricks))
+        on_progress((done + 1) / len(bricks))
         if found is None:
             continue
         places, triangles = found

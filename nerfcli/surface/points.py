@@ -42,14 +42,14 @@ class Points:
 
 
 def agreed_points(
-    views: Sequence[DepthView], grid: Grid, *, on_share: Callable[[float], None] = lambda share: None
+    views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda share: None
 ) -> Points:
     """Return one point at most for each voxel of a grid: of all depths in it the narrowest, if two photos see it.
 
     Args:
         views: what the photos' cameras see.
         grid: whose voxels thin the points out.
-        on_share: called with how much is done.
+        on_progress: called with how much is done.
     """
     candidates = _thinned(views, grid)
     count = len(candidates.places)
@@ -59,7 +59,7 @@ def agreed_points(
         towards[:, index] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-30)
         facing = -(towards[:, index] * candidates.normals).sum(axis=1)
         seen[:, index] = _sees(view, candidates.places) & (facing > _FLATTEST)
-        on_share((index + 1) / len(views))
+        on_progress((index + 1) / len(views))
     photos = seen.sum(axis=1)
     kept = photos >= LEAST_PHOTOS
     return Points(

@@ -56,7 +56,7 @@ def depth_views(
     *,
     max_size: int,
     depth: DepthRequest = DEPTH,
-    on_share: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> list[DepthView]:
     """Render what the pinhole cameras of frames see.
 
@@ -65,7 +65,7 @@ def depth_views(
         frames: as the photos have them.
         max_size: longer side of the pictures at most, pixels.
         depth: which depth, along the optical axis.
-        on_share: called with how much is done.
+        on_progress: called with how much is done.
     """
     views = []
     for frame in frames:
@@ -76,7 +76,7 @@ def depth_views(
         assert seen.disagreement is not None
         normals = normals_of(seen.depth, small.camera)
         views.append(DepthView(small, seen.rgb, seen.opacity, seen.depth, seen.spread, seen.disagreement, normals))
-        on_share(len(views) / len(frames))
+        on_progress(len(views) / len(frames))
     return views
 
 

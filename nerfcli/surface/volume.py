@@ -23,7 +23,7 @@ def automatic_volume_voxel(box: tuple[float, ...]) -> float:
 
 
 def sample_volume(
-    model: Model, grid: Grid, *, on_share: Callable[[float], None] = lambda share: None
+    model: Model, grid: Grid, *, on_progress: Callable[[float], None] = lambda share: None
 ) -> dict[str, np.ndarray]:
     """Return the maps of a grid: density (X, Y, Z) float32 in 1 / scene unit, and colour (X, Y, Z, 3) uint8 sRGB.
 
@@ -42,7 +42,7 @@ def sample_volume(
         levels = np.zeros((len(points), 3), np.uint8)
         levels[seen] = np.rint(255 * point_colours(model, points[seen])[0])
         density[layers], colour[layers] = values.reshape(shape), levels.reshape(*shape, 3)
-        on_share(layers.stop / grid.shape[0])
+        on_progress(layers.stop / grid.shape[0])
     return {"density": density, "colour": colour}
 
 

@@ -101,8 +101,8 @@ class Checkpoints:
         learned = self._learned_gains()
         if learned is None:
             return {}
-        told = gains_between(*learned, self._places(self._scene.test_frames))
-        return {frame.name: tuple(row) for frame, row in zip(self._scene.test_frames, told.tolist(), strict=True)}
+        gains = gains_between(*learned, self._places(self._scene.test_frames))
+        return {frame.name: tuple(row) for frame, row in zip(self._scene.test_frames, gains.tolist(), strict=True)}
 
     def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
         """The training photos and those held out, with their cameras as they are now."""

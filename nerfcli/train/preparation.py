@@ -67,7 +67,7 @@ class Prepared:
         storage: where arrays of the size of the photos go.
         extent: of the field.
         pool: the training photos.
-        selection: how the scene decided on the components; None where it was not asked.
+        selection: how the scene decided on the components; None where it did not.
         log_exposure: the mean of the training photos by EXIF; None where exposures are not asked for, or not known.
         log_gains: (photos, 3) logarithms of their exposures relative to it, as the trials found them or as far as EXIF
             tells; else 0.
@@ -108,8 +108,8 @@ class Prepared:
         """Return the cells that may be filled; None for all."""
         if not self.settings.components.overlap:
             return None
-        known = reduce(PointDepths.joined, self.points.known) if self.points is not None else None
-        return covered_cells(self.pool, OCCUPANCY_SIDE, self.extent.contraction, known)
+        depths = reduce(PointDepths.joined, self.points.sets) if self.points is not None else None
+        return covered_cells(self.pool, OCCUPANCY_SIDE, self.extent.contraction, depths)
 
 
 def prepare(
@@ -156,7 +156,7 @@ def prepare(
         located = scene
         if lacks_depth(scene, settings, fills_frame=album.fills_frame):
             frames = [photo.frame for photo in album.photos]
-            located = replace(scene, points=triangulate(frames, shared.of_matches).known)
+            located = replace(scene, points=triangulate(frames, shared.of_matches).found)
             notify(f"the scene has no 3D points; estimating its extent from {len(located.points)} triangulated ones")
         extent = choose_extent(located, settings, fills_frame=album.fills_frame)
     pool = PixelPool(album.photos, extent.training_from_scene, device, colours=album.colours, storage=storage)
@@ -200,7 +200,7 @@ def prepare(
 def _points(scene: Scene, components: Components, evidence: Evidence, *, pool: PixelPool) -> PointRays:
     """Return the pixels at known distances that are drawn in each step."""
     points = PointRays(evidence.sets(components), pool)
-    if not points.known:
+    if not points.sets:
         raise UserError(
             f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
             "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
@@ -279,7 +279,7 @@ def _search(
         settings=settings,
         exif=_exif(scene),
         log_focal=log_focal,
-        known=evidence.sets(model) if facts.points else [],
+        depths=evidence.sets(model) if facts.points else [],
         log_gains=evidence.gains_or(torch.zeros(len(album.photos), 3)) if facts.exposure_spread else None,
         sky=None if facts.has_alpha else evidence.sky,
         colours=album.colours,

@@ -149,7 +149,7 @@ class Sentinel:
         path = self._run / f"failure-{fitting.step + 1}.safetensors"
         content = {
             "format": FAILURE_FORMAT,
-            "told": text,
+            "message": text,
             "tensor": bad.name,
             "share": fraction,
             "pixels": [list(pixel) for pixel in pixels],

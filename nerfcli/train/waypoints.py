@@ -50,7 +50,7 @@ def measure_waypoints(
 ) -> None:
     """Add the PSNR of a sample of held-out pixels to the waypoint entries of RUN/log.jsonl, and remove the waypoints.
 
-    Held-out photos that cannot be read are told, and nothing is measured: the training is done without them.
+    Held-out photos that cannot be read are reported, and nothing is measured: the training is done without them.
     """
     settings, device = prepared.settings, prepared.settings.device
     steps = _kept(run)

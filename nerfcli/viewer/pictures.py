@@ -48,7 +48,7 @@ def page_photos(
     *,
     room_bytes: int,
     threads: int = 1,
-    on_share: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> PagePhotos:
     """Return the photos of a run, as pinhole cameras took them, in the order of their names.
 
@@ -57,7 +57,7 @@ def page_photos(
         train, test: the frames.
         room_bytes: for the pictures in all, as text of the page.
         threads: to read photos with.
-        on_share: called with how much is done.
+        on_progress: called with how much is done.
     """
     frames = _sorted(train, test)
     there = [index for index, (frame, _) in enumerate(frames) if frame.image is not None and frame.image.exists()]
@@ -69,7 +69,7 @@ def page_photos(
         encoded = pool.map(lambda index: jpeg_bytes(_small_photo(frames[index][0], longest), quality=QUALITY), of)
         for count, (index, jpeg) in enumerate(zip(of, encoded, strict=True)):
             pictures[index] = data_uri(jpeg, "jpeg")
-            on_share((count + 1) / len(of))
+            on_progress((count + 1) / len(of))
     entries = [{**entry, "picture": pictures.get(index)} for index, entry in enumerate(_entries(model, frames))]
     return PagePhotos(entries, longest, len(frames) - len(there))
 

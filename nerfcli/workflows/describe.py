@@ -1,6 +1,6 @@
 """Describe a folder or file as plain values: scenes, runs, renders, depth, pictures, videos, training states.
 
-Imports stand where they are needed: what a depth file holds is told without torch.
+Imports stand where they are needed: a depth file is described without torch.
 """
 
 from pathlib import Path

@@ -91,4 +91,4 @@ def describe_tensors(path: Path) -> dict[str, Any]:
         return facts
     _, bad = replay(path)
     again = None if bad is None else f"{bad.name}: {bad.count} of {bad.total} numbers"
-    return {**facts, "failure": description["told"], "pixels": description["pixels"], "repeated_now": again}
+    return {**facts, "failure": description["message"], "pixels": description["pixels"], "repeated_now": again}

@@ -149,7 +149,7 @@ def _export_page(
         cameras.test,
         room_bytes=PAGE_BYTES - text_bytes - 150_000,
         threads=torch.get_num_threads(),
-        on_share=lambda fraction: progress(0.2 + 0.8 * fraction, "photos"),
+        on_progress=lambda fraction: progress(0.2 + 0.8 * fraction, "photos"),
     )
     if photos.missing:
         notify(f"{photos.missing} photos are missing: the page shows only their cameras")

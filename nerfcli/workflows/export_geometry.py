@@ -43,8 +43,8 @@ def export_mesh(
 ) -> None:
     """Write the surface as .ply, .glb or .obj."""
     views, grid = _seen(run, model, settings, progress)
-    fused = fuse(views, grid, on_share=_part(progress, _DEPTHS, 0.9, "fuses"))
-    mesh = without_small_pieces(surface_of(fused, on_share=_part(progress, 0.9, 0.95, "marches")))
+    fused = fuse(views, grid, on_progress=_part(progress, _DEPTHS, 0.9, "fuses"))
+    mesh = without_small_pieces(surface_of(fused, on_progress=_part(progress, 0.9, 0.95, "marches")))
     if not len(mesh.faces):
         raise UserError("no surface found in the box", "use another --box, a larger --voxel-size, or train longer")
     found = len(mesh.faces)
@@ -65,7 +65,7 @@ def export_points(
 ) -> None:
     """Write points of the surfaces as .ply."""
     views, grid = _seen(run, model, settings, progress)
-    points = agreed_points(views, grid, on_share=_part(progress, _DEPTHS, 1.0, "compares"))
+    points = agreed_points(views, grid, on_progress=_part(progress, _DEPTHS, 1.0, "compares"))
     if not len(points.places):
         raise UserError("no two photos see the same point in the box", "use another --box, or train longer")
     columns = dict(zip("xyz", points.places.T, strict=True))
@@ -86,7 +86,7 @@ def export_volume(
     """Write density and colour on a grid as .npz, the density alone as .nrrd."""
     box = settings.box or scene_box(model, run.cameras.train)
     grid = Grid.over(box, settings.voxel_size or automatic_volume_voxel(box))
-    maps = sample_volume(model, grid, on_share=_part(progress, 0.05, 1.0, "evaluating the field"))
+    maps = sample_volume(model, grid, on_progress=_part(progress, 0.05, 1.0, "evaluating the field"))
     per_unit = {"metre": "1/m"}.get(model.unit, "1 / unit")
     described = _description(run, model, "volume", grid) | {
         "density": f"share of light that ends per length, {per_unit}; 0 where rays pass over cells",
@@ -101,7 +101,7 @@ def export_tsdf(
 ) -> None:
     """Write the signed distances that the mesh is made from: with their weights as .npz, alone as .nrrd."""
     views, grid = _seen(run, model, settings, progress)
-    fused = fuse(views, grid, on_share=_part(progress, _DEPTHS, 1.0, "fuses"))
+    fused = fuse(views, grid, on_progress=_part(progress, _DEPTHS, 1.0, "fuses"))
     distance, weight = fused.dense((0, 0, 0), grid.shape)
     described = _description(run, model, "tsdf", grid) | {
         "distance": "to the surface, positive outside, in the unit; NaN where too few photos see",
@@ -147,7 +147,7 @@ def _seen(
     chosen = spread_frames(run.cameras.train, MOST_VIEWS) if frames is None else frames
     box = settings.box or scene_box(model, run.cameras.train)
     views = depth_views(
-        model, chosen, max_size=settings.max_size, on_share=_part(progress, 0.02, _DEPTHS, "renders depths")
+        model, chosen, max_size=settings.max_size, on_progress=_part(progress, 0.02, _DEPTHS, "renders depths")
     )
     return views, Grid.over(box, settings.voxel_size or automatic_voxel(views, box))
 

@@ -71,9 +71,9 @@ def report_runs(
     names = common_names(facts, views)
     looks, meanings = [], []
     progress(0.0, "")
-    for index, (run, told) in enumerate(zip(opened, facts, strict=True)):
+    for index, (run, described) in enumerate(zip(opened, facts, strict=True)):
 
-        def on_share(fraction: float, index: int = index, label: str = told.label) -> None:
+        def on_progress(fraction: float, index: int = index, label: str = described.label) -> None:
             progress((index + fraction) / len(runs), label)
 
         model = run.model(device_name(device))
@@ -85,7 +85,7 @@ def report_runs(
         frames = [frame for frame in run.cameras.test if frame.name in names]
         held_out = held_out_photos_of(run.config, frames, model, threads=thread_count(threads))
         compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
-        looks.append(look_at(model, compared, depth=depth, on_share=on_share))
+        looks.append(look_at(model, compared, depth=depth, on_progress=on_progress))
         meanings.append(depth_meta(model, depth))
     write_page(page_html(facts, looks, depth=meanings[0], origin=origin), target)
     return target

@@ -140,7 +140,7 @@ class RunShow:
             server.announce()
 
     def close(self) -> None:
-        """Take back what was asked of a training."""
+        """Cancel a request to a training."""
         with self._lock:
             end_request(self._path)
 

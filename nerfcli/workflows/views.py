@@ -147,7 +147,7 @@ def refuse_z_all_around(frames: Sequence[Frame], *, notify: Notify) -> None:
     """z is the distance along the optical axis, and half of a picture of all directions lies behind the camera.
 
     Raises:
-        UserError: a picture is equirectangular. Of lenses that see a little behind, it is only told.
+        UserError: a picture is equirectangular. Lenses that see a little behind are only reported.
     """
     if any(frame.camera.is_spherical for frame in frames):
         raise UserError(

@@ -166,9 +166,9 @@ def _points(
         owners += [index] * int(count)
     table = np.array(views, dtype=np.float64).reshape(-1, 4)
     table[:, 1] = owners
-    known = (table[:, 0] >= 0) & (table[:, 0] < num_cameras) & (table[:, 0] == np.floor(table[:, 0]))
-    if not known.all():
-        where = _line(lines, 3 * owners[int(np.argmin(known))] + 2, 0, path)[2]
+    valid = (table[:, 0] >= 0) & (table[:, 0] < num_cameras) & (table[:, 0] == np.floor(table[:, 0]))
+    if not valid.all():
+        where = _line(lines, 3 * owners[int(np.argmin(valid))] + 2, 0, path)[2]
         raise malformed(where, "a view refers to a camera that does not exist", f"expected 0 to {num_cameras - 1}")
     return points, np.clip(np.rint(colours), 0, 255).astype(np.uint8), table
 

@@ -150,7 +150,7 @@ def _file(model_dir: Path, name: str) -> Path:
 
 
 def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
-    """What `reader` makes of a file's bytes, with damage told as one error that names the file."""
+    """What `reader` makes of a file's bytes, with damage reported as one error that names the file."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -194,14 +194,14 @@ def _percentile_bounds(capture: Capture) -> np.ndarray:
         depths = depths[depths > 0]
         if len(depths):
             bounds[index] = np.percentile(depths, [_NEAR_PERCENT, _FAR_PERCENT])
-    known = bounds[:, 0] < bounds[:, 1]  # False at NaN
-    if not known.any():
+    valid = bounds[:, 0] < bounds[:, 1]  # False at NaN
+    if not valid.any():
         raise UserError(
             f"poses_bounds.npy needs depth bounds, but none of the {len(capture.frames)} views sees two of the "
             f"{len(capture.points)} points",
             "convert from a format with points or depth bounds, such as a COLMAP model",
         )
-    bounds[~known] = bounds[known, 0].min(), bounds[known, 1].max()
+    bounds[~valid] = bounds[valid, 0].min(), bounds[valid, 1].max()
     return bounds
 
 

@@ -154,8 +154,8 @@ def _camera(sensor: Element, where: str) -> Camera:
     if kind == _SPHERICAL:
         return lenses.spherical_camera(size, where)
     if kind != _FRAME and kind not in _FISHEYE:
-        known = ", ".join((_FRAME, *_FISHEYE, _SPHERICAL))
-        raise malformed(where, f"camera type {shown(kind)} is not supported", f"expected one of {known}")
+        supported = ", ".join((_FRAME, *_FISHEYE, _SPHERICAL))
+        raise malformed(where, f"camera type {shown(kind)} is not supported", f"expected one of {supported}")
     if calibration.find("f") is None:
         raise malformed(where, "has no focal length f", "align the photos before exporting the cameras")
     focal = _number(calibration, "f", where)

@@ -136,8 +136,8 @@ def _camera(value: Any, where: str) -> Camera:
     if kind in _SPHERICAL:
         return lenses.spherical_camera(size, where)
     if kind not in _BROWN + _FISHEYE:
-        known = ", ".join(_BROWN + _FISHEYE + _SPHERICAL)
-        raise malformed(where, f"projection_type {shown(kind)} is not supported", f"expected one of {known}")
+        supported = ", ".join(_BROWN + _FISHEYE + _SPHERICAL)
+        raise malformed(where, f"projection_type {shown(kind)} is not supported", f"expected one of {supported}")
     term = {key: number(record, key, where, default=0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")}
     scale = max(size)
     if kind in ("perspective", "fisheye"):

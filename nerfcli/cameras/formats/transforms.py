@@ -259,12 +259,12 @@ def _sizes(
             stored_size(image, measure) if size is None and image.is_file() else size
             for size, image in zip(sizes, images, strict=True)
         ]
-    known = {size for size in sizes if size is not None}
+    given = {size for size in sizes if size is not None}
     result = []
     for size, where, image in zip(sizes, wheres, images, strict=True):
-        if size is None and len(known) != 1:
+        if size is None and len(given) != 1:
             raise malformed(where, f"w and h are missing, and {image} does not exist", "add the image, or w and h")
-        result.append(next(iter(known)) if size is None else size)
+        result.append(next(iter(given)) if size is None else size)
     return result
 
 

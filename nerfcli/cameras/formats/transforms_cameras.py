@@ -76,8 +76,8 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) 
             raise malformed(where, "a fisheye camera with p1 or p2", "expected k1 to k4 only (OpenCV's fisheye)")
         return stated_camera("OPENCV_FISHEYE", width, height, (*head, k1, k2, k3, k4), where=where)
     if model not in _PERSPECTIVE_MODELS:
-        known = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
-        raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {known}")
+        supported = ", ".join(str(name) for name in (*_PERSPECTIVE_MODELS[1:], *_FISHEYE_MODELS, "EQUIRECTANGULAR"))
+        raise malformed(where, f"camera_model {model!r:.80} is not supported", f"expected one of {supported}")
     if k4:
         raise malformed(where, f"k4 is {k4} without a fisheye camera", "k1, k2, k3, p1, p2 are the perspective terms")
     if k3:

@@ -53,8 +53,8 @@ _MODELS = {
 class Step:
     """A decision about some parameters.
 
-    distance: how far from nothing they are, squared and in units of their uncertainty, relative to what is asked: taken
-    from 1 on; None for the model that the others are added to.
+    distance: how far from nothing they are, squared and in units of their uncertainty, relative to what is required:
+    taken from 1 on; None for the model that the others are added to.
     """
 
     model: str
