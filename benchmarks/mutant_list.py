@@ -636,4 +636,37 @@ GROUPS: tuple[Group, ...] = (
             Mutant("np.cross(forward, right), forward]", "np.cross(right, forward), forward]"),
         ),
     ),
+    Group(
+        "render/visibility.py",
+        ("tests/test_visibility.py",),
+        "",
+        (),
+        (
+            Mutant("np.floor(pixels[rows] + 0.5)", "np.floor(pixels[rows] + 1.5)"),
+            Mutant("(0, 1, stride, stride + 1)", "(0,)"),
+            Mutant("top * stride + left", "top * camera.width + left"),
+            Mutant("<= SAME * distance", "<= 0.1 * distance"),
+            Mutant("np.abs(bordered[corner + offset] - distance)", "(distance - bordered[corner + offset])"),
+            Mutant("valid & (pixels >= 0).all(1)", "valid"),
+            Mutant("(pixels <= (camera.width, camera.height)).all(1)", "True"),
+            Mutant("cosines < np.cos", "cosines < 0 * np.cos"),
+            Mutant("seen.sum(axis=1) > 1", "seen.sum(axis=1) > 2"),
+            Mutant(
+                "np.where(here, np.arange(len(used)), here.argmax(axis=1)[:, None])", "np.arange(len(used)) + 0 * here"
+            ),
+            Mutant(".amin((1, 2))", ".amin(1)[:, 0]"),
+            Mutant("np.isfinite(points).all(axis=1)", "np.isfinite(points).any(axis=1)"),
+        ),
+    ),
+    Group(
+        "export/visibility.py",
+        ("tests/test_visibility.py",),
+        "render",
+        (),
+        (
+            Mutant("(picture.coverage >= request.min_views) & ", ""),
+            Mutant(" & (picture.parallax >= request.min_parallax_deg)", ""),
+            Mutant("had & ~seen", "~seen"),
+        ),
+    ),
 )

@@ -110,19 +110,19 @@ def test_an_exr_has_the_channels_that_compositing_programs_look_for(tmp_path):
     generator = np.random.default_rng(0)
     depth, opacity, spread = (generator.random((4, 5), np.float32) for _ in range(3))
     rgb = generator.random((4, 5, 3), np.float32)
-    maps = {"depth": depth, "opacity": opacity, "spread": spread, "disagreement": spread * 2}
+    maps = {"depth": depth, "opacity": opacity, "spread": spread, "disagreement": spread * 2, "coverage": spread * 3}
     write_exr(tmp_path / "a.exr", {"rgb": rgb, **maps}, META)
     write_exr(tmp_path / "b.exr", maps, META)
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
         assert file.header()["comments"].startswith("conditional depth along the ray, in arbitrary units")
-    assert set(channels) == {"R", "G", "B", "Z", "opacity.V", "spread.V", "disagreement.V"}
+    assert set(channels) == {"R", "G", "B", "Z", "opacity.V", "spread.V", "disagreement.V", "coverage.V"}
     np.testing.assert_array_equal(channels["opacity.V"], opacity)
     np.testing.assert_array_equal(channels["disagreement.V"], spread * 2)
     np.testing.assert_array_equal(channels["G"], linear_light(rgb)[..., 1])
     with OpenEXR.File(str(tmp_path / "b.exr"), separate_channels=True) as file:
         channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    assert set(channels) == {"Y", "Z", "opacity.V", "spread.V", "disagreement.V"}
+    assert set(channels) == {"Y", "Z", "opacity.V", "spread.V", "disagreement.V", "coverage.V"}
     np.testing.assert_array_equal(channels["Y"], depth)
 
 
@@ -218,7 +218,7 @@ def test_what_does_not_fit_into_levels_is_refused(tmp_path):
 def test_meta_refuses_an_unknown_axis_and_quantity():
     with pytest.raises(ValueError, match="axis must be one of ray, z, got y"):
         DepthMeta("median", "y", "metre", 0.5)
-    with pytest.raises(ValueError, match="quantity must be one of depth, spread, disagreement, got speed"):
+    with pytest.raises(ValueError, match=r"quantity must be one of depth, .*, parallax, got speed"):
         replace(META, quantity="speed")
 
 

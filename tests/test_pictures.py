@@ -22,7 +22,7 @@ from nerfcli.render.rays import places_in_pixel
 from nerfcli.runs.files import FIELD
 
 BLACK = (0.0, 0.0, 0.0)
-MAPS = ("rgb", "opacity", "depth", "spread", "disagreement", "truncation_error", "valid")
+MAPS = ("rgb", "opacity", "depth", "spread", "disagreement", "median", "truncation_error", "valid")
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,8 @@ from typing import Any
 # Of the table of costs.
 HEADINGS = ("field", "weights", "optimiser", "step keeps", "ops/sample", "B/sample", "ops/picture", "B/picture")
 _UNITS = ("", "k", "M", "G", "T", "P")
+# Of maps that are no lengths.
+_UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees"}
 # Letters in a line; what is longer goes on in the next one, further in.
 WIDTH = 110
 
@@ -61,7 +63,7 @@ def _maps(facts: dict[str, Any]) -> Iterator[str]:
     meaning = facts.get("meaning") or {}
     unit = {"metre": " m", "arbitrary": " units"}.get(meaning.get("unit", ""), "")
     for name, of_map in facts.get("maps", {}).items():
-        suffix = unit if name in ("depth", "spread", "disagreement") else ""
+        suffix = unit if name in ("depth", "spread", "disagreement") else _UNITS_OF_MAPS.get(name, "")
         shape = "" if len(of_map["shape"]) == 2 else f" {'x'.join(map(str, of_map['shape']))}"
         line = f"{name}: {of_map['dtype']}{shape}"
         if "valid_share" in of_map:
@@ -72,6 +74,8 @@ def _maps(facts: dict[str, Any]) -> Iterator[str]:
 
 
 def _meaning(meaning: dict[str, Any]) -> Iterator[str]:
+    from nerfcli.media.depth_pictures import limits_in_words
+
     if not meaning:
         return
     invalid = {"nan": "NaN", "0": "0"}.get(meaning.get("invalid", "nan"), "marked")
@@ -81,7 +85,11 @@ def _meaning(meaning: dict[str, Any]) -> Iterator[str]:
         yield f"light that passes counts at the background distance, {meaning['background_distance']:.6g}"
     if meaning.get("units_per_level") is not None:
         yield f"value = level x {meaning['units_per_level']:g}"
-    if meaning["unit"] != "metre":
+    if limits := limits_in_words(meaning.get("min_views", 0), meaning.get("min_parallax_deg", 0.0)):
+        yield f"pixels with {limits} have no value ({invalid})"
+    if meaning.get("quantity") in _UNITS_OF_MAPS:
+        pass  # not a length
+    elif meaning["unit"] != "metre":
         yield "the scene has no metric scale: lengths are in scene units, not metres"
     elif not meaning.get("unit_source"):
         yield "the source of the metric scale is not recorded"

@@ -57,7 +57,8 @@ def render(
     outputs: Annotated[
         str | None,
         typer.Option(
-            help="Any of rgb,depth,opacity,spread,disagreement; for scans projection,transmission,residual.  "
+            help="Any of rgb,depth,opacity,spread,disagreement,coverage,parallax; for scans "
+            "projection,transmission,residual.  "
             "[default: rgb,depth,opacity; projection]"
         ),
     ] = None,
@@ -76,6 +77,17 @@ def render(
     min_opacity: Annotated[
         float, typer.Option(help="Pixels with less opacity have no depth (NaN).", min=0, max=1)
     ] = 0.5,
+    min_views: Annotated[
+        int, typer.Option(help="Pixels whose surface fewer training photos see have no depth (NaN).", min=0)
+    ] = 0,
+    min_parallax: Annotated[
+        float,
+        typer.Option(
+            help="Pixels whose surface no two training photos see at this angle, in degrees, have no depth (NaN).",
+            min=0,
+            max=180,
+        ),
+    ] = 0.0,
     background_distance: Annotated[
         float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
     ] = None,
@@ -170,7 +182,8 @@ def render(
       median         distance at which half of all light is absorbed       (NaN if less than half is)
       quantile:0.05  distance at which 5 % of all light is absorbed        (NaN if less is)
     spread is the standard deviation of that distance, disagreement |median - conditional|: both are large where no
-    single depth is right (edges, glass, fog). Every file describes its values: nerfcli info FILE.
+    single depth is right (edges, glass, fog). coverage is the number of training photos that see the surface (its
+    median depth), parallax the largest angle between two of them. Every file describes its values: nerfcli info FILE.
     \b
     Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos and previews of
     views that were already rendered are made without rendering again (add --overwrite to replace existing ones).
@@ -180,6 +193,7 @@ def render(
     \b
     Examples:
       nerfcli render photos-scene-run --cameras test --outputs rgb,depth --depth median --depth-axis ray
+      nerfcli render photos-scene-run --outputs depth,coverage,parallax --min-views 2 --min-parallax 2
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
       nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-layout side-by-side --video-format gif
       nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8 --jobs 4
@@ -229,11 +243,17 @@ def render(
     finite(background_distance, "--background-distance")
     finite(min_opacity, "--min-opacity")
     finite(step, "--step")
+    finite(min_parallax, "--min-parallax")
+    if (min_views or min_parallax) and "depth" not in chosen:
+        hint = "--min-views" if min_views else "--min-parallax"
+        raise typer.BadParameter("it removes depth; add depth to --outputs", param_hint=hint)
     request = DepthRequest(
         convention=depth,
         axis=depth_axis or ("ray" if lens == "equirectangular" else "z"),
         min_opacity=min_opacity,
         background_distance=background_distance,
+        min_views=min_views,
+        min_parallax_deg=min_parallax,
     )
     one_of(colour_map, COLOUR_MAPS, "--colour-map")
     if max_size is not None and (width is not None or height is not None):

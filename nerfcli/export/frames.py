@@ -13,6 +13,7 @@ from nerfcli.export.presentation import write_previews, write_videos
 from nerfcli.export.processes import render_in_processes
 from nerfcli.export.settings import depth_meta
 from nerfcli.export.unfinished import Unfinished, take_over, unfinished_of
+from nerfcli.export.visibility import removed_in_words
 from nerfcli.media.levels import scale_in_words
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.model import Model
@@ -103,6 +104,9 @@ def export_frames(
             if written.pixels_beyond:
                 notify(f"{written.pixels_beyond} pixels are too distant for 16-bit files and have no depth there")
         write_videos(unfinished.folder, order, meta, ranges=ranges, notify=notify)
+        facts = {name: unfinished.facts(name) for name in order.names}
+        if words := removed_in_words(order.settings.depth, list(facts.values())):
+            notify(words)
         description = {
             **order.of_pictures(),
             **order.settings.of_presentation(),
@@ -110,7 +114,7 @@ def export_frames(
             **levels,
             "ranges": ranges,
             "error_meaning": ERROR_IN_WORDS,
-            "facts": {name: unfinished.facts(name) for name in order.names},
+            "facts": facts,
             "files": {name: unfinished.files(name) for name in order.names},
         }
         write_json(unfinished.folder / DESCRIPTION, description)

@@ -8,6 +8,7 @@ from nerfcli.export.order import Order
 from nerfcli.export.picture_files import write_picture
 from nerfcli.export.settings import depth_meta
 from nerfcli.export.unfinished import Unfinished
+from nerfcli.export.visibility import with_visibility, without_unseen_depth
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.accuracy import measure_error, truncation_bounds
 from nerfcli.render.model import Model
@@ -42,10 +43,14 @@ def render_frame(
     )
     if settings.rgba:
         picture = replace(picture, rgb=straight_rgba(picture))
+    removed = {}
+    if settings.needs_visibility:
+        picture = with_visibility(picture, frame, axis=settings.depth.axis, photo_depths=order.photo_depths)
+        picture, removed = without_unseen_depth(picture, settings.depth)
     tolerance = settings.quality.tolerance
     measured = measure_error(model, frame, depth=wanted, tolerance=tolerance)
     facts = truncation_bounds(picture, tolerance) | measured.to_json()
     bounds = {**facts, "meaning": ERROR_IN_WORDS}
     meta = frame_meta(depth_meta(model, settings.depth), frame, provenance=order.provenance, error_bounds=bounds)
     files = write_picture(picture, unfinished.folder, name, settings=settings, meta=meta, background=model.background)
-    unfinished.note(name, files, facts=facts)
+    unfinished.note(name, files, facts=facts | removed)

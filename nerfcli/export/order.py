@@ -14,6 +14,7 @@ from nerfcli.errors import UserError
 from nerfcli.export.file_names import describe_frames, file_names
 from nerfcli.export.settings import ExportSettings
 from nerfcli.media.video import FORMATS, check_encoders
+from nerfcli.render.visibility import DepthMap
 
 DESCRIPTION = "render.json"
 _IN_WORDS = {"colour_map": "colours", "colour_range": "range of colours", "levels": "16-bit levels", "video": "videos"}
@@ -27,11 +28,14 @@ class Order:
         frames: cameras and poses in the scene's frame.
         settings: what to write of them.
         provenance: what else decides over the pictures, the run and the hash of its field first of all; plain values.
+        photo_depths: what each training photo sees of the surface, where `ExportSettings.needs_visibility`; the
+            provenance says which photos.
     """
 
     frames: tuple[Frame, ...]
     settings: ExportSettings
     provenance: dict[str, Any]
+    photo_depths: tuple[DepthMap, ...] = ()
 
     @cached_property
     def names(self) -> list[str]:
@@ -94,8 +98,8 @@ class Order:
         del wanted["nerfcli"]
         depth, there = wanted["settings"]["depth"], made.get("settings", {}).get("depth")
         if self.settings.measured and depth != there and isinstance(there, dict):
-            names = [name for name, value in depth.items() if there.get(name) != value]
-            differing = [f"{name} {there.get(name)}, not {depth[name]}" for name in names]
+            names = [name for name in {**depth, **there} if there.get(name) != depth.get(name)]
+            differing = [f"{name} {there.get(name)}, not {depth.get(name)}" for name in names]
             raise UserError(
                 f"{folder} contains depth with another definition: {', '.join(differing)}",
                 "choose another folder with -o, or add --overwrite to replace the whole folder",

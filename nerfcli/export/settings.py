@@ -8,9 +8,9 @@ from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Quality
 
-OUTPUTS = ("rgb", "depth", "opacity", "spread", "disagreement")
+OUTPUTS = ("rgb", "depth", "opacity", "spread", "disagreement", "coverage", "parallax")
 # Those that are measured: floats on disk, and pictures in colours to look at.
-MEASURED = ("depth", "spread", "disagreement")
+MEASURED = ("depth", "spread", "disagreement", "coverage", "parallax")
 FLOAT_FORMATS = ("tiff", "exr", "npy", "npz")
 FORMATS = (*FLOAT_FORMATS, "png16")
 # A file of these holds all that was asked for of a view, in a folder under the name of the format.
@@ -73,6 +73,12 @@ class ExportSettings:
         return tuple(output for output in MEASURED if output in self.outputs)
 
     @property
+    def needs_visibility(self) -> bool:
+        """Whether it must be known which photos see the surface."""
+        wanted = {"coverage", "parallax"} & set(self.outputs)
+        return bool(wanted or self.depth.min_views or self.depth.min_parallax_deg)
+
+    @property
     def float_formats(self) -> tuple[str, ...]:
         """The formats of floats: at least one, because previews and levels are made from them."""
         return tuple(name for name in FLOAT_FORMATS if name in self.formats) or FLOAT_FORMATS[:1]
@@ -95,6 +101,9 @@ class ExportSettings:
         settings = asdict(self)
         for name in ("colour_map", "colour_range", "video", "depth_scale"):
             del settings[name]
+        for name in ("min_views", "min_parallax_deg"):
+            if not settings["depth"][name]:  # as in folders that were made before there was a choice
+                del settings["depth"][name]
         return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
 
     def of_presentation(self) -> dict[str, Any]:
@@ -114,6 +123,8 @@ def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
         unit_source=model.unit_source,
         opacity_floor=effective_floor(request),
         background_distance=request.background_distance if request.convention == "background" else None,
+        min_views=request.min_views,
+        min_parallax_deg=request.min_parallax_deg,
     )
 
 
@@ -124,4 +135,4 @@ def floor_of(request: DepthRequest, output: str) -> float:
             return effective_floor(request)
         case "spread":
             return request.min_opacity
-    return max(request.min_opacity, MEDIAN)  # the disagreement: of the median, too, there must be one
+    return max(request.min_opacity, MEDIAN)  # all others need the median, too

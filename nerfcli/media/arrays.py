@@ -38,7 +38,7 @@ def write_npz(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
 
     Args:
         path: the folder is made if need be.
-        maps: by name: depth, spread, disagreement, opacity (H, W) and rgb (H, W, 3 or 4), float32.
+        maps: by name: those of `exr.CHANNELS` (H, W) and rgb (H, W, 3 or 4), float32.
         meta: of the depth; of another map where there is no depth among them.
 
     Raises:

@@ -20,9 +20,16 @@ FORMAT = "nerfcli depth 2"
 # The word under which a description stands in PNG text chunks, OpenEXR attributes and NPZ archives.
 KEY = "nerfcli"
 AXES = {"ray": "along the ray", "z": "along the optical axis (z)"}
-QUANTITIES = ("depth", "spread", "disagreement")
+QUANTITIES = ("depth", "spread", "disagreement", "coverage", "parallax")
 # The convention of what is no depth itself.
-CONVENTION_OF = {"spread": "standard-deviation", "disagreement": "median-conditional"}
+CONVENTION_OF = {
+    "spread": "standard-deviation",
+    "disagreement": "median-conditional",
+    "coverage": "photos-that-see",
+    "parallax": "largest-angle",
+}
+# The unit of what is no length.
+UNIT_OF = {"coverage": "photos", "parallax": "degrees"}
 
 _IN_WORDS = {
     "conditional": "the mean distance at which light is absorbed, given that it is",
@@ -32,10 +39,12 @@ _IN_WORDS = {
     "median": "the distance at which half of all light is absorbed",
     "standard-deviation": "the standard deviation of the distance at which light is absorbed",
     "median-conditional": "|median - conditional|, large where no single depth is right (edges, glass, fog)",
+    "photos-that-see": "the number of training photos that see the surface, by the field's own depths",
+    "largest-angle": "the largest angle between the rays of two training photos that see the surface; 0 below two",
 }
 _WHAT_MUST_AGREE = (
     *("quantity", "convention", "axis", "unit", "opacity_floor", "background_distance"),
-    *("invalid", "units_per_level"),
+    *("invalid", "units_per_level", "min_views", "min_parallax_deg"),
 )
 
 
@@ -47,10 +56,11 @@ class DepthMeta:
         convention: which depth of the ray's distribution: "conditional", "median", "quantile:0.05", ...; for other
             quantities the entry of `CONVENTION_OF`.
         axis: "ray", distance from the camera's centre along the ray; or "z", along the optical axis.
-        unit: "metre", or "arbitrary" where the scale of the scene is not known.
+        unit: "metre", or "arbitrary" where the scale of the scene is not known; of other quantities see `UNIT_OF`.
         opacity_floor: pixels whose opacity is below it have no value.
         invalid: the value of pixels without one: "nan", or "0" in files of whole numbers.
         background_distance: what a ray that hits nothing counts as, where the convention needs that.
+        min_views, min_parallax_deg: coverage and parallax below which a pixel has no depth.
         quantity: one of `QUANTITIES`.
         unit_source: how the unit is known ("gps", "distances", ...); None where nobody wrote it down.
         units_per_level: of files of whole numbers: value = level * units_per_level.
@@ -70,6 +80,8 @@ class DepthMeta:
     opacity_floor: float
     invalid: str = "nan"
     background_distance: float | None = None
+    min_views: int = 0
+    min_parallax_deg: float = 0.0
     quantity: str = "depth"
     unit_source: str | None = None
     units_per_level: float | None = None
@@ -89,13 +101,27 @@ class DepthMeta:
         if quantity == self.quantity:
             return self
         floor = self.opacity_floor if opacity_floor is None else opacity_floor
-        convention = CONVENTION_OF[quantity]
-        return replace(self, quantity=quantity, convention=convention, opacity_floor=floor, background_distance=None)
+        return replace(
+            self,
+            quantity=quantity,
+            convention=CONVENTION_OF[quantity],
+            unit=UNIT_OF.get(quantity, self.unit),
+            unit_source=None if quantity in UNIT_OF else self.unit_source,
+            opacity_floor=floor,
+            background_distance=None,
+            min_views=0,
+            min_parallax_deg=0.0,
+        )
 
     @property
     def title(self) -> str:
         """A few words for legends: "conditional depth"."""
-        named = {"spread": "spread of depth", "disagreement": "|median - conditional| depth"}
+        named = {
+            "spread": "spread of depth",
+            "disagreement": "|median - conditional| depth",
+            "coverage": "coverage: training photos that see the surface",
+            "parallax": "parallax: largest angle between two of them",
+        }
         return named.get(self.quantity, f"{self.convention} depth")
 
     def to_json(self) -> dict[str, Any]:
@@ -123,6 +149,8 @@ class DepthMeta:
 
     def in_words(self) -> str:
         """One line for people: "conditional depth along the optical axis (z), in metres (gps): the mean ..."."""
+        if self.quantity in UNIT_OF:
+            return f"{self.quantity}, in {self.unit}: {_IN_WORDS[self.convention]}"
         unit = "metres" if self.unit == "metre" else f"{self.unit} units"
         source = f" (from: {self.unit_source})" if self.unit_source else ""
         convention, _, fraction = self.convention.partition(":")
@@ -130,6 +158,12 @@ class DepthMeta:
         if convention == "quantile":
             meaning = f"the distance at which {fraction} of all light is absorbed"
         return f"{self.title} {AXES[self.axis]}, in {unit}{source}" + (f": {meaning}" if meaning else "")
+
+
+def limits_in_words(min_views: int, min_parallax_deg: float) -> str:
+    """Return what makes a pixel lose its depth: "a coverage below 2 photos or ..."; empty without a limit."""
+    views = [f"a coverage below {min_views} photos"] if min_views else []
+    return " or ".join([*views, *([f"a parallax below {min_parallax_deg:g} degrees"] if min_parallax_deg else [])])
 
 
 def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:

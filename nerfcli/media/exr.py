@@ -7,6 +7,8 @@
     opacity.V         1 - transmittance
     spread.V          standard deviation of the distance at which light ends
     disagreement.V    |median - conditional|
+    coverage.V        number of training photos that see the surface
+    parallax.V        largest angle between the rays of two of them, degrees
 
 Pixels without a value are NaN. The header carries the description as JSON in the attribute "nerfcli", and a sentence
 for people in "comments". Source: https://openexr.com/en/latest/TechnicalIntroduction.html, "Channel Names".
@@ -29,7 +31,10 @@ from nerfcli.errors import UserError
 from nerfcli.media.depth_pictures import KEY, DepthMeta, check_map
 from nerfcli.media.srgb import linear_light
 
-CHANNELS = {"depth": "Z", "opacity": "opacity.V", "spread": "spread.V", "disagreement": "disagreement.V"}
+CHANNELS = {
+    "depth": "Z",
+    **{name: f"{name}.V" for name in ("opacity", "spread", "disagreement", "coverage", "parallax")},
+}
 
 
 def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> None:
@@ -37,8 +42,8 @@ def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
 
     Args:
         path: the folder is made if need be.
-        maps: by name: depth, spread, disagreement, opacity (H, W), every bit of which comes back, and rgb (H, W, 3 or
-            4), sRGB in [0, 1] with straight alpha; float32.
+        maps: by name: those of `CHANNELS` (H, W), every bit of which comes back, and rgb (H, W, 3 or 4), sRGB in [0, 1]
+            with straight alpha; float32.
         meta: of the depth; of another map where there is no depth among them.
 
     Raises:

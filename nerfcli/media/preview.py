@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from nerfcli.media.colour_maps import levels_of
-from nerfcli.media.depth_pictures import AXES, DepthMeta
+from nerfcli.media.depth_pictures import AXES, UNIT_OF, DepthMeta
 
 _HATCH = np.array([[112, 112, 112], [160, 160, 160]], dtype=np.uint8)
 _INK, _PAPER = (20, 20, 20), (255, 255, 255)
@@ -77,6 +77,8 @@ def _legend(meta: DepthMeta, *, lo: float, hi: float, colour_map: str, width: in
     font = ImageFont.load_default(size)
     unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
     lines = [f"{meta.title} in {unit}", f"{AXES[meta.axis]}; hatched: no value"]
+    if meta.quantity in UNIT_OF:
+        lines = [meta.title, f"in {unit}; hatched: no surface"]
     numbers = _tick_labels(lo, hi, suffix=" m" if meta.unit == "metre" else "")
     margin, line = size, round(1.4 * size)
     numbers_width = len(numbers) * max(font.getlength(f"  {text}") for text in numbers)

@@ -39,6 +39,8 @@ class DepthRequest:
         min_opacity: rays that are less opaque have no depth, spread or disagreement; see `effective_floor`.
         background_distance: distance along the ray that the background convention counts for what passes, in the
             scene's unit; needed by that convention only.
+        min_views, min_parallax_deg: coverage and parallax of the median point below which an export removes the depth;
+            see `visibility`.
 
     Raises:
         ValueError: no such convention or axis.
@@ -48,6 +50,8 @@ class DepthRequest:
     axis: str
     min_opacity: float = 0.5
     background_distance: float | None = None
+    min_views: int = 0
+    min_parallax_deg: float = 0.0
 
     def __post_init__(self) -> None:
         if not is_convention(self.convention):
@@ -116,5 +120,9 @@ def spread(request: DepthRequest, ends: LightEnds) -> Tensor:
 
 def disagreement(request: DepthRequest, ends: LightEnds) -> Tensor:
     """|median - conditional| (R,); NaN where either is undefined: below 1/2 or below the request's `min_opacity`."""
-    apart = (ends.quantiles[:, 0] - ends.mean).abs()
-    return torch.where(ends.opacity >= request.min_opacity, apart, torch.nan)
+    return (median(request, ends) - ends.mean).abs()
+
+
+def median(request: DepthRequest, ends: LightEnds) -> Tensor:
+    """Distance (R,) at which half of all light has ended; NaN below 1/2 or below the request's `min_opacity`."""
+    return torch.where(ends.opacity >= request.min_opacity, ends.quantiles[:, 0], torch.nan)

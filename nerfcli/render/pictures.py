@@ -10,7 +10,7 @@ from torch import Tensor
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.background import Background, colours_behind
-from nerfcli.render.depth import DepthRequest, disagreement, requested, shares, spread
+from nerfcli.render.depth import DepthRequest, disagreement, median, requested, shares, spread
 from nerfcli.render.model import Model
 from nerfcli.render.pixels import pixels_of_rays
 from nerfcli.render.rays import PictureRays, pixel_rays, places_in_pixel
@@ -52,8 +52,10 @@ class RenderedPicture:
         depth: (H, W) as requested; None when not asked for.
         spread: (H, W) standard deviation of where light ends, along the axis of depth; None without depth.
         disagreement: (H, W) |median - conditional| along that axis; None without depth.
+        median: (H, W) along that axis, where half of all light is absorbed; None without depth.
         truncation_error: (H, W) bound on what was left out of each channel of rgb; the tolerance at most.
         valid: (H, W) bool; False where the lens has no ray (rgb is then the background, opacity 0).
+        coverage, parallax: (H, W) of the points at `median`, see `visibility`; None unless an export adds them.
     """
 
     rgb: np.ndarray
@@ -61,8 +63,11 @@ class RenderedPicture:
     depth: np.ndarray | None
     spread: np.ndarray | None
     disagreement: np.ndarray | None
+    median: np.ndarray | None
     truncation_error: np.ndarray
     valid: np.ndarray
+    coverage: np.ndarray | None = None
+    parallax: np.ndarray | None = None
 
 
 @torch.no_grad()
@@ -115,13 +120,14 @@ def render_picture(
         for column in zip(*columns, strict=True)
     )
     _refuse_non_finite(frame, {"rgb": rgb, "opacity": opacity, "truncation error": error})
-    depth_map, spread_map, disagreement_map = distances if depth is not None else (None, None, None)
+    depth_map, spread_map, disagreement_map, median_map = distances if depth is not None else (None,) * 4
     return RenderedPicture(
         rgb=rgb,
         opacity=opacity,
         depth=depth_map,
         spread=spread_map,
         disagreement=disagreement_map,
+        median=median_map,
         truncation_error=error,
         valid=valid,
     )
@@ -149,7 +155,9 @@ def straight_rgba(picture: RenderedPicture) -> np.ndarray:
 def _render_tile(
     model: Model, rays: PictureRays, part: slice, *, background: Tensor, depth: DepthRequest | None, quality: Quality
 ) -> tuple[Tensor, ...]:
-    """Colour, opacity, truncation error, validity of the pixels of some rays; depth, spread, disagreement if wanted."""
+    """Colour, opacity, truncation error, validity of the pixels of some rays; if wanted, depth, spread, disagreement
+    and median.
+    """
     directions, count = rays.directions[part], quality.samples_per_pixel
     wanted = shares(depth) if depth is not None else ()
     behind = background[part]
@@ -182,6 +190,6 @@ def _render_tile(
         return colours
     far = (depth.background_distance or 0.0) * scale * pixels.to_background
     distances = requested(depth, pixels.ends, background_distance=far)
-    maps = (distances, spread(depth, pixels.ends), disagreement(depth, pixels.ends))
+    maps = (distances, spread(depth, pixels.ends), disagreement(depth, pixels.ends), median(depth, pixels.ends))
     defined = pixels.valid & ahead.view(-1, count).all(1)
     return *colours, *(torch.where(defined, values, torch.nan) for values in maps)

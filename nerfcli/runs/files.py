@@ -7,10 +7,23 @@ FIELD = "field.safetensors"
 STATE = "state.safetensors"
 LOG = "log.jsonl"
 METRICS = "metrics.json"
+PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
 LOCK = ".train.lock"
 LIVE = ".live"
 # Of a reconstruction from an X-ray scan; tomography writes and reads it.
 RECONSTRUCTION = "reconstruction.json"
 
-__all__ = ["CAMERAS", "CONFIG", "FIELD", "LIVE", "LOCK", "LOG", "METRICS", "RECONSTRUCTION", "REPORT", "STATE"]
+__all__ = [
+    "CAMERAS",
+    "CONFIG",
+    "FIELD",
+    "LIVE",
+    "LOCK",
+    "LOG",
+    "METRICS",
+    "PHOTO_DEPTHS",
+    "RECONSTRUCTION",
+    "REPORT",
+    "STATE",
+]

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerfcli.render.visibility import largest_angle_deg, sees
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.views import DepthView
 
 # A depth counts where the pixel is this opaque, and median and mean are within this share of it of each other.
 _OPAQUE, _AGREEING = 0.9, 0.02
-# Another photo sees a point where its own depth there is within this share of the point's distance from it.
-_SAME = 0.01
 # From the side a depth is another one within a pixel: the cosine between normal and ray at least.
 _FLATTEST = 0.1
 # Photos that have to see a point.
@@ -52,13 +51,12 @@ def agreed_points(
         on_progress: called with how much is done.
     """
     candidates = _thinned(views, grid)
-    count = len(candidates.places)
-    seen, towards = np.zeros((count, len(views)), bool), np.zeros((count, len(views), 3), np.float32)
+    seen = np.zeros((len(candidates.places), len(views)), dtype=bool)
     for index, view in enumerate(views):
         ray = candidates.places - view.frame.centre
-        towards[:, index] = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-30)
-        facing = -(towards[:, index] * candidates.normals).sum(axis=1)
-        seen[:, index] = _sees(view, candidates.places) & (facing > _FLATTEST)
+        facing = -(ray * candidates.normals).sum(axis=1)
+        seen[:, index] = sees(view.distances(), candidates.places)
+        seen[:, index] &= facing > _FLATTEST * np.linalg.norm(ray, axis=1)
         on_progress((index + 1) / len(views))
     photos = seen.sum(axis=1)
     kept = photos >= LEAST_PHOTOS
@@ -67,7 +65,9 @@ def agreed_points(
         normals=candidates.normals[kept],
         colours=candidates.colours[kept],
         photos=photos[kept].astype(np.uint16),
-        parallax_deg=_parallax_deg(seen[kept], towards[kept]),
+        parallax_deg=largest_angle_deg(
+            seen[kept], candidates.places[kept], np.stack([view.frame.centre for view in views])
+        ),
         spread=candidates.spread[kept],
         seen=seen[kept],
     )
@@ -107,31 +107,3 @@ def _best(keys: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Where the smallest spread of each key is, in the order of the keys."""
     order = np.lexsort((spread, keys))
     return order[np.unique(keys[order], return_index=True)[1]]
-
-
-def _sees(view: DepthView, places: np.ndarray) -> np.ndarray:
-    """(N,) whether a view's own depth at the pixel of a point is the point's."""
-    pose, camera = view.frame.world_from_cam, view.frame.camera
-    fx, fy, cx, cy = camera.params
-    x, y, z = ((places - pose[:3, 3]) @ pose[:3, :3]).T
-    ahead = z > 0
-    deep = np.where(ahead, z, 1.0)
-    # Pixel (i, j) covers [j, j + 1) x [i, i + 1).
-    column, row = np.floor(fx * x / deep + cx), np.floor(fy * y / deep + cy)
-    inside = ahead & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    seen = np.zeros(len(places), dtype=bool)
-    at = (row[inside].astype(int), column[inside].astype(int))
-    with np.errstate(invalid="ignore"):
-        seen[inside] = np.abs(view.depth[at] - z[inside]) <= _SAME * z[inside]
-    return seen
-
-
-def _parallax_deg(seen: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """(N,) the largest angle between two of the rays (N, views, 3) that see a point."""
-    largest = np.zeros(len(seen), np.float32)
-    for index in range(seen.shape[1]):
-        rows = np.flatnonzero(seen[:, index])
-        cosine = np.einsum("nvc,nc->nv", towards[rows], towards[rows, index])
-        smallest = np.where(seen[rows], cosine, 1.0).min(axis=1, initial=1.0)
-        largest[rows] = np.maximum(largest[rows], np.degrees(np.arccos(np.clip(smallest, -1, 1))))
-    return largest

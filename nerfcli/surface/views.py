@@ -10,10 +10,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.photos.undistorted import pinhole_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
+from nerfcli.render.normals import normals_of_points
 from nerfcli.render.pictures import render_picture
+from nerfcli.render.visibility import DepthMap
 
-# Neighbours whose depths differ by more than this share of them are not on one surface: there is no normal.
-_STEP = 0.1
 # The depth of half of all light: it does not move with what little of it ends before or behind a surface.
 DEPTH = DepthRequest("median", "z")
 
@@ -43,6 +43,10 @@ class DepthView:
         """(H, W, 3) in the scene's frame; NaN where there is no depth."""
         pose = self.frame.world_from_cam
         return (plane_rays(self.frame.camera) * self.depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+
+    def distances(self) -> DepthMap:
+        """The depths as distances along the rays."""
+        return DepthMap(self.frame, self.depth * np.linalg.norm(plane_rays(self.frame.camera), axis=-1))
 
     def cosines(self) -> np.ndarray:
         """(H, W) between the surface's normal and the way to the camera; 0 where there is no normal."""
@@ -102,33 +106,5 @@ def plane_rays(camera: Camera) -> np.ndarray:
 
 
 def normals_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Unit normals (H, W, 3) of a depth map along the optical axis, towards the camera, in its axes.
-
-    Cross product of the differences between the neighbours on both sides; of that to one neighbour where the other is
-    missing or on another surface. NaN where both are, and where there is no depth.
-    """
-    points = plane_rays(camera) * depth[..., None]
-    across, down = _slope(points, depth, axis=1), _slope(points, depth, axis=0)
-    normals = np.cross(down, across)
-    length = np.linalg.norm(normals, axis=-1, keepdims=True)
-    normals = np.divide(normals, length, out=np.full_like(normals, np.nan), where=length > 0)
-    # z grows away from the camera: what faces it has a normal against the ray.
-    away = (normals * points).sum(-1) > 0
-    return np.where(away[..., None], -normals, normals).astype(np.float32)
-
-
-def _slope(points: np.ndarray, depth: np.ndarray, *, axis: int) -> np.ndarray:
-    """Change of the points per pixel along an axis, NaN where neither neighbour is on the same surface."""
-    missing = np.full_like(np.take(points, [0], axis), np.nan)
-    steps = np.diff(points, axis=axis)
-    jump = np.abs(np.diff(depth, axis=axis)) > _STEP * np.minimum(*_sides(depth, axis))
-    steps[jump] = np.nan
-    after, before = np.concatenate([steps, missing], axis), np.concatenate([missing, steps], axis)
-    both = (after + before) / 2
-    return np.where(np.isnan(both), np.where(np.isnan(after), before, after), both)
-
-
-def _sides(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """The values without the last and without the first along an axis."""
-    count = values.shape[axis]
-    return np.take(values, range(count - 1), axis), np.take(values, range(1, count), axis)
+    """Return the normals of a pinhole camera's depth map along the optical axis: see `normals_of_points`."""
+    return normals_of_points(plane_rays(camera) * depth[..., None], depth)

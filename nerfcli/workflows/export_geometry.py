@@ -18,6 +18,7 @@ from nerfcli.media.volume_files import Volume, write_nrrd, write_volume_npz
 from nerfcli.photos.loading import load_photo
 from nerfcli.photos.undistorted import pinhole_frame, pinhole_of, undistorted
 from nerfcli.render.model import Model
+from nerfcli.render.visibility import coverage_and_parallax
 from nerfcli.runs.run import Run
 from nerfcli.surface.colmap_dense import photo_name, write_photo, write_sparse, write_stereo
 from nerfcli.surface.colours import surface_colours
@@ -34,6 +35,7 @@ from nerfcli.workflows.notices import Notify, Progress
 
 FORMAT = "nerfcli geometry 1"
 FRAME = "of the scene, as its cameras have it"
+PARALLAX = "largest angle between the rays of two photos that see the point"
 # The share of the work that rendering depths takes.
 _DEPTHS = 0.7
 
@@ -55,7 +57,12 @@ def export_mesh(
         "faces_before_simplification": found,
         "made_by": "truncated signed distances of median depths, marching cubes",
     }
-    _write_mesh(path, mesh, colours, description, y_up=_y_up_from_scene(run))
+    seen: dict[str, np.ndarray] = {}
+    if path.suffix.lower() == ".ply":
+        photos, parallax = coverage_and_parallax([view.distances() for view in views], mesh.vertices)
+        seen = {"photos": photos.astype(np.uint16), "parallax_deg": parallax}
+        description |= {"parallax_deg": PARALLAX}
+    _write_mesh(path, mesh, colours, description, seen=seen, y_up=_y_up_from_scene(run))
     of_found = f" of {found}" if found != len(mesh.faces) else ""
     notify(f"{len(mesh.faces)} triangles{of_found}, {_grid_in_words(grid, model)}")
 
@@ -73,7 +80,7 @@ def export_points(
     columns |= dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
     columns |= {"photos": points.photos, "parallax_deg": points.parallax_deg, "spread": points.spread}
     described = _description(run, model, "points", grid) | {
-        "parallax_deg": "largest angle between the rays of two photos that see the point",
+        "parallax_deg": PARALLAX,
         "spread": "standard deviation of where the light of the pixel ends, in the unit",
     }
     write_ply(path, columns, description=described)
@@ -178,7 +185,13 @@ def _grid_in_words(grid: Grid, model: Model) -> str:
 
 
 def _write_mesh(
-    path: Path, mesh: Mesh, colours: np.ndarray, description: Mapping[str, Any], *, y_up: np.ndarray
+    path: Path,
+    mesh: Mesh,
+    colours: np.ndarray,
+    description: Mapping[str, Any],
+    *,
+    seen: Mapping[str, np.ndarray],
+    y_up: np.ndarray,
 ) -> None:
     match path.suffix.lower():
         case ".glb":
@@ -197,7 +210,7 @@ def _write_mesh(
             columns = dict(zip("xyz", mesh.vertices.T, strict=True))
             columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.astype("<f4").T, strict=True))
             columns |= dict(zip(("red", "green", "blue"), colours.T, strict=True))
-            write_ply(path, columns, faces=mesh.faces, description=description)
+            write_ply(path, {**columns, **seen}, faces=mesh.faces, description=description)
 
 
 def _write_volume(path: Path, volume: Volume, name: str) -> None:

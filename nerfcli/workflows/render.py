@@ -14,6 +14,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.runs.run import Run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.views import Views, chosen_frames, refuse_z_all_around
 
 RENDERS = "renders"
@@ -74,7 +75,15 @@ def render_run(
     trained, cores, torch_device = Run(Path(run)), thread_count(threads), device_name(device)
     folder = trained.path / RENDERS / folder_name(views, settings) if target is None else Path(target)
     torch.set_num_threads(cores)
-    model = trained.model(torch_device).stretched(step)
+    model = trained.model(torch_device)
+    seen = ()
+    provenance: dict[str, Any] = {"cameras": views.cameras, "run": trained.path.name, "field_sha256": model.sha256}
+    if settings.needs_visibility:
+        seen = photo_depths(
+            trained, model, on_progress=lambda share: progress(share, "depths of the training photos"), notify=notify
+        )
+        provenance["training_photos"] = len(seen)
+    model = model.stretched(step)
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
         farthest = model.marching.far / model.training_from_scene.scale
         settings = replace(settings, depth=replace(settings.depth, background_distance=farthest))
@@ -82,10 +91,9 @@ def render_run(
     frames = chosen_frames(trained, views, depth_hint=1.0 / model.training_from_scene.scale)
     if "depth" in settings.outputs and settings.depth.axis == "z":
         refuse_z_all_around(frames, notify=notify)
-    provenance: dict[str, Any] = {"cameras": views.cameras, "run": trained.path.name, "field_sha256": model.sha256}
     if step != 1.0:
         provenance["step"] = step
-    order = Order(tuple(frames), settings, provenance)
+    order = Order(tuple(frames), settings, provenance, seen)
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
         raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)

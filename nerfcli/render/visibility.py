@@ -1,0 +1,138 @@
+"""Visibility of points: which photos see them, by the field's own depths, and the angle between the photos' rays."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch.nn.functional import normalize
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.render.depth import DepthRequest
+from nerfcli.render.model import Model
+from nerfcli.render.normals import normals_of_points
+from nerfcli.render.pictures import render_picture
+
+# Longer side of the depth maps of the photos, pixels.
+MAX_SIZE = 160
+# A photo sees a point where its own depth there is within this share of the point's distance...
+SAME = 0.01
+# ...and the surface is not seen more from the side than this: one pixel would show too much of it.
+STEEPEST_DEG = 80.0
+# Points whose rays are compared at a time: what that takes stays in the processor's cache.
+_BLOCK = 2**12
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Distances (H, W) from a camera to the surface along its rays, float32; NaN where it sees none."""
+
+    frame: Frame
+    distances: np.ndarray
+
+
+def depth_maps(
+    model: Model,
+    frames: Sequence[Frame],
+    *,
+    max_size: int = MAX_SIZE,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> list[DepthMap]:
+    """Render the median distance that each photo sees, through its own lens, small; see `without_steep`.
+
+    Args:
+        model: the trained model.
+        frames: as the photos have them.
+        max_size: longer side of the maps at most, pixels.
+        on_progress: called with how much is done.
+    """
+    maps = []
+    for frame in frames:
+        small = small_frame(frame, max_size)
+        seen = render_picture(model, small, background=model.background, depth=DepthRequest("median", "ray"))
+        assert seen.depth is not None
+        maps.append(without_steep(DepthMap(small, seen.depth)))
+        on_progress(len(maps) / len(frames))
+    return maps
+
+
+def without_steep(view: DepthMap) -> DepthMap:
+    """Return the map without the surfaces at an incidence above `STEEPEST_DEG`."""
+    rays, _ = view.frame.camera.pixel_bearings()
+    rays = rays.reshape(*view.distances.shape, 3)
+    cosines = -(normals_of_points(rays * view.distances[..., None], view.distances) * rays).sum(-1)
+    # NaN, where the distances around are no surface, compares as False: the edge of an object is seen.
+    steep = cosines < np.cos(np.radians(STEEPEST_DEG))
+    return DepthMap(view.frame, np.where(steep, np.float32(np.nan), view.distances))
+
+
+def sees(view: DepthMap, points: np.ndarray) -> np.ndarray:
+    """Return which points (N, 3) of the scene, finite, a camera sees: (N,) bool.
+
+    A point is seen where it lies in the picture, and one of the four pixels around it has its distance.
+    """
+    camera, pose = view.frame.camera, view.frame.world_from_cam
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    pixels, valid = camera.project(local)
+    rows = np.flatnonzero(valid & (pixels >= 0).all(1) & (pixels <= (camera.width, camera.height)).all(1))
+    distance = np.linalg.norm(local[rows], axis=1)
+    # The centre of the first pixel is at 0.5, and at 1.5 with a border.
+    bordered, stride = np.pad(view.distances, 1, mode="edge").ravel(), camera.width + 2
+    left, top = np.floor(pixels[rows] + 0.5).astype(int).T
+    corner, same = top * stride + left, np.zeros(len(rows), dtype=bool)
+    for offset in (0, 1, stride, stride + 1):
+        same |= np.abs(bordered[corner + offset] - distance) <= SAME * distance  # False at NaN
+    seen = np.zeros(len(points), dtype=bool)
+    seen[rows] = same
+    return seen
+
+
+def coverage_and_parallax(views: Sequence[DepthMap], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how many cameras see each point (N, 3) of the scene, and the largest angle between two of their rays.
+
+    Returns:
+        coverage: (N,) float32, a whole number; NaN where the point is NaN.
+        parallax: (N,) float32 degrees, 0 where fewer than two cameras see it; NaN where the point is NaN.
+    """
+    coverage, parallax = np.full(len(points), np.nan, np.float32), np.full(len(points), np.nan, np.float32)
+    centres = np.stack([view.frame.centre for view in views])
+    defined = np.flatnonzero(np.isfinite(points).all(axis=1))
+    for first in range(0, len(defined), _BLOCK):
+        rows = defined[first : first + _BLOCK]
+        seen = np.stack([sees(view, points[rows]) for view in views], axis=1)  # (rows, views)
+        coverage[rows], parallax[rows] = seen.sum(axis=1), largest_angle_deg(seen, points[rows], centres)
+    return coverage, parallax
+
+
+def largest_angle_deg(seen: np.ndarray, points: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Return the largest angle in degrees between the rays of two cameras that see a point.
+
+    Args:
+        seen: (N, views) bool.
+        points: (N, 3).
+        centres: (views, 3) of the cameras.
+
+    Returns:
+        (N,) float32; 0 where fewer than two see it. Accurate to 0.03 degrees at small angles.
+    """
+    largest = np.zeros(len(points), np.float32)
+    several = np.flatnonzero(seen.sum(axis=1) > 1)
+    for first in range(0, len(several), _BLOCK):
+        rows = several[first : first + _BLOCK]
+        used = np.flatnonzero(seen[rows].any(axis=0))
+        here = seen[np.ix_(rows, used)]
+        # Where a camera does not see the point, one that does stands in: it adds no angle.
+        chosen = np.where(here, np.arange(len(used)), here.argmax(axis=1)[:, None])
+        away = (centres[used] - points[rows, None]).astype(np.float32)  # (rows, used, 3)
+        rays = normalize(torch.from_numpy(np.take_along_axis(away, chosen[..., None], axis=1)), dim=-1)
+        cosines = torch.bmm(rays, rays.transpose(1, 2)).amin((1, 2)).numpy()
+        largest[rows] = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return largest
+
+
+def small_frame(frame: Frame, max_size: int) -> Frame:
+    """Return the frame with a picture whose longer side has `max_size` pixels at most, through the same lens."""
+    camera = frame.camera
+    factor = max(1.0, max(camera.width, camera.height) / max_size)
+    size = (max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
+    return replace(frame, camera=camera.resized(*size))

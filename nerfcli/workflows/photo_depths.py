@@ -1,0 +1,58 @@
+"""What each training photo sees of the surface: rendered once per field, kept in the run."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+from nerfcli.media.masks import read_mask
+from nerfcli.render.model import Model
+from nerfcli.render.visibility import MAX_SIZE, DepthMap, depth_maps
+from nerfcli.runs.photo_depths import photo_depths_digest, read_photo_depths, write_photo_depths
+from nerfcli.runs.run import Run
+from nerfcli.workflows.notices import Notify
+
+
+def photo_depths(
+    run: Run, model: Model, *, on_progress: Callable[[float], None], notify: Notify
+) -> tuple[DepthMap, ...]:
+    """Return the depth maps of all training photos, from the run if they belong to this field.
+
+    Args:
+        run: the run.
+        model: its field, with the steps of the training.
+        on_progress: called with how much is done.
+        notify: takes a line for the user.
+    """
+    frames = run.cameras.train
+    expected = photo_depths_digest(model.sha256, frames, max_size=MAX_SIZE)
+    kept = read_photo_depths(run.path, frames, max_size=MAX_SIZE, expected=expected)
+    if kept is not None:
+        return tuple(kept)
+    maps = depth_maps(model, frames, max_size=MAX_SIZE, on_progress=on_progress)
+    if run.components.masks == "ignore":
+        maps = [
+            view if frame.mask is None else _without_masked(view, frame, notify)
+            for view, frame in zip(maps, frames, strict=True)
+        ]
+    try:
+        write_photo_depths(run.path, maps, digest=expected)
+    except UserError as error:  # a run of somebody else can be rendered, too
+        notify(f"the depths of the training photos are not kept: {error.message}")
+    return tuple(maps)
+
+
+def _without_masked(view: DepthMap, frame: Frame, notify: Notify) -> DepthMap:
+    """The map without the pixels whose photo was not used there."""
+    assert frame.mask is not None
+    assert frame.image is not None
+    try:
+        mask = read_mask(frame.mask, frame.image)
+    except UserError as error:  # runs outlive their photos
+        notify(f"{frame.name} counts without its mask: {error.message}")
+        return view
+    height, width = view.distances.shape
+    used = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA) >= 128
+    return DepthMap(view.frame, np.where(used, view.distances, np.float32(np.nan)))

@@ -1,0 +1,239 @@
+"""Which photos see a surface: against closed forms, and as renders and exports write it."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from commands import error_of, nerfcli
+from fog import fog, foggy_cells
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity, look_at
+from nerfcli.media.descriptions import depth_meta_of
+from nerfcli.media.mesh_files import read_ply_header
+from nerfcli.render.visibility import (
+    DepthMap,
+    coverage_and_parallax,
+    depth_maps,
+    largest_angle_deg,
+    sees,
+    without_steep,
+)
+from nerfcli.runs.files import PHOTO_DEPTHS
+from nerfcli.runs.run import Run
+from nerfcli.workflows.photo_depths import photo_depths
+
+# Two balls beside each other: each hides a part of the other from most sides.
+CENTRES, RADII = np.array([[0.0, 0.0, 0.0], [0.9, 0.2, 0.1]]), np.array([0.5, 0.3])
+LENS = Camera("OPENCV", 160, 120, (150.0, 148.0, 83.0, 58.0, -0.1, 0.02, 0.001, -0.002))
+
+
+def distance_to_balls(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Distance of the first hit of rays (N, 3), unit; NaN where there is none."""
+    nearest = np.full(len(directions), np.inf)
+    for centre, radius in zip(CENTRES, RADII, strict=True):
+        off = origins - centre
+        b = (directions * off).sum(1)
+        inside = b * b - (off * off).sum(1) + radius**2
+        hit = -b - np.sqrt(np.maximum(inside, 0))
+        nearest = np.where((inside > 0) & (hit > 0), np.minimum(nearest, hit), nearest)
+    return np.where(np.isfinite(nearest), nearest, np.nan)
+
+
+def ball_map(place: np.ndarray, target: np.ndarray) -> DepthMap:
+    """What a camera with a distorting lens sees of the balls."""
+    frame = Frame("a", LENS, look_at(place, target, np.array([0.1, 0.2, 1.0])))
+    rays, _ = LENS.pixel_bearings()
+    distances = distance_to_balls(np.broadcast_to(place, rays.shape), rays @ frame.world_from_cam[:3, :3].T)
+    return without_steep(DepthMap(frame, distances.reshape(120, 160).astype(np.float32)))
+
+
+@pytest.fixture(scope="module")
+def ball_maps() -> list[DepthMap]:
+    """Nine cameras on one side of the balls; two of them look past one of them."""
+    angles = np.radians(np.linspace(-70, 70, 9))
+    places = 2.2 * np.stack([np.cos(angles), np.sin(angles), 0.2 + 0.3 * np.cos(3 * angles)], axis=-1)
+    targets = np.array([[0.3, 0.0, 0.0]] * 7 + [[0.3, 1.2, 0.0], [-0.2, -1.0, 0.3]])
+    return [ball_map(place, target) for place, target in zip(places, targets, strict=True)]
+
+
+def surface_points(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points on both balls and their normals."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    ball = rng.integers(0, 2, count)
+    return CENTRES[ball] + RADII[ball, None] * normals, normals
+
+
+def truly_seen(view: DepthMap, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """In closed form: in the picture, nothing in front, incidence below 80 degrees; and where all that is clear.
+
+    A point is not clear within three pixels of a border between seen and unseen, nor on the rim of a ball, from 68 to
+    96 degrees.
+    """
+    place = view.frame.centre
+    reach = 3 * np.linalg.norm(points - place, axis=1, keepdims=True) / LENS.focal_px
+    aside = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    other = np.cross(normals, aside)
+    answers = []
+    for a, b in [(0, 0), *((np.cos(t), np.sin(t)) for t in np.linspace(0, 2 * np.pi, 8, endpoint=False))]:
+        moved = points + reach * (a * aside + b * other)
+        rays = moved - place
+        distance = np.linalg.norm(rays, axis=1)
+        first = distance_to_balls(np.broadcast_to(place, rays.shape), rays / distance[:, None])
+        pixels, valid = LENS.project((moved - place) @ view.frame.world_from_cam[:3, :3])
+        inside = valid & (pixels >= 0).all(1) & (pixels <= (LENS.width, LENS.height)).all(1)
+        facing = -(rays * normals).sum(1) / distance
+        hidden = first < distance - 0.2  # the other ball, not the bulge of its own
+        answers.append(inside & ~hidden & (facing > np.cos(np.radians(80))))
+    clear = np.all(np.array(answers) == answers[0], axis=0)
+    steepness = np.degrees(np.arccos(-((points - place) * normals).sum(1) / np.linalg.norm(points - place, axis=1)))
+    return answers[0], clear & (np.abs(steepness - 82) > 14)
+
+
+def test_points_of_two_balls_are_seen_as_closed_forms_say(ball_maps):
+    points, normals = surface_points(4000)
+    for view in ball_maps:
+        expected, clear = truly_seen(view, points, normals)
+        found = sees(view, points)
+        assert clear.mean() > 0.6
+        assert 0.02 < expected[clear].mean() < 0.6
+        np.testing.assert_array_equal(found[clear], expected[clear])
+
+
+def test_coverage_and_parallax_are_those_of_the_cameras_that_see(ball_maps):
+    points, normals = surface_points(1500)
+    truth = [truly_seen(view, points, normals) for view in ball_maps]
+    seen, clear = np.stack([a for a, _ in truth], 1), np.all([b for _, b in truth], axis=0)
+    coverage, parallax = coverage_and_parallax(ball_maps, points)
+    assert {0, 1, 2, 3, 6} <= set(coverage[clear].tolist())
+    np.testing.assert_array_equal(coverage[clear], seen.sum(1)[clear])
+    for index in np.flatnonzero(clear):
+        rays = [view.frame.centre - points[index] for view, there in zip(ball_maps, seen[index], strict=True) if there]
+        rays = [ray / np.linalg.norm(ray) for ray in rays]
+        angles = [np.degrees(np.arccos(np.clip(a @ b, -1, 1))) for a in rays for b in rays]
+        assert parallax[index] == pytest.approx(max(angles, default=0.0), abs=0.05)
+
+
+def test_a_point_that_is_undefined_has_no_coverage(ball_maps):
+    points, _ = surface_points(3)
+    points[1, 2] = np.nan
+    for values in coverage_and_parallax(ball_maps, points):
+        assert values.dtype == np.float32
+        assert np.isnan(values).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("angle", [0.5, 2.0, 60.0, 179.0])
+def test_small_and_large_angles_keep_their_digits(angle):
+    turned = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.0])
+    centres = np.stack([[1.0, 0, 0], 3 * turned, [0, 0, 5.0]]) + 100.0
+    seen = np.array([[True, True, False], [True, False, False], [False, False, False]])
+    found = largest_angle_deg(seen, np.full((3, 3), 100.0), centres)
+    np.testing.assert_allclose(found, [angle, 0, 0], atol=0.03)
+
+
+def test_depths_of_a_field_are_those_of_its_surface():
+    """A cube of fog: half of the light ends ln 2 / density behind its face."""
+    scene = Similarity(0.5, np.eye(3), np.array([0.0, 0.0, 0.0]))
+    model = fog(foggy_cells((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), scene)
+    frame = Frame(
+        "a",
+        Camera("SIMPLE_RADIAL", 400, 300, (300.0, 200.0, 150.0, -0.05)),
+        look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0])),
+    )
+    (view,) = depth_maps(model, [frame], max_size=40)
+    assert view.distances.shape == (30, 40)
+    assert view.frame.camera == frame.camera.resized(40, 30)
+    assert view.distances[15, 20] == pytest.approx(3.0 + np.log(2) / 0.5, abs=0.02)
+    assert np.isnan(view.distances[0, 0])
+
+
+@pytest.fixture
+def run(spheres_run, tmp_path) -> Path:
+    """A copy of the run, to write into."""
+    return shutil.copytree(spheres_run, tmp_path / "spheres-run")
+
+
+def test_render_writes_coverage_and_parallax_and_removes_depth(run, tmp_path):
+    common = ("render", run, "--max-size", "48", "--depth-axis", "ray", "--threads", "2")
+    plain = nerfcli(*common, "--outputs", "depth", "-o", tmp_path / "plain")
+    limited = nerfcli(
+        *common, "--outputs", "depth,coverage,parallax", "--min-views", "4", "--min-parallax", "50",
+        "--depth-format", "tiff,exr", "-o", tmp_path / "views",
+    )  # fmt: skip
+    assert (plain.exit_code, limited.exit_code) == (0, 0), limited.stderr
+    before, after, coverage, parallax = (
+        np.stack([tifffile.imread(path) for path in sorted((tmp_path / folder).rglob("*.tiff"))])
+        for folder in ("plain/depth", "views/depth", "views/coverage", "views/parallax")
+    )
+    assert (coverage == np.round(coverage))[np.isfinite(coverage)].all()
+    assert np.nanmax(coverage) > 8
+    kept = (coverage >= 4) & (parallax >= 50)
+    assert ((coverage >= 4) & ~kept).any()
+    np.testing.assert_array_equal(after, np.where(kept, before, np.nan))
+    removed = 100 * (np.isfinite(before) & ~kept).sum() / np.isfinite(before).sum()
+    words = "a coverage below 4 photos or a parallax below 50 degrees"
+    assert f"depth removed at {removed:.1f} % of the pixels that had one: {words}" in limited.stderr
+    facts = json.loads((tmp_path / "views/render.json").read_text())["facts"]
+    assert sum(of_view["pixels_with_depth"] for of_view in facts.values()) == np.isfinite(before).sum()
+    # What the files say of themselves.
+    (of_depth, of_coverage, of_parallax) = (
+        depth_meta_of(next((tmp_path / "views" / name).rglob("*.tiff"))) for name in ("depth", "coverage", "parallax")
+    )
+    assert of_depth is not None
+    assert of_coverage is not None
+    assert of_parallax is not None
+    assert (of_depth.min_views, of_depth.min_parallax_deg) == (4, 50.0)
+    assert (of_coverage.unit, of_parallax.unit, of_coverage.min_views) == ("photos", "degrees", 0)
+    assert of_coverage.provenance["training_photos"] == 21
+    text = nerfcli("info", next((tmp_path / "views/parallax").rglob("*.tiff"))).stdout
+    assert "parallax, in degrees: the largest angle between the rays of two training photos" in text
+    assert "metric scale" not in text
+    assert f"pixels with {words} have no value" in nerfcli("info", next((tmp_path / "views").rglob("*.exr"))).stdout
+    again = nerfcli(*common, "--outputs", "depth,coverage,parallax", "-o", tmp_path / "views")
+    assert "min_views 4, not None" in error_of(again)[0]
+
+
+def test_limits_need_depth(run):
+    result = nerfcli("render", run, "--outputs", "coverage", "--min-parallax", "2")
+    assert result.exit_code == 2
+    assert re.search(r"add\s+depth\s+to\s+--outputs", result.stderr.replace("│", " "))
+
+
+def test_depths_of_photos_are_kept_for_the_field_they_belong_to(run, monkeypatch):
+    trained = Run(run)
+    shares: list[float] = []
+    maps = photo_depths(trained, trained.model(), on_progress=shares.append, notify=pytest.fail)
+    assert shares[-1] == 1.0
+    again = photo_depths(
+        trained, trained.model(), on_progress=lambda share: pytest.fail("rendered"), notify=pytest.fail
+    )
+    for one, other in zip(maps, again, strict=True):
+        np.testing.assert_array_equal(one.distances, other.distances)
+        assert one.frame.camera == other.frame.camera
+    # Another field, or a damaged file: rendered again.
+    shares.clear()
+    photo_depths(trained, replace(trained.model(), sha256="ab"), on_progress=shares.append, notify=pytest.fail)
+    assert len(shares) == 21
+    content = (run / PHOTO_DEPTHS).read_bytes()
+    (run / PHOTO_DEPTHS).write_bytes(content[: len(content) // 2])
+    photo_depths(trained, trained.model(), on_progress=shares.append, notify=pytest.fail)
+    assert len(shares) == 42
+
+
+def test_a_mesh_says_how_many_photos_see_its_points(run, tmp_path):
+    path = tmp_path / "a.ply"
+    result = nerfcli("export", run, "--to", "mesh", "--max-size", "48", "--voxel-size", "0.1", "-o", path)
+    assert result.exit_code == 0, result.stderr
+    _, columns, comments, _ = read_ply_header(path)
+    assert "photos" in str(columns)
+    assert "parallax_deg" in str(columns)
+    assert any("largest angle between the rays of two photos" in comment for comment in comments)
