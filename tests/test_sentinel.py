@@ -4,12 +4,14 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from nerfcli.errors import NON_FINITE, UserError
 from nerfcli.field.checkpoint import load_tensors, save_tensors
+from nerfcli.fit.delayed import Delayed
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.watch import FirstBad, is_finite
 from nerfcli.kernels import numba_cpu
@@ -95,17 +97,28 @@ def test_the_way_back_is_exact(views, tmp_path, monkeypatch):
     assert weights(tmp_path / "found") == weights(tmp_path / "known")
 
 
-def test_a_fault_that_does_not_come_back_changes_nothing(views, tmp_path, monkeypatch):
+def read_a_step_later(self: Delayed, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...] | None:
+    """As on a GPU."""
+    before = self.take()
+    copies = tuple(tensor.detach().clone() for tensor in tensors)
+    self._sent = copies, SimpleNamespace(synchronize=lambda: None)  # type: ignore[assignment]
+    return before
+
+
+@pytest.mark.parametrize(("bad_call", "on_gpu"), [(9, False), (9, True), (13, True)], ids=str)
+def test_a_fault_that_does_not_come_back_changes_nothing(bad_call, on_gpu, views, tmp_path, monkeypatch):
     fit(views, tmp_path / "straight")
+    if on_gpu:
+        monkeypatch.setattr(Delayed, "exchange", read_a_step_later)
     composite, calls = numba_cpu.composite, 0
 
     def flaky(*args: torch.Tensor, **named: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         nonlocal calls
         calls += 1
         rgb, transmittance, shares = composite(*args, **named)
-        return (rgb * math.nan if calls == 9 else rgb), transmittance, shares
+        return (rgb * math.nan if calls == bad_call else rgb), transmittance, shares
 
-    monkeypatch.setattr(numba_cpu, "composite", flaky)
+    monkeypatch.setattr(numba_cpu, "composite", flaky)  # the first call warms up
     told = fit(views, tmp_path / "flaky")
     assert any("but are finite when the step is repeated" in line for line in told)
     assert weights(tmp_path / "flaky") == weights(tmp_path / "straight")

@@ -370,6 +370,7 @@ def whole(
     layers = tuple(x.to(device, dtype).requires_grad_() for x in layers_of(hidden, g))
     resolutions = tuple(round(4 * 1.22**level) for level in range(8))
     background = torch.rand(count, 3, generator=g).to(device, dtype)
+    targets = targets._replace(distances=(0.7 + torch.rand(count // 2, generator=g)).to(device, dtype))
     sink = torch.zeros_like(table, requires_grad=False) if with_sink else None
     seen = backend.render_rays(
         rays, march, HashGrid(table, resolutions, layers, 3, with_sink), targets, background=background, sink=sink

@@ -72,4 +72,5 @@ class Adam:
         for index, entry in enumerate(self._state):
             for name, value in entry.items():
                 stored = tensors.get(f"{prefix}.{index}.{name}")
-                entry[name] = torch.zeros_like(value) if stored is None else stored
+                # The number of steps stays on the host, where it is read.
+                entry[name] = torch.zeros_like(value) if stored is None else stored.to(value.device)

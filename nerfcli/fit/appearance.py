@@ -116,6 +116,11 @@ class Appearance(nn.Module):
         if self.cameras is not None:
             self.cameras.step(drawn, losses, fraction, factor=factor)
 
+    def forget_gradients(self) -> None:
+        """Drop those that a GPU has sent for the next step of the cameras."""
+        if self.cameras is not None:
+            self.cameras.sent.forget()
+
     def behind(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) what rays are composited on: black or random colours.
 

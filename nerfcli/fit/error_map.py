@@ -55,7 +55,7 @@ class ErrorMap:
             replaced, numbers = 0.0, torch.cat([numbers, anywhere[guided:]])
         else:
             usable = _contains(pool.usable, numbers)
-            replaced = float((~usable).double().mean()) if guided else 0.0
+            replaced = (~usable).double().mean().float() if guided else 0.0
             numbers = torch.cat([torch.where(usable, numbers, anywhere[:guided]), anywhere[guided:]])
         relative = self._known_errors()[self._blocks_of(numbers)] / sums[-1].float() * pool.usable_count
         density = 1.0 - GUIDED_SHARE + GUIDED_SHARE * (relative + replaced)
@@ -63,14 +63,13 @@ class ErrorMap:
 
     def learn(self, numbers: Tensor, errors: Tensor) -> None:
         """Take note of the errors (N,) of pixels."""
-        if self.errors[0] == UNKNOWN:
-            self.errors.fill_(errors.mean())
+        before = torch.where(self.errors[0] == UNKNOWN, errors.mean(), self.errors)
         blocks = self._blocks_of(numbers)
         sums, counts = (torch.zeros_like(self.errors) for _ in range(2))
         sums.index_add_(0, blocks, errors)
         counts.index_add_(0, blocks, torch.ones_like(errors))
-        seen = counts > 0
-        self.errors[seen] = KEPT * self.errors[seen] + (1.0 - KEPT) * sums[seen] / counts[seen]
+        mixed = KEPT * before + (1.0 - KEPT) * sums / counts.clamp_min(1.0)
+        self.errors.copy_(torch.where(counts > 0, mixed, before))
 
     def _known_errors(self) -> Tensor:
         """The same everywhere as long as nothing is known, and never 0."""

@@ -12,6 +12,7 @@ from nerfcli.field.interface import FieldSettings
 from nerfcli.field.kinds import fresh_field
 from nerfcli.field.sizes import chosen_size
 from nerfcli.fit.appearance import Appearance
+from nerfcli.fit.delayed import Delayed
 from nerfcli.fit.error_map import BEGINS, ErrorMap
 from nerfcli.fit.losses import colour_losses, opacity_entropy
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
@@ -47,7 +48,7 @@ DETAILED_STEPS = 2500
 
 @dataclass(frozen=True)
 class StepResult:
-    """Result of one step: its loss, and the number of samples and rays."""
+    """Result of one step: its loss, on a GPU that of the step before, and the number of samples and rays."""
 
     loss: float
     samples: int
@@ -129,6 +130,8 @@ class Fitting:
         self.samples_per_ray = float(len(self.edges) - 2)
         self.rate_factor, self.rollbacks = 1.0, 0
         self.in_step = False
+        self.loss: float | None = None  # the last that has been read
+        self._losses = Delayed()
 
     def advance(self, share: float, watch: Watch = UNWATCHED) -> StepResult:
         """One optimiser step.
@@ -138,7 +141,8 @@ class Fitting:
             watch: is shown every tensor of the step, before and after it.
 
         Raises:
-            NonFiniteError: the loss or a gradient of the weights is not finite. The state is then that of no step.
+            NonFiniteError: the loss or a gradient of the weights is not finite; on a GPU, maybe of the step before. The
+                state is then that of no step.
         """
         self.in_step = True
         watch.state(self.state)
@@ -289,8 +293,23 @@ class Fitting:
         occupied = self.occupancy.above(threshold)
         return occupied if self.covered is None else occupied & self.covered
 
+    def settle(self) -> None:
+        """Read the loss of the last step if a GPU still had to compute it.
+
+        Raises:
+            NonFiniteError: as for `advance`.
+        """
+        self._take_loss(self._losses.take())
+
+    def _take_loss(self, numbers: tuple[Tensor, ...] | None) -> None:
+        if numbers is not None:
+            value, summed = numbers[0].tolist()
+            if not math.isfinite(summed):
+                raise NonFiniteError
+            self.loss = value
+
     def _finite_loss(self, loss: Tensor, drawn: Drawn, watch: Watch) -> float:
-        """The loss, if it and all gradients are finite."""
+        """The loss, if it and all gradients are finite; of the step before where the host would have to wait."""
         total = loss.detach()
         rays = {"origins of rays": drawn.origins.grad, "directions of rays": drawn.directions.grad}
         of_rays = {name: gradient for name, gradient in rays.items() if gradient is not None}
@@ -299,10 +318,11 @@ class Fitting:
             total = total + gradient.sum()  # which is non-finite if any term is
         if self.optimiser.sink is not None:
             watch.values("gradient of rows", self.optimiser.sink)
-        value, summed = torch.stack([loss.detach(), total]).tolist()  # together: a GPU is waited for once
-        if not math.isfinite(summed):
-            raise NonFiniteError
-        return value
+        self._take_loss(self._losses.exchange(torch.stack([loss.detach(), total])))
+        if self.loss is None or watch is not UNWATCHED:
+            self.settle()
+        assert self.loss is not None
+        return self.loss
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return everything that `restore` needs to continue bit for bit."""
@@ -328,6 +348,8 @@ class Fitting:
 
     def restore(self, tensors: dict[str, Tensor], description: dict[str, Any]) -> None:
         """Take up what `state` gave."""
+        self._losses.forget()
+        self.parts.forget_gradients()
         self.field.load_state_dict(
             {name.removeprefix("field."): value for name, value in tensors.items() if name.startswith("field.")}
         )

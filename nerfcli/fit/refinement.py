@@ -15,6 +15,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.lens_change import FOCAL, bearings_by_change, changeable, changed, pixels_by_change
 from nerfcli.cameras.rigid import from_parts, transform_from_twist, vector_from_rotation
+from nerfcli.fit.delayed import Delayed, on_device_of
 from nerfcli.fit.gauge import relative_motions, without_mean
 from nerfcli.fit.newton import NewtonSteps
 from nerfcli.fit.whitening import WhitenedAdam, whitening
@@ -89,9 +90,9 @@ class PoseRefinement(nn.Module):
         """Rays (R, 3) of the poses as given, as they are now; `photos` (R,) are theirs."""
         now = self.poses()
         turns = now[:, :3, :3] @ np.swapaxes(self._given[:, :3, :3], -1, -2)
-        turn = torch.from_numpy(turns).to(directions)[photos]
+        turn = on_device_of(directions, turns)[photos]
         # A photo that has not moved keeps its rays to the last bit.
-        shift = torch.from_numpy(now[:, :3, 3] - self._given[:, :3, 3]).to(origins)[photos]
+        shift = on_device_of(origins, now[:, :3, 3] - self._given[:, :3, 3])[photos]
         return origins + shift, (turn * directions[:, None, :]).sum(-1)
 
     def gradients(self, directions: Tensor, photos: Tensor, *, by_origin: Tensor, by_direction: Tensor) -> Tensor:
@@ -167,14 +168,15 @@ class LensRefinement(nn.Module):
 
     def directions(self, drawn: Drawn, photos: Tensor) -> Tensor:
         """(R, 3) those of the poses as given, through the lenses as they are now."""
-        numbers, photos = drawn.numbers.cpu(), photos.cpu()
-        directions = drawn.directions.cpu().clone()
+        numbers, photos = torch.stack([drawn.numbers, photos]).cpu()  # for a GPU, the host waits
+        changed = torch.full(drawn.directions.shape, torch.nan, dtype=drawn.directions.dtype)
         for index, rays, pixels in self._by_camera(numbers, photos):
             bearings, valid = self._now(index).bearings(pixels)
             there = rays[torch.from_numpy(valid)]  # elsewhere the lens as given is better than none
             turned = self._turns[photos[there]] @ torch.from_numpy(bearings[valid])[..., None]
-            directions[there] = turned[..., 0].to(directions.dtype)
-        return directions.to(drawn.directions.device)
+            changed[there] = turned[..., 0].to(changed.dtype)
+        now = on_device_of(drawn.directions, changed.numpy())
+        return torch.where(now.isnan(), drawn.directions, now)
 
     def gradient(self, numbers: Tensor, photos: Tensor, *, turns: Tensor, by_direction: Tensor) -> Tensor:
         """(C, K) by the changes, from gradients (R, 3) by directions; `turns` (P, 3, 3) are the photos' rotations."""
@@ -231,6 +233,7 @@ class Refinement(nn.Module):
         names = [(FOCAL,)] if kind == "focal" else [changeable(camera) for camera in pool.cameras if kind == "all"]
         listed = tuple(dict.fromkeys(name for own in names for name in own))
         self.lenses = LensRefinement(pool, listed, log_focal) if listed else None
+        self.sent = Delayed()
 
     @torch.no_grad()
     def refined(self, drawn: Drawn) -> Drawn:
@@ -245,7 +248,8 @@ class Refinement(nn.Module):
 
     @torch.no_grad()
     def step(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float) -> None:
-        """One step against the gradients of the mean loss of `drawn`, which `refined` gave.
+        """One step against the gradients of the mean loss of `drawn`, which `refined` gave; on a GPU, against those of
+        the step before.
 
         Args:
             drawn: rays that have gradients.
@@ -256,8 +260,12 @@ class Refinement(nn.Module):
         by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * rate_at(fraction)
         if rate == 0.0 or by_origin is None or by_direction is None:
             return
-        photos, numbers = self._pool.photo_of(drawn.numbers).cpu(), drawn.numbers.cpu()
-        directions, by_origin, by_direction = (t.double().cpu() for t in (drawn.directions, by_origin, by_direction))
+        sent = (self._pool.photo_of(drawn.numbers), drawn.numbers, losses, drawn.directions, by_origin, by_direction)
+        arrived = self.sent.exchange(*sent)
+        if arrived is None:
+            return
+        photos, numbers, *rest = arrived
+        losses, directions, by_origin, by_direction = (tensor.double() for tensor in rest)
         given = self._given if self.poses is None else self.poses.poses()
         turns = torch.from_numpy(given[:, :3, :3])
         # Both gradients first: they are of the rays as they were.
@@ -266,7 +274,7 @@ class Refinement(nn.Module):
             by_lens = self.lenses.gradient(numbers, photos, turns=turns, by_direction=by_direction)
         if self.poses is not None:
             by_pose = self.poses.gradients(directions, photos, by_origin=by_origin, by_direction=by_direction)
-            self.poses.step(len(by_pose) * by_pose, losses.double().cpu(), photos, fraction, rate=rate)
+            self.poses.step(len(by_pose) * by_pose, losses, photos, fraction, rate=rate)
         if self.lenses is not None and by_lens is not None:
             self.lenses.step(by_lens, LENS_RATE * rate)
 

@@ -105,7 +105,9 @@ class ComposedBackend(abc.ABC):
             apart = self.parts.distortion(weights, near, far, offsets)
         if targets.distances is not None and len(targets.distances):
             middles = (starts + ends) / 2
-            off = off_target(weights, transmittance, middles, offsets=offsets, distances=targets.distances)
+            off = self._off_target(
+                weights, transmittance, middles, offsets=offsets, rays=index, distances=targets.distances
+            )
         if trace is not None:
             trace("coordinates of samples", samples.coordinates, index)
             if samples.encoded is not None:
@@ -179,6 +181,19 @@ class ComposedBackend(abc.ABC):
     @abc.abstractmethod
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         """Densities and colours of codes, seen along directions (R, 3) of rays `index` (N,)."""
+
+    def _off_target(
+        self,
+        weights: Tensor,
+        transmittance: Tensor,
+        middles: Tensor,
+        *,
+        offsets: Tensor,
+        rays: Tensor,
+        distances: Tensor,
+    ) -> Tensor:
+        """`reference.off_target`; `rays` (N,) are those of the samples."""
+        return off_target(weights, transmittance, middles, offsets=offsets, distances=distances)
 
     def _radiance(
         self,

@@ -4,7 +4,7 @@ Letters: rays R; samples N of all rays together, packed ray after ray; `offsets`
 samples offsets[r] up to offsets[r + 1]; intervals S of a ray; cells G along a side of the occupancy grid; table levels
 L, rows per level T, features per row F.
 
-No operation makes the host wait for the device: numbers of samples stay there.
+On a GPU, `render_rays` of a hash grid makes the host wait once, for the number of samples.
 """
 
 from collections.abc import Callable

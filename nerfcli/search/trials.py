@@ -268,6 +268,7 @@ class Trials:
     @torch.no_grad()
     def _errors(self, fitting: Fitting) -> np.ndarray:
         """(photos,) squared differences of the judged pixels, summed."""
+        fitting.settle()
         rendered, measured = fitting.compare(self._judged)
         errors = (rendered.clamp(0.0, 1.0) - measured).square().sum(-1).double().cpu().numpy()
         return np.bincount(self._photos, errors, len(self._counts))

@@ -103,6 +103,7 @@ def train(
             _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
         except KeyboardInterrupt:
             if not fitting.in_step:
+                sentinel.settle()
                 checkpoints.write()
             live.end()
             raise
@@ -185,13 +186,17 @@ def _run(
             loss = result.loss
             fraction = _share(settings, fitting.step, totals)
             on_progress(Progress(fraction, fitting.step, totals.seconds, loss, speeds()[0]))
+            checkpoint_due = totals.seconds - last_saved >= CHECKPOINT_SECONDS
+            if checkpoint_due or (waypoints and fraction >= waypoints[0]):
+                sentinel.settle()
+                fraction = _share(settings, fitting.step, totals)
             if waypoints and fraction >= waypoints[0]:
                 waypoints = [later for later in waypoints if later > fraction]
                 keep_waypoint(run, fitting.step, checkpoints.model())
                 log()
             elif totals.seconds - logged_seconds >= 1.0:
                 log()
-            if totals.seconds - last_saved >= CHECKPOINT_SECONDS:
+            if checkpoint_due:
                 checkpoints.write()
                 last_saved = totals.seconds
     finally:

@@ -14,7 +14,7 @@ from nerfcli.kernels import reference
 from nerfcli.kernels.composition import Parts
 from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference.backend import ReferenceBackend
-from nerfcli.kernels.triton_cuda import hash_grid, marching, networks, operations, rays
+from nerfcli.kernels.triton_cuda import compositing, hash_grid, marching, networks, operations, rays
 from nerfcli.kernels.triton_cuda.coordinates import sample_coordinates
 from nerfcli.kernels.triton_cuda.row_adam import adam_rows
 
@@ -120,6 +120,18 @@ class TritonBackend(ReferenceBackend):
             samples.coordinates, directions, grid.table, self._half.of(grid.table), sink, samples.encoded, index,
             samples.offsets, grid.resolutions, grid.view_degree, widths, *grid.layers,
         )  # fmt: skip
+
+    def _off_target(
+        self,
+        weights: Tensor,
+        transmittance: Tensor,
+        middles: Tensor,
+        *,
+        offsets: Tensor,
+        rays: Tensor,
+        distances: Tensor,
+    ) -> Tensor:
+        return compositing.off_target(weights, transmittance, middles, rays=rays, distances=distances)
 
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         if not _fits(grid):

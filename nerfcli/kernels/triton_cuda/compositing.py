@@ -10,6 +10,7 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
+from nerfcli.kernels.reference.compositing import MOST_DEVIATION
 from nerfcli.kernels.triton_cuda.launch import jit, launch
 from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, span_of
 
@@ -262,6 +263,17 @@ def composite(
 def distortion(weights: Tensor, starts: Tensor, ends: Tensor, offsets: Tensor) -> Tensor:
     """See `reference.distortion`; float32, differentiable in the weights."""
     return _Distortion.apply(weights, starts, ends, offsets)  # type: ignore[return-value]
+
+
+def off_target(weights: Tensor, transmittance: Tensor, middles: Tensor, *, rays: Tensor, distances: Tensor) -> Tensor:
+    """`reference.off_target` over all samples, whose `rays` (N,) are given: the host need not know where the last ones
+    begin.
+    """
+    first = len(transmittance) - len(distances)
+    distance = torch.nn.functional.pad(distances, (first, 0), value=1.0)[rays]
+    deviation = ((middles - distance).abs() / (MOST_DEVIATION * distance)).clamp_max(1.0)
+    total = torch.zeros_like(transmittance).index_add(0, rays, weights * deviation)
+    return total[first:] + transmittance[first:]
 
 
 def optical_depth_before(density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor:

@@ -1,0 +1,151 @@
+"""A step of a training on a GPU waits for it once. There is no GPU: the device is torch's `meta`, which has no numbers.
+
+Kernels are counted instead of launched. Whatever needs a number of the device on the host, or a copy that is waited
+for, is counted as a wait, and gets a number that was made up.
+"""
+
+import traceback
+from collections.abc import Iterator
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+pytest.importorskip("triton", reason="Triton is for Linux")
+
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.fit.error_map import ErrorMap
+from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.point_depth import PointDepths, PointRays
+from nerfcli.kernels.triton_cuda import launch
+from nerfcli.kernels.triton_cuda.backend import TritonBackend
+from nerfcli.photos import pool as pools
+from nerfcli.photos.loading import load_photos
+from nerfcli.photos.pool import PixelPool
+from nerfcli.render.model import Marching
+from nerfcli.runs.components import Components
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.scene import Scene
+
+GPU = torch.device("meta")
+# Whatever a copy from the device brings.
+ANY = 2
+# Operations whose result has a size that only the device knows.
+SIZED_BY_NUMBERS = ("nonzero", "masked_select", "repeat_interleave", "unique_dim", "_unique2", "unique_consecutive")
+
+
+class Waits(TorchDispatchMode):
+    """Counts what makes the host wait for the device, with the lines that do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+        self.launches = 0
+
+    def note(self) -> None:
+        own = [frame for frame in traceback.extract_stack() if "/nerfcli/" in frame.filename]
+        self.lines.append(f"{own[-1].filename}:{own[-1].lineno} {own[-1].line}" if own else "not in nerfcli")
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs, name = dict(kwargs or {}), func._schema.name.removeprefix("aten::")
+        first = next((arg for arg in args if isinstance(arg, Tensor)), None)
+        here = first is not None and first.device == GPU
+        if "generator" in kwargs:
+            kwargs["generator"] = None
+        if name == "_local_scalar_dense" and here:
+            self.note()
+            return ANY
+        if name == "lift_fresh" and here:  # torch.tensor(values, device=...)
+            self.note()
+        if name == "_to_copy" and (to := kwargs.get("device")) is not None and here != (to == GPU):
+            if not kwargs.get("non_blocking"):
+                self.note()
+            if here:
+                assert first is not None
+                return torch.full(first.shape, ANY, dtype=kwargs.get("dtype") or first.dtype)
+        if name == "copy_" and args[0].device != args[1].device and not (len(args) > 2 and args[2]):
+            self.note()
+        masks = (
+            [part for part in args[1] or () if part is not None] if name in ("index", "index_put_", "index_put") else []
+        )
+        if here and (name in SIZED_BY_NUMBERS or any(mask.dtype in (torch.bool, torch.uint8) for mask in masks)):
+            self.note()
+            raise AssertionError(f"{name} makes the host wait: {self.lines[-1]}")
+        return func(*args, **kwargs)
+
+
+class OfCpu(torch.Generator):
+    """A generator for any device; its numbers are never looked at."""
+
+    def __new__(cls, device: object = None) -> "OfCpu":
+        return super().__new__(cls)
+
+
+@pytest.fixture
+def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
+    """Have `meta` be a GPU."""
+    found = Waits()
+
+    class Event:
+        """Is waited for, unless the host has waited for the device since it was recorded."""
+
+        def record(self, stream: object) -> None:
+            self._before = len(found.lines)
+
+        def synchronize(self) -> None:
+            if len(found.lines) == self._before:
+                found.note()
+
+    def count(variant: object, device: int) -> SimpleNamespace:
+        found.launches += 1
+        return SimpleNamespace(launch=lambda grid, values, stream: None)
+
+    monkeypatch.setattr(torch, "Generator", OfCpu)
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: self)
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device=None: SimpleNamespace(cuda_stream=0))
+    monkeypatch.setattr(launch, "_function", count)
+    monkeypatch.setattr(launch, "_with_triton", False)
+    monkeypatch.setattr(pools, "backend_for", lambda device, dtype: TritonBackend(device))
+    with found:
+        yield found
+
+
+@pytest.mark.parametrize(
+    ("components", "most"),
+    [
+        (Components(), 1),
+        (Components(exposure="learned", background="sphere", entropy=1e-3, antialias=True), 1),
+        (Components(points=0.1, pixels="error"), 1),
+        (Components(cameras="poses"), 1),
+        (Components(cameras="all"), 2),  # the host computes the directions of pixels through a lens that learns
+    ],
+    ids=lambda value: "-".join(f"{k}={v}" for k, v in vars(value).items() if v != getattr(Components(), k)) or "default"
+    if isinstance(value, Components) else None,
+)  # fmt: skip
+def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Scene):
+    photos = load_photos(spheres.train_frames[:3], factor=4, threads=1)
+    opaque = [photo.__class__(photo.frame, photo.pixels[..., :3].copy(), photo.used) for photo in photos]
+    pool = PixelPool(opaque, Similarity(1.0, np.eye(3), np.zeros(3)), GPU)
+    pool.poses = torch.eye(4).repeat(3, 1, 1)  # the host looks at these
+    settings = TrainSettings(budget_seconds=None, steps=40, components=components, device="cuda", samples_per_step=2**9)
+    known = [PointDepths(*(torch.zeros(9, device=GPU).to(t) for t in (torch.int64, torch.float32, torch.float32)))]
+    fitting = Fitting(
+        pool, Marching(0.1, 4.0, 0.05, 0.0), contraction="l2", settings=settings,
+        points=PointRays(known, pool) if components.points else None,
+        error_map=ErrorMap(pool) if components.pixels == "error" else None,
+    )  # fmt: skip
+    fitting.field.backend = TritonBackend(GPU)
+    for step in range(20):
+        before = len(waits.lines)
+        fitting.advance(0.2 + step / 40)
+        if step > 1:  # before, room for samples is learned, and there is no loss to show
+            assert len(waits.lines) - before <= most, waits.lines[before:]
+    assert waits.launches > 20 * 10
