@@ -13,8 +13,12 @@ _DEFAULT_SHARE = 0.8
 _CGROUP_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
-def default_memory_limit() -> int | None:
-    """Return four fifths of the memory of the machine or container, in bytes; None if unknown."""
+def default_memory_limit(device: str = "cpu") -> int | None:
+    """Return four fifths of the memory of the machine or container, in bytes; None if unknown, and for a GPU, where all
+    that is free may be used.
+    """
+    if device != "cpu":
+        return None
     try:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):  # not a POSIX system

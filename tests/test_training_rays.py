@@ -16,12 +16,15 @@ from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.fit.losses import colour_losses, over_background
 from nerfcli.fit.normalisation import box_frame, contracted_frame, object_frame
 from nerfcli.media.images import downscale, write_png
-from nerfcli.memory import resident_bytes
+from nerfcli.memory import default_memory_limit, resident_bytes
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.photos.pool import Album, PixelPool, load_album
 from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, PhotoStorage, check_device_memory, storage_for
 from nerfcli.render.rays import frame_rays
+from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
+from nerfcli.train import preparation
+from nerfcli.train.preparation import prepare
 
 CPU = torch.device("cpu")
 CAMERA = Camera.pinhole(40, 30, 50.0)
@@ -364,11 +367,33 @@ def test_a_gpu_without_room_is_refused_up_front(monkeypatch):
     needs = Needs(photos=3 * 10**9, step=10**9, rest=9 * 10**9)  # what the host decodes does not count there
     device = torch.device("cuda:1")
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (4 * 10**9, 8 * 10**9))
-    assert check_device_memory(needs, device) == "memory on cuda:1: about 4.00 GB of 4.00 GB that are free"
+    assert check_device_memory(needs, device, None) == "memory on cuda:1: about 4.00 GB of 4.00 GB that are free"
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (3 * 10**9, 8 * 10**9))
     with pytest.raises(UserError, match=r"needs about 4\.00 GB of memory on cuda:1, where 3\.00 GB are free") as caught:
-        check_device_memory(needs, device)
+        check_device_memory(needs, device, None)
     assert caught.value.exit_code == OUT_OF_MEMORY
+    assert "--device cpu" in caught.value.hint
+
+
+def test_a_limit_of_memory_is_that_of_the_gpu(monkeypatch, tmp_path):
+    """Torch keeps to it; the machine's own memory then has its usual limit."""
+    needs, device = Needs(photos=3 * 10**9, step=10**9, rest=0), torch.device("cuda:1")
+    kept: list[tuple[float, torch.device]] = []
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6 * 10**9, 10 * 10**9))
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda *given: kept.append(given))
+    with pytest.raises(UserError, match=r"4\.00 GB of memory on cuda:1, where the limit is 3\.90 GB"):
+        check_device_memory(needs, device, 39 * 10**8)
+    with pytest.raises(UserError, match=r"8\.00 GB of memory on cuda:1, where 6\.00 GB are free"):
+        check_device_memory(Needs(7 * 10**9, 10**9, 0), device, 9 * 10**9)
+    assert kept == []
+    check_device_memory(needs, device, 5 * 10**9)
+    assert kept == [(0.5, device)]
+    assert default_memory_limit("cuda:1") is None
+    needed = Needs(photos=0, step=0, rest=2 * (default_memory_limit() or 0))
+    monkeypatch.setattr(preparation, "needs_of", lambda *given, **named: needed)
+    settings = TrainSettings(steps=1, device="cuda:1")
+    with pytest.raises(UserError, match="in addition to the photos, but the limit is"):
+        prepare(scene_of(ring()), settings, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
 
 
 def test_a_full_disk_is_told_before_anything_is_written_to_it(tmp_path):

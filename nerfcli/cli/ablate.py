@@ -9,12 +9,12 @@ from nerfcli.cli.batch import for_each_input, result_path
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Device,
+    DeviceMemory,
     Downscale,
     Exclude,
     Holdout,
     Include,
     Json,
-    Memory,
     Output,
     Overwrite,
     Quiet,
@@ -60,7 +60,7 @@ def ablate(
     model: Annotated[str, typer.Option(help="Reference model: auto (selected for this scene) or default.")] = "auto",
     downscale: Downscale = "auto",
     holdout: Holdout = None,
-    memory: Memory = None,
+    memory: DeviceMemory = None,
     device: Device = "auto",
     seed: Seed = 0,
     threads: Threads = 0,
@@ -111,7 +111,7 @@ def ablate(
         fixed=named_components(include, exclude),
         **sizes_for(torch_device),
     )
-    rule, limit = holdout_rule(holdout), memory_limit(memory)
+    rule, limit = holdout_rule(holdout), memory_limit(memory, torch_device)
 
     def work(path: Path, one_of_many: bool) -> None:
         folder = result_path(path, suffix="-ablation", output=output, one_of_many=one_of_many)

@@ -70,6 +70,15 @@ Contraction = Annotated[
     ),
 ]
 Memory = Annotated[str | None, typer.Option(help="Memory limit: 4GB, 500MB.  [default: 4/5 of the machine's memory]")]
+DeviceMemory = Annotated[
+    str | None,
+    typer.Option(
+        "--memory",
+        help="Memory limit, of the GPU with --device cuda: 4GB, 500MB.  [default: 4/5 of the machine's memory, or what "
+        "is free on the GPU]",
+        show_default=False,
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print results as JSON Lines on stdout instead of paths.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show only warnings and errors.")]
@@ -172,15 +181,15 @@ def holdout_rule(holdout: str | None) -> str | None:
         raise typer.BadParameter(str(error), param_hint="--holdout") from error
 
 
-def memory_limit(memory: str | None) -> int | None:
-    """Parse --memory to bytes; by default four fifths of the machine's memory, None if that is unknown.
+def memory_limit(memory: str | None, device: str = "cpu") -> int | None:
+    """Parse --memory to bytes, with `default_memory_limit` of the device if it is not given.
 
     Raises:
         typer.BadParameter: not an amount of memory.
     """
     from nerfcli.memory import default_memory_limit
 
-    return default_memory_limit() if memory is None else bytes_from_text(memory)
+    return default_memory_limit(device) if memory is None else bytes_from_text(memory)
 
 
 def thread_count(threads: int) -> int:

@@ -117,8 +117,6 @@ def run(
     )
     depth = DepthRequest(convention="conditional", axis="z")
 
-    memory = default_memory_limit()
-
     def work(source: Path, one_of_many: bool) -> None:
         scene = result_path(without_suffix(source), suffix="-scene", output=output, one_of_many=one_of_many)
         field = result_path(scene, suffix="-run", output=None, one_of_many=False)
@@ -133,7 +131,7 @@ def run(
                 folder,
                 scene,
                 pose_settings,
-                limits=Limits(memory_bytes=memory),
+                limits=Limits(memory_bytes=default_memory_limit()),
                 intrinsics=given_intrinsics(intrinsics, folder, use=use),
                 overwrite=overwrite,
                 notify=console.note,
@@ -145,7 +143,7 @@ def run(
                 scene,
                 field,
                 train_settings,
-                memory_bytes=memory,
+                memory_bytes=default_memory_limit(torch_device),
                 resume=not overwrite and was_interrupted(scene, field, train_settings),
                 overwrite=overwrite,
                 notify=console.note,

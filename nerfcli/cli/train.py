@@ -12,6 +12,7 @@ from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import (
     Contraction,
     Device,
+    DeviceMemory,
     Downscale,
     Exclude,
     FieldKind,
@@ -19,7 +20,6 @@ from nerfcli.cli.options import (
     Holdout,
     Include,
     Json,
-    Memory,
     ModelChoice,
     Output,
     Overwrite,
@@ -33,7 +33,6 @@ from nerfcli.cli.options import (
     downscale_factor,
     field_kind,
     holdout_rule,
-    memory_limit,
     model_name,
     named_components,
     seconds_from_text,
@@ -87,7 +86,7 @@ def train(
     view: Annotated[
         bool, typer.Option("--view", help="Show the field in a browser while it trains; see nerfcli view.")
     ] = False,
-    memory: Memory = None,
+    memory: DeviceMemory = None,
     device: Device = "auto",
     seed: Seed = 0,
     threads: Threads = 0,
@@ -146,6 +145,7 @@ def train(
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
     from nerfcli.errors import UserError
+    from nerfcli.memory import default_memory_limit
     from nerfcli.runs.components import Components, choose
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.tomography.formats.read import recognise
@@ -157,7 +157,7 @@ def train(
     console = Console(quiet=quiet, json_lines=json)
     budget_seconds = None if budget is None else seconds_from_text(budget)
     rule = holdout_rule(holdout)
-    limit = memory_limit(memory)
+    limit = None if memory is None else bytes_from_text(memory)
 
     def train_one_scan(folder: Path, run: Path) -> None:
         from nerfcli.cli.scans import reconstruction_settings
@@ -216,7 +216,7 @@ def train(
                 folder,
                 run,
                 photo_settings(),
-                memory_bytes=limit,
+                memory_bytes=limit or default_memory_limit(photo_settings().device),
                 resume=resume,
                 overwrite=overwrite,
                 holdout=rule,

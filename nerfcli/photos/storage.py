@@ -124,20 +124,28 @@ PhotoStorage = InMemory | InFiles
 IN_MEMORY = InMemory()
 
 
-def check_device_memory(needs: Needs, device: torch.device) -> str:
-    """Return a message for the user about the memory of a CUDA device.
+def check_device_memory(needs: Needs, device: torch.device, limit: int | None) -> str:
+    """Keep torch within a limit of memory on a CUDA device, and return a message for the user.
+
+    Args:
+        needs: of the training.
+        device: that it is to run on.
+        limit: bytes that it may use there; None for all that are free.
 
     Raises:
-        UserError: photos and training do not fit into what is free there.
+        UserError: photos and training do not fit into the limit, or into what is free.
     """
-    free, _ = torch.cuda.mem_get_info(device)
+    free, total = torch.cuda.mem_get_info(device)
     needed = needs.photos + needs.step
-    if needed > free:
+    if needed > min(free, limit or free):
+        least = f"{_gigabytes(free)} are free" if limit is None or free < limit else f"the limit is {_gigabytes(limit)}"
         raise UserError(
-            f"training needs about {_gigabytes(needed)} of memory on {device}, where {_gigabytes(free)} are free",
+            f"training needs about {_gigabytes(needed)} of memory on {device}, where {least}",
             "reduce the photos with --downscale 4, lower --log2-rows or --batch, or use --device cpu",
             OUT_OF_MEMORY,
         )
+    if limit is not None:
+        torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total), device)
     return f"memory on {device}: about {_gigabytes(needed)} of {_gigabytes(free)} that are free"
 
 

@@ -61,7 +61,8 @@ def train(
         run: the folder to write; must not hold a run unless `resume`.
         settings: budget, resolution, seed, device.
         resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0.
-        memory_bytes: that may be resident; photos that do not fit stand in files, and the result is the same.
+        memory_bytes: that may be resident; photos that do not fit stand in files, and the result is the same. On a GPU,
+            that may be used there, and all has to fit.
         notify: takes lines for the user.
         on_progress: called after every step.
 

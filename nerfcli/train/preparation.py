@@ -19,6 +19,7 @@ from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
 from nerfcli.fit.fitting import OCCUPANCY_SIDE, Fitting
 from nerfcli.fit.point_depth import PointDepths, PointRays
+from nerfcli.memory import default_memory_limit
 from nerfcli.multiview.camera_check import CameraCheck, check_cameras
 from nerfcli.multiview.correspondences import Shared
 from nerfcli.multiview.triangulation import triangulate
@@ -127,7 +128,7 @@ def prepare(
         scene: photos, cameras and split.
         settings: as asked for.
         run: where files may stand that hold what does not fit into memory.
-        memory_bytes: that may be resident.
+        memory_bytes: that may be resident, or be used on a GPU.
         begun: decisions of a training that goes on; None for a new one.
         notify: takes lines for the user.
 
@@ -142,11 +143,12 @@ def prepare(
     first = scene.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)
     needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
-    storage, text = storage_for(needs, memory_bytes, folder=run)
-    notify(text)
     device = torch.device(settings.device)
     if device.type == "cuda":
-        notify(check_device_memory(needs, device))
+        notify(check_device_memory(needs, device, memory_bytes))
+        memory_bytes = default_memory_limit()
+    storage, text = storage_for(needs, memory_bytes, folder=run)
+    notify(text)
     masks = settings.components.masks
     album = load_album(scene.train_frames, factor=factor, threads=settings.threads, storage=storage, masks=masks)
     shared = Shared(scene, album.photos, threads=settings.threads)

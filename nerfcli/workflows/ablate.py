@@ -55,7 +55,7 @@ def ablate_scene(
         only: components to vary; all where there are none.
         whole: measure whole held-out photos as `evaluate_run` does, not random pixels of them.
         holdout: see `train_scene`.
-        memory_bytes: that a training may have resident.
+        memory_bytes: that a training may have resident, or use on a GPU.
         overwrite: train and measure again what is there.
         notify, warn: take lines for the user.
         progress: takes the share of the trainings that is done.

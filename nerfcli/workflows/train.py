@@ -48,7 +48,7 @@ def train_scene(
         scene: a folder that `estimate_poses` wrote, or of another format that `load_scene` reads.
         run: the folder to write.
         settings: budget, components, resolution, seed, device, threads.
-        memory_bytes: that may be resident; None for no limit.
+        memory_bytes: that may be resident, or be used on the GPU that trains; None for no limit.
         resume: go on from the last checkpoint of `run`.
         overwrite: replace another run at `run`.
         holdout: photos to hold out, "every:8", "block:0.15" or a file of names; None as the scene says.
