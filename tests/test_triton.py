@@ -309,6 +309,29 @@ def test_machine_code_is_kept_on_disk_and_damage_is_noticed(monkeypatch, tmp_pat
         compiled(variant, 90)
 
 
+def test_the_cache_is_bounded_and_what_was_used_least_recently_goes_first(monkeypatch, tmp_path):
+    """Files of other versions, and those that another process writes or removes at the same time."""
+    monkeypatch.setenv("NERFCLI_KERNEL_CACHE", str(tmp_path))
+    built = Cubin("kernel", b"c" * 60, "p" * 20, "Q", 4, 0)
+    monkeypatch.setattr(cubin, "compile_now", lambda variant, capability: built)
+    monkeypatch.setattr(cubin, "MOST_BYTES", 1000)
+    for age in range(8):
+        path = tmp_path / f"old-{age}.cubin"
+        path.write_bytes(b"x" * 200)
+        os.utime(path, (1000 - age, 1000 - age))
+    (tmp_path / ".new.partial-7.cubin").write_bytes(b"x" * 10_000)
+    (tmp_path / "gone.cubin").symlink_to("nowhere")  # as if another process had removed it meanwhile
+    variant = launch.variant_of(launch._count, (torch.zeros(4), 7, 0.5, 4), {"BLOCK": 32}, warps=4, stages=1)
+    assert not cubin.is_compiled()
+    assert compiled(variant, 90) == compiled(variant, 90) == built
+    assert cubin.is_compiled()
+    assert {path.name for path in tmp_path.glob("old-*")} == {f"old-{age}.cubin" for age in range(4)}
+    assert (tmp_path / ".new.partial-7.cubin").exists()
+    os.utime(tmp_path / "old-3.cubin")
+    compiled(variant, 80)
+    assert {path.name for path in tmp_path.glob("old-*")} == {"old-0.cubin", "old-1.cubin", "old-3.cubin"}
+
+
 @pytest.mark.parametrize(
     "parameters", [".param .u64 a", ".param .u64 a, .param .u64 b, .param .u32 c", ".param .u32 a"]
 )

@@ -116,7 +116,8 @@ def prepare(notify: Callable[[str], None], device: str = "cpu") -> None:
     """Compile what has to be compiled for a device, so that no clock runs meanwhile; once per machine."""
     wanted = torch.device(device)
     if backend_for(wanted, torch.float32).name == "triton_cuda":
-        from nerfcli.kernels.triton_cuda.warm_up import is_compiled, warm_up
+        from nerfcli.kernels.triton_cuda.cubin import is_compiled
+        from nerfcli.kernels.triton_cuda.warm_up import warm_up
 
         if not is_compiled():
             notify("compiling the GPU kernels (once per machine, about a minute)")

@@ -1,7 +1,9 @@
 """Machine code of kernels: compiled by Triton with the ptxas in its package, and kept on disk.
 
-The cache is in the user's cache folder, or in NERFCLI_KERNEL_CACHE. A file is named by a digest of the sources of all
-kernels, the versions of Triton and Python, the variant and the architecture, so that nothing outdated is ever loaded.
+The cache is in the user's cache folder, or in NERFCLI_KERNEL_CACHE. A file is named by two digests: of the sources of
+all kernels and the versions of Triton and Python; and of the variant and the architecture. So nothing outdated is ever
+loaded. Of more than `MOST_BYTES`, what was used least recently is removed. Several processes may do this at once: files
+appear whole, and what another process has removed is compiled again.
 """
 
 import functools
@@ -11,6 +13,8 @@ import os
 import platform
 import re
 import sys
+import tempfile
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,6 +56,8 @@ class UnexpectedCodeError(Exception):
 # Parameters in PTX and as letters of `struct`.
 _FORMATS = {"u64": "Q", "b64": "Q", "u32": "I", "b32": "I", "f32": "f"}
 _OF_TYPES = {"i32": "i", "i64": "q", "fp32": "f"}
+# Machine code of several versions of the kernels; that of one is about 5 MB.
+MOST_BYTES = 2**26
 # What Triton appends: pointers to scratch memory, unused.
 _MOST_EXTRA = 3
 
@@ -62,10 +68,13 @@ def compiled(variant: "Variant", capability: int) -> Cubin:
     Raises:
         UnexpectedCodeError: it needs something that is not passed, as this version of Triton compiles it.
     """
-    path = folder() / f"{_digest(variant, capability)}.cubin"
+    path = folder() / f"{_environment()}-{_digest(variant, capability)}.cubin"
     try:
         head, ptx, code = path.read_bytes().split(b"\0\0\0\0", 2)
-        return Cubin(code=code, ptx=ptx.decode(), **json.loads(head))
+        built = Cubin(code=code, ptx=ptx.decode(), **json.loads(head))
+        with suppress(OSError):  # the folder may be somebody else's
+            path.touch()
+        return built
     except (OSError, ValueError):  # not there, or damaged
         built = compile_now(variant, capability)
     described = {name: value for name, value in asdict(built).items() if name not in ("code", "ptx")}
@@ -74,11 +83,18 @@ def compiled(variant: "Variant", capability: int) -> Cubin:
             partial.write_bytes(b"\0\0\0\0".join([json.dumps(described).encode(), built.ptx.encode(), built.code]))
     except UserError:  # the disk is full: it is compiled again next time
         pass
+    _prune(path.parent)
     return built
+
+
+def is_compiled() -> bool:
+    """Return whether machine code of the kernels as they stand is on the disk."""
+    return any(folder().glob(f"{_environment()}-*.cubin"))
 
 
 def compile_now(variant: "Variant", capability: int) -> Cubin:
     """`compiled` without the disk."""
+    from triton import knobs
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
 
@@ -96,7 +112,9 @@ def compile_now(variant: "Variant", capability: int) -> Cubin:
         },
     )
     options = {"num_warps": variant.warps, "num_stages": variant.stages, "enable_fp_fusion": True}
-    binary = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=options)
+    with knobs.cache.scope(), tempfile.TemporaryDirectory() as scratch:
+        knobs.cache.dir = scratch  # Triton would keep every intermediate form, for ever
+        binary = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=options)
     if binary.metadata.global_scratch_size or binary.metadata.profile_scratch_size:
         raise UnexpectedCodeError("it needs scratch memory")
     return Cubin(
@@ -131,15 +149,31 @@ def _formats(ptx: str, types: tuple[str, ...]) -> str:
     return "".join(wanted) + "Q" * len(extra)
 
 
+def _prune(place: Path) -> None:
+    """Remove what was used least recently, beyond `MOST_BYTES`."""
+    found = []
+    for path in place.glob("[!.]*.cubin"):  # with a dot, another process is writing it
+        with suppress(OSError):  # another process has removed it
+            found.append((path.stat().st_mtime, path.stat().st_size, path))
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= MOST_BYTES:
+            return
+        with suppress(OSError):
+            path.unlink()
+        total -= size
+
+
 def _digest(variant: "Variant", capability: int) -> str:
     described = (variant.kernel.__module__, variant.kernel.__name__, *variant[1:], capability)
-    return hashlib.blake2b(f"{_environment()} {described}".encode(), digest_size=20).hexdigest()
+    return hashlib.blake2b(str(described).encode(), digest_size=20).hexdigest()
 
 
 @functools.cache
 def _environment() -> str:
-    """Digest of the sources of the kernels, and the versions."""
-    content = hashlib.blake2b(digest_size=20)
+    """Digest of the sources of the kernels and the versions."""
+    versions = f"{triton.__version__} {sys.version_info[:2]} {platform.machine()}"
+    content = hashlib.blake2b(versions.encode(), digest_size=8)
     for path in sorted(Path(__file__).parent.glob("*.py")):
         content.update(path.name.encode() + b"\0" + path.read_bytes())
-    return f"{content.hexdigest()} {triton.__version__} {sys.version_info[:2]} {platform.machine()}"
+    return content.hexdigest()

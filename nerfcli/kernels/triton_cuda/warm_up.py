@@ -3,13 +3,7 @@
 import torch
 
 from nerfcli.kernels.interface import HashGrid, March, PixelTable, Rays, Targets
-from nerfcli.kernels.triton_cuda import cubin
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
-
-
-def is_compiled() -> bool:
-    """Return whether machine code is cached on disk."""
-    return any(cubin.folder().glob("*.cubin"))
 
 
 def warm_up(device: torch.device) -> None:
