@@ -8,6 +8,7 @@ import torch
 from commands import nerfcli
 
 from nerfcli import kernels
+from nerfcli.bench import machine
 from nerfcli.errors import UserError
 from nerfcli.kernels.devices import describe_machine
 from nerfcli.runs.settings import TrainSettings, sizes_for
@@ -45,6 +46,17 @@ def test_without_a_gpu_none_can_be_named(monkeypatch):
     for name in ("cuda", "cuda:0"):
         with pytest.raises(UserError, match=f"--device {name}: torch finds no CUDA device"):
             device_name(name)
+
+
+def test_a_benchmark_names_the_gpu_and_reads_its_memory(monkeypatch):
+    """Of the device that is given, which need not be the first."""
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"GPU of {device}")
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: {"cuda:1": 7}[device])
+    assert machine.describe_machine("cuda:1", 2)["device"] == "GPU of cuda:1"
+    memory = machine.PeakMemory("cuda:1")
+    memory.begin()
+    assert memory.read() == 7
 
 
 def test_a_gpu_gets_larger_steps_and_tables():

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -24,6 +25,8 @@ from nerfcli.kernels.triton_cuda import compositing, coordinates, depth, hash_gr
 from nerfcli.kernels.triton_cuda import rays as along
 from nerfcli.kernels.triton_cuda.backend import TritonBackend
 from nerfcli.kernels.triton_cuda.launch import INTERPRETED, seen
+from nerfcli.selftest.measure import MET, Precision
+from nerfcli.selftest.table import OF_GPU, checks, row_of
 
 DEVICE = torch.device("cpu" if INTERPRETED else "cuda")
 SIZES = [0, 1, 5, 123]
@@ -444,6 +447,24 @@ def test_far_points_contract_as_in_the_reference(generator):
     found = marching.occupied_samples(rays, march)[2]
     assert_close(found, contract(points.double()) / 4 + 0.5, "coordinates")
     assert math.isfinite(float(found.sum()))
+
+
+OF_SELFTEST = Precision(OF_GPU, torch.float32, str(DEVICE), for_gpu=True)
+
+
+def hard_cases() -> Iterator[Any]:
+    """The rows of `nerfcli selftest --device cuda`; in the interpreter, rays of 4096 samples take seconds."""
+    for check in checks():
+        if check.is_for(OF_SELFTEST):
+            takes_long = "1 to 4096" in check.case and "depth 1 per" not in check.case
+            yield pytest.param(check, id=check.case, marks=pytest.mark.slow if takes_long else ())
+
+
+@pytest.mark.parametrize("check", list(hard_cases()))
+def test_hard_cases_are_within_the_bounds_of_float32(check):
+    with np.errstate(over="ignore", invalid="ignore"):  # the interpreter is NumPy
+        row = row_of(check, OF_SELFTEST)
+    assert row.verdict == MET, row
 
 
 @pytest.fixture(scope="session", autouse=True)

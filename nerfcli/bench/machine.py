@@ -19,7 +19,7 @@ def describe_machine(device: str, threads: int) -> dict[str, Any]:
     return {
         "processor": processor_name(),
         "processors": os.cpu_count(),
-        "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
+        "device": "cpu" if device == "cpu" else torch.cuda.get_device_name(device),
         "threads": threads,
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "python": platform.python_version(),
@@ -54,15 +54,15 @@ class PeakMemory:
 
     def begin(self) -> None:
         """Count from here."""
-        if self.device == "cuda":
-            torch.cuda.reset_peak_memory_stats()
+        if self.device != "cpu":
+            torch.cuda.reset_peak_memory_stats(self.device)
         elif _CLEAR_REFS.exists():
             _CLEAR_REFS.write_text("5")  # resets the peak of the resident size: Linux, proc(5)
 
     def read(self) -> int | None:
         """Bytes; None where the system has no such count."""
-        if self.device == "cuda":
-            return torch.cuda.max_memory_allocated()
+        if self.device != "cpu":
+            return torch.cuda.max_memory_allocated(self.device)
         if not (_CLEAR_REFS.exists() and _STATUS.exists()):
             return None
         for line in _STATUS.read_text(encoding="utf-8").splitlines():

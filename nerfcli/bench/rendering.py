@@ -178,7 +178,7 @@ def _measure_times(
     subject: _Subject, settings: Sequence[RenderSetting], *, rounds: int, session: Session, ends: float
 ) -> None:
     """Rounds through all settings; the least number of them whatever it costs, the others while there is time."""
-    memory = PeakMemory(subject.models["float32"].device.type)
+    memory = PeakMemory(str(subject.models["float32"].device))
     measured = {(entry["round"], entry["point"]) for entry in session.records.of_kind("time")}
     for number in range(1, rounds + 1):
         if number > LEAST_ROUNDS and session.spent > ends:

@@ -45,15 +45,16 @@ def selftest(
 ) -> None:
     """Check the numerical accuracy of the kernels on hard cases.
 
-    Compares the kernels in float32, in bfloat16 and as compiled with their definitions in float64: thin fog and opaque
-    walls, no samples and thousands, densities near overflow, points at infinity. Prints relative errors of values and
-    gradients, their bounds, time, and the error of the textbook formula. The exit code is 7 if an error exceeds its
-    bound.
+    Compares the kernels in float32, in bfloat16, as compiled for the CPU and, with --device cuda, for the GPU, with
+    their definitions in float64: thin fog and opaque walls, no samples and thousands, densities near overflow, points
+    at infinity. Prints relative errors of values and gradients, their bounds, time, and the error of the textbook
+    formula. The exit code is 7 if an error exceeds its bound.
 
     \b
     Examples:
       nerfcli selftest
       nerfcli selftest --textbook
+      nerfcli selftest --device cuda
       nerfcli selftest --device cpu --json | jq 'select(.verdict == "not met")'
     """
     import torch

@@ -17,21 +17,26 @@ MET, NOT_MET = "met", "not met"
 
 @dataclass(frozen=True)
 class Precision:
-    """An arithmetic that an operation is tried in: plain torch on the device, or the compiled kernels of the CPU."""
+    """An arithmetic that an operation is tried in: plain torch on the device, or the compiled kernels of CPU or GPU."""
 
     name: str
     dtype: torch.dtype
     device: str
     compiled: bool = False
+    for_gpu: bool = False
 
     @property
     def parts(self) -> ModuleType:
         """The single operations in this arithmetic."""
-        if not self.compiled:
-            return reference
-        from nerfcli.kernels import numba_cpu  # which may not work here
+        if self.for_gpu:
+            from nerfcli.kernels.triton_cuda import operations
 
-        return numba_cpu
+            return operations
+        if self.compiled:
+            from nerfcli.kernels import numba_cpu  # which may not work here
+
+            return numba_cpu
+        return reference
 
     @property
     def unit(self) -> float:

@@ -5,24 +5,27 @@ from collections.abc import Callable, Iterator
 import torch
 
 from nerfcli import kernels
-from nerfcli.selftest.cases import MEANINGLESS
 from nerfcli.selftest.measure import Precision, Row
-from nerfcli.selftest.table import checks, row_of
+from nerfcli.selftest.table import OF_GPU, checks, row_of
 
 
 def precisions(device: str) -> tuple[Precision, ...]:
-    """List the precisions to test on a device; compiled kernels run on the CPU wherever they work."""
+    """List the precisions to test on a device; the compiled kernels of the CPU run wherever they work."""
     plain = tuple(
         Precision(name, dtype, device) for name, dtype in (("float32", torch.float32), ("bfloat16", torch.bfloat16))
     )
     compiled = (Precision("compiled", torch.float32, "cpu", compiled=True),) if kernels.has_compiled() else ()
-    return plain + compiled
+    has_gpu_kernels = kernels.why_not_triton(torch.device(device)) is None
+    of_gpu = (Precision(OF_GPU, torch.float32, device, for_gpu=True),) if has_gpu_kernels else ()
+    return plain + of_gpu + compiled
 
 
 def rows(device: str, notify: Callable[[str], None]) -> Iterator[Row]:
     """Every row, one after the other as they are measured."""
     kernels.prepare(notify)
+    if device != "cpu":
+        kernels.prepare(notify, device)
     for check in checks():
         for precision in precisions(device):
-            if precision.name in check.precisions and check.bound(precision).value <= MEANINGLESS:
+            if check.is_for(precision):
                 yield row_of(check, precision)

@@ -18,7 +18,12 @@ from nerfcli.kernels.reference.depth import BISECTIONS
 from nerfcli.selftest import cases, operations, textbook
 from nerfcli.selftest.measure import Errors, Precision, Row
 
-SINGLE, HALF, COMPILED = "float32", "bfloat16", "compiled"
+SINGLE, HALF, COMPILED, OF_GPU = "float32", "bfloat16", "compiled", "GPU kernels"
+# What the kernels of a GPU compute in float32 without those of the reference.
+OPERATIONS_OF_GPU = (
+    *("composite", "optical_depth_before", "distortion", "light_ends"),
+    *("hash_encode", "pixel_rays", "adam_rows", "visible_samples"),
+)
 VALUE_ONLY = "value only: where a gradient is wanted, plain torch gives both"
 
 
@@ -50,6 +55,11 @@ class Check:
     textbook: Callable[[operations.Inputs], operations.Outcome] | None = None
     no_gradient: str = ""
 
+    def is_for(self, precision: Precision) -> bool:
+        """Return whether it is tried in a precision, and has digits there."""
+        tried = self.operation in OPERATIONS_OF_GPU if precision.for_gpu else precision.name in self.precisions
+        return tried and self.bound(precision).value <= cases.MEANINGLESS
+
 
 def row_of(check: Check, precision: Precision) -> Row:
     """Measure one operation on one hard case in one precision."""
@@ -57,9 +67,11 @@ def row_of(check: Check, precision: Precision) -> Row:
     wanted = check.run(reference, {name: operations.exact(given) for name, given in inputs.items()})
     start = time.perf_counter()
     got = check.run(precision.parts, inputs)
+    if precision.device != "cpu":
+        torch.cuda.synchronize(precision.device)
     seconds = time.perf_counter() - start
     plain = None
-    if check.textbook is not None and not precision.compiled:
+    if check.textbook is not None and precision.parts is reference:
         plain = operations.errors(check.textbook(inputs), wanted, tiny=precision.tiny)
     return Row(
         case=check.case,
@@ -71,7 +83,7 @@ def row_of(check: Check, precision: Precision) -> Row:
         formula=check.formula,
         textbook=plain,
         seconds=seconds,
-        no_gradient=check.no_gradient if precision.compiled else "",
+        no_gradient="" if precision.parts is reference else check.no_gradient,
     )
 
 

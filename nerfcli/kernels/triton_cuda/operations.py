@@ -1,15 +1,22 @@
 """Single operations on packed samples, by the GPU kernels or, where none is worth it, by the reference."""
 
+from torch import Tensor
+
+from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 from nerfcli.kernels.reference import mixture_quantile
+from nerfcli.kernels.triton_cuda import marching, row_adam
 from nerfcli.kernels.triton_cuda.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.triton_cuda.depth import light_ends
+from nerfcli.kernels.triton_cuda.hash_grid import hash_encode
 from nerfcli.kernels.triton_cuda.marching import occupied_samples
 from nerfcli.kernels.triton_cuda.pixels import pixel_rays
 from nerfcli.kernels.triton_cuda.rays import ray_indices
 
 __all__ = [
+    "adam_rows",
     "composite",
     "distortion",
+    "hash_encode",
     "interval_weights",
     "light_ends",
     "mixture_quantile",
@@ -17,4 +24,26 @@ __all__ = [
     "optical_depth_before",
     "pixel_rays",
     "ray_indices",
+    "visible_samples",
 ]
+
+
+def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
+    """See `reference.visible_samples`."""
+    return marching.visible_samples(rays, along, grid, table=grid.table.half(), capacity=marching.Capacity())
+
+
+def adam_rows(
+    table: Tensor,
+    gradient: Tensor,
+    first: Tensor,
+    second: Tensor,
+    *,
+    step: int,
+    rate: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """See `reference.adam_rows`."""
+    half = table.half()
+    row_adam.adam_rows(table, gradient, first, second, half=half, step=step, rate=rate, betas=betas, eps=eps)
