@@ -669,4 +669,21 @@ GROUPS: tuple[Group, ...] = (
             Mutant("had & ~seen", "~seen"),
         ),
     ),
+    Group(
+        "surface/next_views.py",
+        ("tests/test_next_views.py",),
+        "not doctor",
+        (),
+        (
+            Mutant("np.radians(angle_deg) * across", "angle_deg * across"),
+            Mutant("np.cross(offset, up)", "np.cross(up, offset) * 0 + up"),
+            Mutant("min((_near(photo)", "max((10 * _near(photo)"),
+            Mutant("coverage < ENOUGH]", "coverage < 1]"),
+            Mutant("coverage += seen[:, best]", "coverage += 0"),
+            Mutant("np.argmax(gains)", "np.argmin(gains)"),
+            Mutant("if not gains[best]:", "if False:"),
+            Mutant("gains[[index for index, _ in chosen]] = 0", "pass"),
+            Mutant("(points < grid.high)", "(points < grid.high - 0.3)"),
+        ),
+    ),
 )

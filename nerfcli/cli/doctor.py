@@ -23,13 +23,14 @@ _STYLES = {"good": "green", "look": "yellow", "bad": "bold red"}
 @command
 def doctor(
     capture: Annotated[
-        str, typer.Argument(help="Folder of photos or a scene, or - to read paths from standard input.")
+        str, typer.Argument(help="Folder of photos, a scene, or a run, or - to read paths from standard input.")
     ],
     output: Output = None,
     intrinsics: Intrinsics = None,
     require: Annotated[
         str | None, typer.Option(help="good or look: exit code 7 if any finding is worse.", show_default=False)
     ] = None,
+    views: Annotated[int, typer.Option(help="Runs: number of further photos to suggest.", min=1, max=100)] = 5,
     threads: Threads = 0,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -41,6 +42,9 @@ def doctor(
     cameras. Prints a table on stderr and writes a page with thumbnails next to the capture, CAPTURE-doctor.html. Each
     finding is good, look or bad, with its number, its threshold and advice.
 
+    Of a run: the percentage of the surface that no, one, two or more training photos have seen, and the positions from
+    which further photos would see most of what fewer than two have, as a camera path in RUN-next-views/.
+
     Of a scan by X-rays: I > I0, drift, rings, counts, truncation, directions and number of views, the centre of
     rotation, beam hardening.
 
@@ -50,9 +54,12 @@ def doctor(
       nerfcli doctor photos/kitchen --json -o kitchen.html | jq .verdict
       nerfcli doctor photos/kitchen --intrinsics calibration/cameras.txt
       nerfcli doctor photos/kitchen --require look
+      nerfcli doctor photos-scene-run --views 8
+      nerfcli render photos-scene-run --cameras photos-scene-run-next-views/cameras.json
       ls -d captures/*/ | nerfcli doctor - -o pages/
     """
     one_of(require, _GATES, "--require")
+    from nerfcli.cameras.formats.run_cameras import find_run
     from nerfcli.doctor.examination import content
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.workflows.doctor import examine_capture
@@ -60,6 +67,14 @@ def doctor(
     console = Console(quiet=quiet, json_lines=json)
 
     def work(path: Path, one_of_many: bool) -> None:
+        if find_run(path) is not None:
+            if intrinsics is not None or require is not None:
+                raise UserError(
+                    f"{path}: --intrinsics and --require are for photos, and this is a run", "leave them out"
+                )
+            folder = result_path(path, suffix="-next-views", output=output, one_of_many=one_of_many)
+            _examine_run(path, folder, console, count=views, threads=threads, overwrite=overwrite)
+            return
         page = result_path(path, suffix="-doctor.html", output=output, one_of_many=one_of_many)
         if recognise(path) is not None:
             if intrinsics is not None:
@@ -82,6 +97,29 @@ def doctor(
             _hold_against(diagnosis, require)
 
     for_each_input(capture, work)
+
+
+def _examine_run(path: Path, folder: Path, console: Console, *, count: int, threads: int, overwrite: bool) -> None:
+    """The same for a run: what its photos have seen."""
+    from nerfcli.workflows.next_views import examine_run
+
+    with console.progress(f"doctor {path.name}") as update:
+        found = examine_run(
+            path, folder, count=count, threads=threads, overwrite=overwrite, notify=console.note, progress=update
+        )
+    shares = [(f"{name} of {found.photos}", f"{100 * share:.1f} %") for name, share in found.shares.items()]
+    console.table(("photos that see it", "surface"), shares, styles={})
+    if not found.views:
+        console.note("no further view would see a part of the surface that fewer than two photos see")
+        return
+    rows = [
+        (view.name, " ".join(f"{value:.3g}" for value in view.centre), f"{100 * gain:.1f} %")
+        for view, gain in zip(found.views, found.gains, strict=True)
+    ]
+    console.table(("further photo", "position", "surface it would be first or second to see"), rows, styles={})
+    before, after = found.seen_twice
+    console.note(f"two photos or more see {100 * before:.1f} % of the surface, with these {100 * after:.1f} %")
+    console.result(folder, found.to_json())
 
 
 def _examine_scan(path: Path, page: Path, console: Console, *, overwrite: bool, require: str | None) -> None:

@@ -26,6 +26,8 @@ from nerfcli.workflows.notices import Notify, warn_python
 PATHS = ("orbit", "ellipse", "spiral", "interpolate")
 # From this field of view on, a lens sees behind the camera.
 BEHIND_FROM_DEG = 180.0
+# What `write_frames` writes.
+_FRAME_FILES = ("cameras.json", "camera_path.json")
 # Formats whose folders `nerfcli train` takes.
 SCENES = ("nerfcli", "colmap", "transforms", "blender", "llff")
 
@@ -177,9 +179,8 @@ def write_frames(
     """
     views = tuple(replace(frame, image=None, mask=None, split=None) for frame in frames)
     capture = Capture(views, np.zeros((0, 3)), (), None, "camera-path")
-    listed, path = target / "cameras.json", target / "camera_path.json"
-    if there := [file for file in (listed, path) if file.exists() and not overwrite]:
-        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another folder with -o")
+    refuse_frames(target, overwrite=overwrite)
+    listed, path = (target / name for name in _FRAME_FILES)
     for loss in losses_camera_path(capture):
         warn(f"{path.name} cannot hold {loss}; use {listed.name} instead")
     try:
@@ -188,6 +189,16 @@ def write_frames(
         raise cannot_write(target, error) from error
     write_transforms(capture, listed)
     write_camera_path(capture, path, fps=fps)
+
+
+def refuse_frames(target: Path, *, overwrite: bool) -> None:
+    """Refuse a folder with what `write_frames` writes.
+
+    Raises:
+        UserError: one of the files exists.
+    """
+    if there := [target / name for name in _FRAME_FILES if (target / name).exists() and not overwrite]:
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another folder with -o")
 
 
 def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:

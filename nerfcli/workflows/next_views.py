@@ -1,0 +1,123 @@
+"""Examine a run: how much of the surface its photos have seen, and where further photos would see most of the rest."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.render.visibility import coverage_and_parallax, depth_maps, sees
+from nerfcli.runs.run import Run
+from nerfcli.surface.extent import scene_box
+from nerfcli.surface.grid import Grid
+from nerfcli.surface.next_views import candidate_frames, in_free_space, next_views, surface_points
+from nerfcli.workflows.machine import thread_count
+from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.photo_depths import photo_depths
+from nerfcli.workflows.views import refuse_frames, write_frames
+
+# Longer side of the candidates' depth maps in pixels, and voxels along the longest side of the box.
+_CANDIDATE_PX, _CELLS = 96, 128
+# Coverage from which each part of the surface begins.
+STRATA = {"none": 0, "one": 1, "two or three": 2, "four or more": 4}
+
+
+@dataclass(frozen=True)
+class RunCoverage:
+    """How much of the surface the photos of a run have seen.
+
+    Args:
+        photos: training photos.
+        box: x0, y0, z0, x1, y1, z1 in the scene's frame; the surface in it counts.
+        shares: of the surface, by how many photos see it; the keys of `STRATA`.
+        views: where to take further photos, best first.
+        gains: of each, the share of the surface that it would be the first or second to see.
+        seen_twice: the share that two photos or more see, before and after them.
+    """
+
+    photos: int
+    box: tuple[float, ...]
+    shares: dict[str, float]
+    views: tuple[Frame, ...]
+    gains: tuple[float, ...]
+    seen_twice: tuple[float, float]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; a view has its pose."""
+        views = [
+            {"name": view.name, "gain": gain, "world_from_cam": view.world_from_cam.tolist()}
+            for view, gain in zip(self.views, self.gains, strict=True)
+        ]
+        return {
+            "photos": self.photos,
+            "box": list(self.box),
+            "shares": self.shares,
+            "seen_twice": list(self.seen_twice),
+            "next_views": views,
+        }
+
+
+def examine_run(
+    run: Path,
+    target: Path,
+    *,
+    count: int,
+    threads: int = 0,
+    overwrite: bool = False,
+    notify: Notify = silent,
+    progress: Progress = no_progress,
+) -> RunCoverage:
+    """Measure the coverage of a run's surface, and write the suggested views as a camera path.
+
+    Args:
+        run: the folder that training wrote.
+        target: the folder to write, cameras.json and camera_path.json.
+        count: how many views to suggest.
+        threads: of the CPU; 0 for all.
+        overwrite: replace the files at `target`.
+        notify: takes lines for the user.
+        progress: takes the share that is done and a few words.
+
+    Raises:
+        UserError: no such run, nothing to be seen, or the files exist.
+    """
+    refuse_frames(target, overwrite=overwrite)
+    trained = Run(run)
+    torch.set_num_threads(thread_count(threads))
+    model, frames = trained.model(), trained.cameras.train
+    photos = photo_depths(trained, model, on_progress=lambda share: progress(0.4 * share, "photos"), notify=notify)
+    box = scene_box(model, frames)
+    low, high = np.array(box[:3]), np.array(box[3:])
+    grid = Grid.over(box, float((high - low).max()) / _CELLS)
+    candidates = candidate_frames(frames, depth_hint=1.0 / model.training_from_scene.scale)
+    rendered = depth_maps(
+        model, candidates, max_size=_CANDIDATE_PX, on_progress=lambda share: progress(0.4 + 0.5 * share, "candidates")
+    )
+    views = in_free_space(rendered, photos)
+    points = surface_points([*photos, *views], grid)
+    coverage, _ = coverage_and_parallax(photos, points)
+    progress(0.95, "choosing")
+    seen = np.stack([sees(view, points) for view in views], axis=1)
+    chosen = next_views(seen, coverage, count=count)
+    after = coverage + seen[:, [index for index, _ in chosen]].sum(axis=1)
+    by_name = {frame.name: frame for frame in candidates}
+    found = [
+        replace(by_name[views[index].frame.name], name=f"next_{place:02d}")
+        for place, (index, _) in enumerate(chosen, start=1)
+    ]
+    if found:
+        write_frames(found, target, fps=1.0, overwrite=overwrite)
+    bounds = [*STRATA.values(), np.inf]
+    return RunCoverage(
+        photos=len(frames),
+        box=box,
+        shares={
+            name: float(((coverage >= low) & (coverage < high)).mean())
+            for name, low, high in zip(STRATA, bounds[:-1], bounds[1:], strict=True)
+        },
+        views=tuple(found),
+        gains=tuple(gain / len(points) for _, gain in chosen),
+        seen_twice=(float((coverage >= 2).mean()), float((after >= 2).mean())),
+    )
