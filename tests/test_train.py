@@ -230,6 +230,37 @@ def test_pixels_drawn_by_their_error_resume_bit_for_bit(views, tmp_path):
     assert anywhere[-1].loss != straight[-1].loss
 
 
+@pytest.mark.parametrize("steps", [1, 600, 1800, 1801, 9000])
+@pytest.mark.parametrize("first", [2**13, 2**16, 2**17])
+def test_expected_samples_are_the_sum_over_the_steps(first, steps):
+    settings = replace(FEW, first_samples_per_step=first, samples_per_step=2**16, steps=steps)
+    total = sum(min(2**16, first * 2 ** (step / 600)) for step in range(steps))
+    assert settings.expected_samples == pytest.approx(total, rel=1e-3)
+    by_time = replace(settings, budget_seconds=1e-3)
+    assert by_time.expected_samples == pytest.approx(min(total, 2e3), rel=1e-3)
+
+
+def test_longer_trainings_have_more_rows_and_given_ones_stay():
+    budgets = [1e-6, 15, 60, 120, 300, 600, 1800, 1e9]
+    rows = [replace(FEW, steps=None, budget_seconds=seconds).chosen_log2_rows for seconds in budgets]
+    assert rows == sorted(rows)
+    assert (rows[0], rows[1], rows[-1]) == (16, 16, 18)
+    assert replace(FEW, log2_rows=12).chosen_log2_rows == 12
+    assert replace(FEW, steps=4000).chosen_log2_rows == replace(FEW, steps=4000, threads=1).chosen_log2_rows
+
+
+def test_a_training_that_goes_on_to_a_larger_total_keeps_its_rows(views, tmp_path, monkeypatch):
+    """The larger total alone would have chosen more; rows that are asked for by number are refused."""
+    fit(views, tmp_path / "run", replace(FEW, steps=2))
+    monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 17)
+    assert replace(FEW, steps=3).chosen_log2_rows == 17
+    fit(views, tmp_path / "run", replace(FEW, steps=3), resume=True)
+    assert load_model(tmp_path / "run" / "field.safetensors", "cpu").field.settings.to_json()["log2_rows"] == 16
+    assert read_config(tmp_path / "run").settings.log2_rows == 16
+    with pytest.raises(UserError, match="was trained with another field"):
+        fit(views, tmp_path / "run", replace(FEW, steps=4, log2_rows=17), resume=True)
+
+
 def test_resume_goes_on_to_a_larger_total(views, tmp_path):
     fit(views, tmp_path / "run", replace(FEW, steps=3))
     second = fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True)

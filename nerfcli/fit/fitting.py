@@ -28,9 +28,6 @@ OCCUPANCY_SIDE = 64
 REFRESH_EVERY = 8
 REFRESH_TURNS = 8
 MOST_RAYS = 2**14
-# Steps until a step is twice as large. What many steps have gone over is learned by larger ones, which cost less for a
-# sample; a training that has few steps in all learns more from many small ones.
-DOUBLING_STEPS, MOST_DOUBLINGS = 600, 16
 # Rays of the training end where less than a thousandth of the light is left.
 DEEPEST = 7.0
 # Rays pass over cells where a step takes away less light than this: hardly any at first, when all of space is thin fog
@@ -104,7 +101,7 @@ class Fitting:
                 hash_grid=HashFieldSettings(
                     contraction=contraction,
                     levels=settings.levels,
-                    log2_rows=settings.log2_rows,
+                    log2_rows=settings.chosen_log2_rows,
                     width=settings.width,
                     view_degree=self.components.view,
                     antialias=self.components.antialias,
@@ -172,9 +169,7 @@ class Fitting:
         settings = self.settings
         if self.step % REFRESH_EVERY == 0:
             self._refresh_occupancy()
-        growth = 2.0 ** min(self.step / DOUBLING_STEPS, MOST_DOUBLINGS)
-        wanted = min(settings.samples_per_step, growth * settings.first_samples_per_step)
-        rays = min(self._most_rays, max(64, round(wanted / max(1.0, self.samples_per_ray))))
+        rays = min(self._most_rays, max(64, round(settings.samples_at(self.step) / max(1.0, self.samples_per_ray))))
         source = self.pool if self.error_map is None or self.furthest < BEGINS else self.error_map
         drawn = source.draw(rays, self.generator)
         if self.points is None or fading(fraction) == 0.0:

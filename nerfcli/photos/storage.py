@@ -59,7 +59,7 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     if settings.model == "auto":  # trials learn from a list of the pixels that they are not judged by
         photos += 9 * sum(sizes) + 12 * sum(of_cameras.values())
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
-    field_bytes = settings.field_memory_bytes or {"hash": 16 * settings.levels * 2**settings.log2_rows}.get(
+    field_bytes = settings.field_memory_bytes or {"hash": 16 * settings.levels * 2**settings.chosen_log2_rows}.get(
         settings.field, _LARGEST_FIELD_BYTES
     )
     step = _COPIES_OF_FIELD * field_bytes + _BYTES_PER_SAMPLE * settings.samples_per_step

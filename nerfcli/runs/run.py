@@ -130,10 +130,10 @@ class Run:
             )
 
     def is_trained_from(self, scene: Scene, settings: TrainSettings) -> bool:
-        """Whether it was trained from this scene with these settings; threads and device aside, an automatic downscale
-        and contraction counting as whatever was chosen."""
+        """Whether it was trained from this scene with these settings; threads and device aside, an automatic downscale,
+        contraction and number of rows counting as whatever was chosen."""
         wanted = {key: value for key, value in settings.to_json().items() if key not in ("device", "threads")}
-        for name in ("downscale", "contraction"):
+        for name in ("downscale", "contraction", "log2_rows"):
             if wanted[name] is None:
                 del wanted[name]
         trained = self.config.settings.to_json()

@@ -1,6 +1,7 @@
 """Everything a training depends on, besides the scene."""
 
 import dataclasses
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,6 +16,14 @@ DOWNSCALES = (1, 2, 4, 8)
 AUTO_LONGER_SIDE_PX = 800
 # Sizes of a training on a GPU, which has nothing to do in small steps, and room for large tables.
 GPU_SIZES: dict[str, Any] = {"first_samples_per_step": 2**16, "samples_per_step": 2**18, "log2_rows": 19}
+# Steps until a step is twice as large. What many steps have gone over is learned by larger ones, which cost less for a
+# sample; a training that has few steps in all learns more from many small ones.
+DOUBLING_STEPS, MOST_DOUBLINGS = 600, 16
+# Samples that a training with a budget of time is expected to have for each second and CPU thread.
+SAMPLES_PER_SECOND = 1e6
+# Short trainings learn more with few rows, each of which is seen often; long ones have room for what photos show. Four
+# times as many at the end make the file of a field 34 MB and a sample a quarter slower.
+FEWEST_LOG2_ROWS, MOST_LOG2_ROWS, SAMPLES_PER_ROW = 16, 18, 900
 
 
 @dataclass(frozen=True)
@@ -35,7 +44,8 @@ class TrainSettings:
         learning_rate, final_learning_rate: of Adam at the start and when the budget is used up.
         warmup_steps: steps over which the learning rate rises from 0.
         levels, log2_rows, width: size of a hash grid; see `HashFieldSettings`. There are compiled kernels for 8 levels
-            and width 32, on a GPU also 64; other sizes train in plain torch, many times slower.
+            and width 32, on a GPU also 64; other sizes train in plain torch, many times slower. Rows are None for
+            automatic, see `chosen_log2_rows`.
         components: what is in the model and in its loss.
         field: what the field is made of, one of `kinds.KINDS`.
         field_memory_bytes: what the field's numbers may take; None for what suits the kind, see `sizes.chosen_size`.
@@ -60,7 +70,7 @@ class TrainSettings:
     final_learning_rate: float = 1e-3
     warmup_steps: int = 50
     levels: int = 8
-    log2_rows: int = 16
+    log2_rows: int | None = None
     width: int = 32
     components: Components = dataclasses.field(default_factory=Components)
     field: str = HashFieldSettings.kind
@@ -69,7 +79,7 @@ class TrainSettings:
     fixed: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if min(self.levels, self.width) < 1 or not 4 <= self.log2_rows <= 24:
+        if min(self.levels, self.width) < 1 or not 4 <= (self.log2_rows or 4) <= 24:
             sizes = f"levels {self.levels}, log2-rows {self.log2_rows}, width {self.width}"
             raise UserError(
                 f"invalid size of the field: {sizes}", "levels and width must be at least 1, log2-rows between 4 and 24"
@@ -96,6 +106,32 @@ class TrainSettings:
             )
         if self.contraction not in (None, *CONTRACTIONS):
             raise UserError(f"unknown contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")
+
+    def samples_at(self, step: float) -> float:
+        """Return the number of samples that a step aims at, the first one being step 0."""
+        growth = 2.0 ** min(step / DOUBLING_STEPS, MOST_DOUBLINGS)
+        return min(self.samples_per_step, growth * self.first_samples_per_step)
+
+    @property
+    def expected_samples(self) -> float:
+        """The samples of the whole training, about: by its steps or by its time on this many threads."""
+        by_steps, by_time = math.inf, math.inf
+        if self.steps is not None:
+            growth = max(1.0, self.samples_per_step / self.first_samples_per_step)
+            rising = min(self.steps, DOUBLING_STEPS * math.log2(growth))
+            rise = DOUBLING_STEPS / math.log(2) * (self.samples_at(rising) - self.samples_at(0))
+            by_steps = rise + (self.steps - rising) * self.samples_per_step
+        if self.budget_seconds is not None:
+            by_time = SAMPLES_PER_SECOND * self.threads * self.budget_seconds
+        return min(by_steps, by_time)
+
+    @property
+    def chosen_log2_rows(self) -> int:
+        """The rows of each table as a power of two: as given, or by the length of the training."""
+        if self.log2_rows is not None:
+            return self.log2_rows
+        rows = round(math.log2(self.expected_samples / SAMPLES_PER_ROW))
+        return min(max(rows, FEWEST_LOG2_ROWS), MOST_LOG2_ROWS)
 
     def to_json(self) -> dict[str, Any]:
         return {**asdict(self), "fixed": list(self.fixed)}

@@ -75,6 +75,9 @@ def train(
     kernels.prepare(notify, settings.device)
     saved = load_tensors(run / STATE, settings.device) if resume else None
     begun = decisions_of(run, settings, saved[1]) if saved is not None else None
+    # A training that goes on to a larger budget keeps the rows that it has.
+    rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
+    settings = replace(settings, log2_rows=rows or settings.chosen_log2_rows)
     prepared = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
     fitting = prepared.fitting()
     size = ", ".join(f"{name} {value}" for name, value in fitting.field.settings.to_json().items())
