@@ -87,6 +87,9 @@ def train(
         bool, typer.Option("--view", help="Show the field in a browser while it trains; see nerfcli view.")
     ] = False,
     memory: DeviceMemory = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show how much memory, disk and time it would take.")
+    ] = False,
     device: Device = "auto",
     seed: Seed = 0,
     threads: Threads = 0,
@@ -135,6 +138,7 @@ def train(
     Examples:
       nerfcli train photos-scene --budget 90s
       nerfcli train photos-scene --budget 5m --resume
+      nerfcli train photos-scene --budget 5m --dry-run --json
       nerfcli train photos-scene --view
       nerfcli train photos-scene --holdout block:0.15 -o gap-run
       nerfcli train data/lego --steps 2000 --downscale 2 -o lego-run
@@ -151,6 +155,7 @@ def train(
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
     from nerfcli.workflows.train import train_scene
+    from nerfcli.workflows.train_plan import plan_training
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
@@ -226,14 +231,26 @@ def train(
                 progress=update,
             )
 
+    def plan_one_scene(folder: Path) -> None:
+        plan = plan_training(folder, photo_settings(), memory_bytes=limit, holdout=rule)
+        if json:
+            console.result(folder, plan.to_json())
+        else:
+            typer.echo(f"{folder}: {plan.describe()}")
+
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
         if is_scan(folder):
+            if dry_run:
+                raise UserError(f"{folder} is a scan; --dry-run is for photos", "remove --dry-run")
             train_one_scan(folder, run)
         elif recognise(folder):
             raise UserError(
                 f"{folder} is a scan in a scanner's format", f"convert it first: nerfcli convert {folder} SCAN"
             )
+        elif dry_run:
+            plan_one_scene(folder)
+            return
         else:
             train_one_scene(folder, run)
         console.result(run)

@@ -59,12 +59,15 @@ def needs_of(frames: Sequence[Frame], factor: int, *, settings: TrainSettings) -
     if settings.model == "auto":  # trials learn from a list of the pixels that they are not judged by
         photos += 9 * sum(sizes) + 12 * sum(of_cameras.values())
     largest = max(frame.camera.width * frame.camera.height for frame in frames)
-    field_bytes = settings.field_memory_bytes or {"hash": 16 * settings.levels * 2**settings.chosen_log2_rows}.get(
-        settings.field, _LARGEST_FIELD_BYTES
-    )
-    step = _COPIES_OF_FIELD * field_bytes + _BYTES_PER_SAMPLE * settings.samples_per_step
+    step = _COPIES_OF_FIELD * field_bytes(settings) + _BYTES_PER_SAMPLE * settings.samples_per_step
     rest = _BYTES_PER_DECODED_PIXEL * largest * min(settings.threads, len(frames)) + step
     return Needs(photos, step, rest + resident_bytes(os.getpid()))
+
+
+def field_bytes(settings: TrainSettings) -> int:
+    """Estimate the memory of the numbers of a field, once."""
+    hash_rows = 16 * settings.levels * 2**settings.chosen_log2_rows
+    return settings.field_memory_bytes or (hash_rows if settings.field == "hash" else _LARGEST_FIELD_BYTES)
 
 
 class InMemory:

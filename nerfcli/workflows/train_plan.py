@@ -1,0 +1,86 @@
+"""Memory, disk space and time of a training before it starts, for people and for schedulers of clusters."""
+
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from nerfcli import scene as scenes
+from nerfcli.photos.storage import InFiles, field_bytes, needs_of, storage_for
+from nerfcli.runs.settings import TrainSettings, automatic_downscale
+
+# The field (1), the state with both moments of the optimiser (3), and the previous state until the next is whole (3).
+_FIELDS_ON_DISK = 7
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """What a training takes.
+
+    Args:
+        train_photos, held_out_photos: how many.
+        downscale: factor by which photos are reduced.
+        pixels: of the training photos, after that.
+        memory_bytes: of the process, at its peak.
+        disk_bytes: of the run folder at its largest, with photos in it that memory cannot hold.
+        seconds: the budget, which includes the automatic selection but not the reading of photos; None for a training
+            by steps.
+        steps: of a training by steps; None for one by time.
+    """
+
+    train_photos: int
+    held_out_photos: int
+    downscale: int
+    pixels: int
+    memory_bytes: int
+    disk_bytes: int
+    seconds: float | None
+    steps: int | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
+
+    def describe(self) -> str:
+        """Return one sentence."""
+        length = f"{self.steps} steps" if self.seconds is None else f"{self.seconds:.0f} s"
+        return (
+            f"{self.train_photos} training photos and {self.held_out_photos} held out, {self.pixels / 1e6:.1f} million "
+            f"pixels (photos reduced by {self.downscale}): {length}, about {self.memory_bytes / 1e9:.2f} GB of memory, "
+            f"{self.disk_bytes / 1e9:.2f} GB on disk"
+        )
+
+
+def plan_training(
+    scene: str | Path, settings: TrainSettings, *, memory_bytes: int | None = None, holdout: str | None = None
+) -> TrainingPlan:
+    """Return what `train_scene` would take. Photos are not opened, and nothing is written.
+
+    Example:
+        >>> from nerfcli.runs.settings import TrainSettings
+        >>> from nerfcli.workflows.train_plan import plan_training
+        >>> plan_training("photos-scene", TrainSettings(budget_seconds=300)).memory_bytes
+
+    Args:
+        scene, settings, memory_bytes, holdout: as for `train_scene`.
+
+    Raises:
+        UserError: the scene cannot be read, has no training photo, or does not fit into memory.
+    """
+    loaded = scenes.load(Path(scene), holdout=holdout)
+    first = loaded.train_frames[0].camera
+    factor = settings.downscale or automatic_downscale(first.width, first.height)
+    needs = needs_of((*loaded.train_frames, *loaded.test_frames), factor, settings=settings)
+    storage, _ = storage_for(needs, memory_bytes, folder=Path(tempfile.gettempdir()))
+    in_files = needs.photos if isinstance(storage, InFiles) else 0
+    total = needs.photos + needs.rest
+    return TrainingPlan(
+        train_photos=len(loaded.train_frames),
+        held_out_photos=len(loaded.test_frames),
+        downscale=factor,
+        pixels=sum((f.camera.width // factor) * (f.camera.height // factor) for f in loaded.train_frames),
+        memory_bytes=min(total, memory_bytes) if memory_bytes else total,
+        disk_bytes=_FIELDS_ON_DISK * field_bytes(settings) + in_files,
+        seconds=settings.budget_seconds,
+        steps=settings.steps,
+    )

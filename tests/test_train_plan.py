@@ -1,0 +1,51 @@
+"""The plan of a training beside what a training leaves, and through the command."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from conftest import SPHERES
+from typer.testing import CliRunner
+
+from nerfcli.cli import app
+from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.workflows.train_plan import plan_training
+
+STEPS = TrainSettings(budget_seconds=None, steps=250)
+
+
+def test_disk_space_covers_a_run_and_the_state_that_is_replaced(spheres_run: Path) -> None:
+    files = {file.name: file.stat().st_size for file in spheres_run.iterdir()}
+    largest = sum(files.values()) + files["state.safetensors"]
+    planned = plan_training(SPHERES, STEPS).disk_bytes
+    assert planned == pytest.approx(largest, rel=0.1)
+
+
+def test_photos_that_memory_cannot_hold_are_on_the_disk() -> None:
+    """96 x 72 RGBA bytes of 24 photos, and what the search and cameras keep beside them."""
+    free = plan_training(SPHERES, STEPS)
+    assert (free.train_photos, free.held_out_photos, free.downscale, free.pixels) == (21, 3, 1, 21 * 96 * 72)
+    limited = plan_training(SPHERES, STEPS, memory_bytes=free.memory_bytes - 10_000)
+    assert limited.memory_bytes == free.memory_bytes - 10_000
+    assert limited.disk_bytes - free.disk_bytes >= 24 * 96 * 72 * 4
+    with pytest.raises(UserError) as refused:
+        plan_training(SPHERES, STEPS, memory_bytes=10**7)
+    assert refused.value.exit_code == OUT_OF_MEMORY
+
+
+def test_twice_the_rows_take_twice_the_field() -> None:
+    small, large = (plan_training(SPHERES, replace(STEPS, log2_rows=rows)) for rows in (18, 19))
+    assert large.disk_bytes == 2 * small.disk_bytes
+
+
+def test_dry_run_prints_the_plan_and_writes_nothing(capture: Path) -> None:
+    result = CliRunner().invoke(app, ["train", str(capture), "--budget", "90s", "--dry-run", "--json"])
+    assert result.exit_code == 0, result.stderr
+    printed = json.loads(result.stdout)
+    assert (printed["path"], printed["seconds"], printed["steps"]) == (str(capture), 90, None)
+    assert (
+        CliRunner().invoke(app, ["train", str(capture), "--dry-run"]).stdout.startswith(f"{capture}: 4 training photos")
+    )
+    assert not capture.with_name("spheres-run").exists()
