@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import Browser, find_browser
 from fog import fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
@@ -21,7 +22,7 @@ from nerfcli.media.colour_maps import levels_of
 from nerfcli.render.depth import DepthRequest
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.page import page_html
-from nerfcli.report.run_facts import RunFacts, labels_of, mismatches_of, warnings_of
+from nerfcli.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of
 from nerfcli.report.views import ERROR_RANGE, Seen, common_names, depth_range, error_map, spread_evenly
 from nerfcli.report.views import look_at as look_through
 from nerfcli.runs.components import Components
@@ -138,7 +139,7 @@ def test_runs_are_shown_by_photos_that_all_of_them_hold_out():
 
 def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
     look, _ = seen
-    text = page_html([facts()], [look], depth=_meta())
+    text = page_html([facts()], [look], depths=[_meta()])
     for told in (
         "23.46 dB",
         "0.7500",
@@ -158,10 +159,52 @@ def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
     assert all(layer["uri"].startswith("data:image/jpeg;base64,") for view in layers for layer in view)
 
 
+def two_captures(seen: tuple[list[Seen], np.ndarray]) -> str:
+    """A page about two runs of one capture and one of another, whose photo has the same name."""
+    look, _ = seen
+
+    def holding(label: str, image: str, psnr: float) -> RunFacts:
+        frame = replace(camera_at("a.png", (0, 0, -2)), image=Path(image))
+        metrics = {**(facts().metrics or {}), "mean": {"psnr": psnr}}
+        return facts(label, frames=RunCameras((), (frame,)), metrics=metrics)
+
+    runs = [holding("one", "x/a.png", 9.5), holding("two", "y/a.png", 30.0), holding("three", "x/a.png", 25.0)]
+    assert captures_of(runs) == [[0, 2], [1]]
+    return page_html(runs, [look] * 3, depths=[_meta()] * 3)
+
+
+def test_photos_of_the_same_name_in_two_captures_stay_apart(seen):
+    text = two_captures(seen)
+    data = re.search(r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL)
+    assert data is not None
+    rendered = [[layer["label"] for layer in view if "rendered" in layer["label"]] for view in json.loads(data[1])]
+    assert rendered == [["one: rendered", "three: rendered"]] * len(seen[0]) + [["two: rendered"]] * len(seen[0])
+    assert "different held-out photos" not in text
+    assert text.count('<img class="thumbnail"') == 3
+    look, _ = seen
+    assert 'class="thumbnail"' not in page_html([facts(), facts()], [look, look], depths=[_meta()] * 2)
+
+
+@pytest.mark.skipif(find_browser() is None, reason="no browser")
+def test_captures_are_sorted_by_a_click(seen, tmp_path):
+    (tmp_path / "page.html").write_text(two_captures(seen), encoding="utf-8")
+    with Browser(tmp_path / "profile") as browser:
+        browser.send("Page.navigate", url=(tmp_path / "page.html").resolve().as_uri())
+        browser.wait("document.readyState == 'complete' && document.querySelectorAll('.sortable').length")
+        click = "[...document.querySelectorAll('.sortable button')].find(b => b.textContent == 'PSNR, dB').click()"
+        order = "[...document.querySelectorAll('.sortable tbody tr')].map(row => row.cells[1].textContent).join()"
+        assert browser.run(order) == "one,two,three"
+        browser.run(click)
+        assert browser.run(order) == "one,three,two"  # 9.5 before 25: by number, not by text
+        browser.run(click)
+        assert browser.run(order) == "two,three,one"
+        assert not browser.errors
+
+
 def test_what_comes_from_outside_stays_text(seen):
     look, _ = seen
     run = facts(EVIL, config=RunConfig(scene=Path(EVIL), versions={EVIL: EVIL}, missing_photos=(EVIL,), unit=EVIL))
-    text = page_html([run], [look], depth=_meta())
+    text = page_html([run], [look], depths=[_meta()])
     assert "<script>alert" not in text
     assert "<b>\"'" not in text
     assert html.escape(EVIL) in text
@@ -170,17 +213,17 @@ def test_what_comes_from_outside_stays_text(seen):
 def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     look, _ = seen
     other = facts("another", config=replace(facts().config, settings=TrainSettings(width=64)))
-    text = page_html([facts(), other], [look, look], depth=_meta())
+    text = page_html([facts(), other], [look, look], depths=[_meta(), _meta()])
     assert "differs: settings.width" in text
     assert text.index("differs: settings.width") < text.index(">settings.seed<")
     assert "another: rendered" in text
     farther = [replace(view, depth=view.depth + 1) for view in look]
     (low, high), (_, highest) = depth_range(look), depth_range([*look, *farther])
     assert f"&gt;= {highest:.3g}" in page_html(
-        [facts(), other], [look, farther], depth=_meta()
+        [facts(), other], [look, farther], depths=[_meta(), _meta()]
     )  # one range for a scene
     foreign = replace(other, config=RunConfig(scene_fingerprint="x"))
-    assert f"&gt;= {high:.3g}" in page_html([facts(), foreign], [look, farther], depth=_meta())
+    assert f"&gt;= {high:.3g}" in page_html([facts(), foreign], [look, farther], depths=[_meta(), _meta()])
     assert low < high < highest
 
 
@@ -199,7 +242,7 @@ def test_the_page_tells_what_saw_the_photos_what_was_chosen_and_how_new_the_view
     chosen = replace(
         run, metrics=metrics, config=replace(run.config, selection=Selection(Components(), (decision,), 1.0))
     )
-    text = page_html([chosen], [look], depth=_meta())
+    text = page_html([chosen], [look], depths=[_meta()])
     for told in (
         "0.123",
         "5.7",
@@ -211,7 +254,7 @@ def test_the_page_tells_what_saw_the_photos_what_was_chosen_and_how_new_the_view
         "-2%",
     ):
         assert told in text
-    assert "view=0" not in page_html([run], [look], depth=_meta())
+    assert "view=0" not in page_html([run], [look], depths=[_meta()])
 
 
 def test_numbers_that_must_not_be_compared_are_named():

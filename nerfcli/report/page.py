@@ -16,7 +16,8 @@ from nerfcli.pages import page
 from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes
 from nerfcli.render.depth import DepthRequest
 from nerfcli.report.drawings import Curve, curves, from_above
-from nerfcli.report.run_facts import RunFacts, mismatches_of, warnings_of
+from nerfcli.report.overview import overview_html
+from nerfcli.report.run_facts import RunFacts, captures_of, mismatches_of, warnings_of
 from nerfcli.report.tables import (
     capture_html,
     ledger_html,
@@ -53,14 +54,14 @@ def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, de
 
 
 def page_html(
-    runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, depth: DepthMeta, origin: str | None = None
+    runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, depths: Sequence[DepthMeta], origin: str | None = None
 ) -> str:
     """The page's text.
 
     Args:
         runs: at least one.
-        looks: what each of them shows of photos of the same names.
-        depth: the meaning of the depths, in the unit of the first run.
+        looks: what each of them shows of held-out photos; runs of a capture show the same ones.
+        depths: the meaning of each run's depths.
         origin: see `origin_of`.
     """
     ranges = _depth_ranges(runs, looks)
@@ -69,9 +70,10 @@ def page_html(
         title=escape(title),
         count="a run" if len(runs) == 1 else f"{len(runs)} runs",
         warnings=_warnings_html(runs),
+        overview=overview_html(runs, looks) if len(captures_of(runs)) > 1 else "",
         numbers=numbers_html(runs),
         views=_views_html(runs, looks, ranges),
-        legends=_legends_html(runs, ranges, depth),
+        legends=_legends_html(runs, ranges, depths),
         curves=_curves_html(runs),
         photos=photos_html(runs),
         capture=capture_html(runs),
@@ -81,7 +83,7 @@ def page_html(
         settings=settings_html(runs),
     )
     style = page.asset("compare.css") + _STYLE
-    script = page.asset("compare.js")
+    script = page.asset("compare.js") + page.asset("sort.js")
     mark = mark_of([run.path for run in runs])
     return page.page_html(title=title, mark=mark, style=style, body=body, script=script, origin=origin)
 
@@ -112,13 +114,13 @@ def _views_html(
     runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], ranges: Sequence[tuple[float, float]]
 ) -> str:
     layers, figures = [], []
-    for name in dict.fromkeys(view.name for look in looks for view in look):
-        seen = [
-            (run, view, limits)
-            for run, look, limits in zip(runs, looks, ranges, strict=True)
-            for view in look
-            if view.name == name
-        ]
+    shown = [
+        (capture, name)
+        for capture in captures_of(runs)
+        for name in dict.fromkeys(view.name for index in capture for view in looks[index])
+    ]
+    for capture, name in shown:
+        seen = [(runs[i], view, ranges[i]) for i in capture for view in looks[i] if view.name == name]
         first = seen[0][1]
         height, width = first.photo.shape[:2]
         facts = "; ".join(
@@ -161,12 +163,13 @@ def _layer(label: str, picture: np.ndarray) -> dict[str, str]:
     return {"label": label, "uri": data_uri(jpeg_bytes(picture, longest_px=_PICTURE_PX), "jpeg")}
 
 
-def _legends_html(runs: Sequence[RunFacts], ranges: Sequence[tuple[float, float]], depth: DepthMeta) -> str:
+def _legends_html(runs: Sequence[RunFacts], ranges: Sequence[tuple[float, float]], depths: Sequence[DepthMeta]) -> str:
     rows = [_legend("error", ERROR_COLOURS, "0", f">= {ERROR_RANGE:g}", "mean absolute difference of sRGB in [0, 1]")]
-    for low, high in dict.fromkeys(ranges):
-        of = [run.label for run, limits in zip(runs, ranges, strict=True) if limits == (low, high)]
+    meanings = [(limits, depth.in_words()) for limits, depth in zip(ranges, depths, strict=True)]
+    for (low, high), words in dict.fromkeys(meanings):
+        of = [run.label for run, meaning in zip(runs, meanings, strict=True) if meaning == ((low, high), words)]
         name = "depth" if len(of) == len(runs) else f"depth, {', '.join(of)}"
-        rows.append(_legend(name, DEPTH_COLOURS, f"<= {low:.3g}", f">= {high:.3g}", depth.in_words()))
+        rows.append(_legend(name, DEPTH_COLOURS, f"<= {low:.3g}", f">= {high:.3g}", words))
     return "".join(rows)
 
 
@@ -212,6 +215,9 @@ def _cameras_html(runs: Sequence[RunFacts]) -> str:
 
 
 _STYLE = """\
+.sortable button{all:unset;cursor:pointer}.sortable button:focus-visible{outline:2px solid var(--bar)}
+[aria-sort=ascending] button::after{content:" \\2191"}[aria-sort=descending] button::after{content:" \\2193"}
+.thumbnail{display:block;max-width:240px;border-radius:3px}
 .warned li{margin:2px 0}.warned b{color:var(--look);margin-right:6px}
 .pairs{grid-template-columns:repeat(auto-fill,minmax(min(100%,420px),1fr))}
 .chart polyline{fill:none;stroke-width:1.6;stroke-linejoin:round}
@@ -226,6 +232,7 @@ _STYLE = """\
 
 _BODY = Template("""\
 <div class="top"><div><h1>$title</h1><p>nerfcli report on $count</p></div></div>
+$overview
 <h2>Numbers</h2>
 $numbers
 <h2>Warnings</h2>

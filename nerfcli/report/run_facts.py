@@ -100,10 +100,24 @@ def warnings_of(facts: RunFacts) -> Iterator[tuple[str, str]]:
         yield from (("evaluation", text) for text in facts.metrics.get("warnings", []))
 
 
+def captures_of(runs: Sequence[RunFacts]) -> list[list[int]]:
+    """Return the indices of the runs by capture: runs that hold out a photo in common are of the same one."""
+    captures: list[tuple[set[str], list[int]]] = []
+    for index, run in enumerate(runs):
+        photos = {str(frame.image.resolve()) if frame.image else frame.name for frame in run.frames.test}
+        found = next((capture for capture in captures if capture[0] & photos), None)
+        if found is None:
+            captures.append((photos, [index]))
+        else:
+            found[0].update(photos)
+            found[1].append(index)
+    return [indices for _, indices in captures]
+
+
 def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
     """List the reasons why metrics of these runs must not be compared."""
     measured = [run for run in runs if run.metrics is not None]
-    if len({run.config.split_sha256 for run in runs}) > 1:
+    if any(len({runs[i].config.split_sha256 for i in capture}) > 1 for capture in captures_of(runs)):
         yield "the runs have different held-out photos"
     if len({(run.metrics or {}).get("protocol") for run in measured}) > 1:
         yield "the runs were evaluated by different protocols"

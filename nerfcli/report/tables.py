@@ -5,7 +5,7 @@ from html import escape
 from typing import Any
 
 from nerfcli.pages.tables import table
-from nerfcli.report.run_facts import RunFacts
+from nerfcli.report.run_facts import RunFacts, captures_of
 
 _MEGA = 1e6
 
@@ -33,7 +33,9 @@ def _protocols_html(runs: Sequence[RunFacts]) -> str:
     return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
 
 
-def _metric(key: str, form: str) -> Callable[[RunFacts], str]:
+def metric(key: str, form: str) -> Callable[[RunFacts], str]:
+    """Return what formats a mean over the held-out photos; "" where there is none."""
+
     def read(run: RunFacts) -> str:
         value = (run.metrics or {}).get("mean", {}).get(key)
         return form.format(value) if isinstance(value, int | float) else ""
@@ -48,6 +50,11 @@ def _of(part: str, key: str, form: str, scale: float = 1.0) -> Callable[[RunFact
         return form.format(value / scale) if isinstance(value, int | float) else ""
 
     return read
+
+
+def render_time(form: str) -> Callable[[RunFacts], str]:
+    """Return what formats the seconds per picture; "" where they were not measured."""
+    return _of("render", "seconds_per_image", form)
 
 
 def _of_kind(kind: str) -> Callable[[RunFacts], str]:
@@ -68,7 +75,8 @@ def number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def _last(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+def last_logged(key: str, form: str, scale: float = 1.0) -> Callable[[RunFacts], str]:
+    """Return what formats the last logged value; "" where there is none."""
     return lambda run: form.format(run.log[-1][key] / scale) if run.log and key in run.log[-1] else ""
 
 
@@ -82,7 +90,8 @@ def _unit(run: RunFacts) -> str:
     return (run.config.unit or "") + (f" ({source})" if source else "")
 
 
-def _registered(run: RunFacts) -> str:
+def registered(run: RunFacts) -> str:
+    """Format how many photos have a pose; "" where the poses came from elsewhere."""
     return f"{run.poses['registered']} of {run.poses['total']}" if run.poses and "registered" in run.poses else ""
 
 
@@ -96,14 +105,19 @@ def _verdict(run: RunFacts) -> str:
 
 
 def photos_html(runs: Sequence[RunFacts]) -> str:
-    """PSNR and SSIM of every held-out photo by every run."""
+    """PSNR and SSIM of every held-out photo by every run, a table for each capture."""
+    tables = (_photos_html([runs[index] for index in capture], of_many=len(runs) > 1) for capture in captures_of(runs))
+    return "".join(filter(None, tables)) or "<p>Not measured.</p>"
+
+
+def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
     by_run = [{image["name"]: image for image in (run.metrics or {}).get("images", [])} for run in runs]
     names = sorted({name for images in by_run for name in images})
     if not names:
-        return "<p>Not measured.</p>"
+        return ""
     columns = ["photo"]
     for run in runs:
-        of = f"{run.label}: " if len(runs) > 1 else ""
+        of = f"{run.label}: " if of_many else ""
         columns += [f"{of}PSNR, dB", f"{of}SSIM"]
     rows = []
     for name in names:
@@ -184,21 +198,21 @@ def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, str]:
 
 
 _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
-    ("PSNR on held-out photos", _metric("psnr", "{:.2f} dB")),
-    ("SSIM", _metric("ssim", "{:.4f}")),
-    ("LPIPS", _metric("lpips", "{:.4f}")),
-    ("PSNR after colour alignment", _metric("psnr_colour_aligned", "{:.2f} dB")),
-    ("PSNR on the right halves", _metric("psnr_right_half", "{:.2f} dB")),
-    ("PSNR on the right halves, poses aligned on the left halves", _metric("psnr_pose_aligned", "{:.2f} dB")),
+    ("PSNR on held-out photos", metric("psnr", "{:.2f} dB")),
+    ("SSIM", metric("ssim", "{:.4f}")),
+    ("LPIPS", metric("lpips", "{:.4f}")),
+    ("PSNR after colour alignment", metric("psnr_colour_aligned", "{:.2f} dB")),
+    ("PSNR on the right halves", metric("psnr_right_half", "{:.2f} dB")),
+    ("PSNR on the right halves, poses aligned on the left halves", metric("psnr_pose_aligned", "{:.2f} dB")),
     ("PSNR on views between training views (interpolation)", _of_kind("interpolation")),
     ("PSNR on views beyond training views (extrapolation)", _of_kind("extrapolation")),
     ("PSNR of billboards (a model without geometry)", _shape),
-    ("training", _last("seconds", "{:.1f} s")),
-    ("steps", _last("step", "{:,.0f}")),
+    ("training", last_logged("seconds", "{:.1f} s")),
+    ("steps", last_logged("step", "{:,.0f}")),
     ("samples per second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),
-    ("peak memory", _last("peak_memory_bytes", "{:.0f} MB", _MEGA)),
+    ("peak memory", last_logged("peak_memory_bytes", "{:.0f} MB", _MEGA)),
     ("checkpoint", lambda run: f"{run.field_bytes / _MEGA:.1f} MB"),
-    ("time per picture", _of("render", "seconds_per_image", "{:.2f} s")),
+    ("time per picture", render_time("{:.2f} s")),
     ("measured on", lambda run: str((run.metrics or {}).get("device", ""))),
 )
 
@@ -210,7 +224,7 @@ _CAPTURE: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("held-out photos", lambda run: str(len(run.frames.test))),
     ("size", _size),
     ("unit of length", _unit),
-    ("poses found", _registered),
+    ("poses found", registered),
     ("result", _verdict),
     ("lenses", _lenses),
     ("points", _of("", "points", "{:,.0f}")),

@@ -46,7 +46,7 @@ class Seen:
 
 
 def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
-    """At most `count` photos that all of the runs hold out, chosen by `spread_evenly` with the first known quality."""
+    """At most `count` photos that all runs of a capture hold out, by `spread_evenly` with the first known quality."""
     names = [frame.name for frame in runs[0].frames.test]
     for run in runs[1:]:
         held_out = {frame.name for frame in run.frames.test}

@@ -11,7 +11,7 @@ from nerfcli.export.settings import depth_meta
 from nerfcli.pages.page import is_made_from, refuse_foreign, write_page
 from nerfcli.render.depth import DepthRequest
 from nerfcli.report.page import mark_of, origin_of, page_html
-from nerfcli.report.run_facts import labels_of, read_facts
+from nerfcli.report.run_facts import captures_of, labels_of, read_facts
 from nerfcli.report.views import common_names, look_at
 from nerfcli.runs.files import REPORT
 from nerfcli.runs.run import load_run
@@ -41,7 +41,7 @@ def report_runs(
     Args:
         runs: folders that training wrote, at least one.
         page: the file; RUN/report.html by default, beside the first run where there are several.
-        views: held-out photos to show at most, from the worst to the best.
+        views: held-out photos of a capture to show at most, from the worst to the best.
         depth: the depth that is shown.
         device, threads: to render with; 0 threads for all.
         overwrite: replace whatever stands there.
@@ -68,7 +68,11 @@ def report_runs(
     if keep and not overwrite and is_made_from(target, origin):
         notify(f"{target} is kept: it is up to date; add --overwrite to write it again")
         return target
-    names = common_names(facts, views)
+    names = [[] for _ in runs]
+    for capture in captures_of(facts):
+        shared = common_names([facts[index] for index in capture], views)
+        for index in capture:
+            names[index] = shared
     looks, meanings = [], []
     progress(0.0, "")
     for index, (run, described) in enumerate(zip(opened, facts, strict=True)):
@@ -82,10 +86,10 @@ def report_runs(
                 f"{run.field_path} was replaced while the report was written",
                 "run the command again when the training is complete",
             )
-        frames = [frame for frame in run.cameras.test if frame.name in names]
+        frames = [frame for frame in run.cameras.test if frame.name in names[index]]
         held_out = held_out_photos_of(run.config, frames, model, threads=thread_count(threads))
         compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
         looks.append(look_at(model, compared, depth=depth, on_progress=on_progress))
         meanings.append(depth_meta(model, depth))
-    write_page(page_html(facts, looks, depth=meanings[0], origin=origin), target)
+    write_page(page_html(facts, looks, depths=meanings, origin=origin), target)
     return target
