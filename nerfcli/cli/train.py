@@ -232,7 +232,9 @@ def train(
             )
 
     def plan_one_scene(folder: Path) -> None:
-        plan = plan_training(folder, photo_settings(), memory_bytes=limit, holdout=rule)
+        on_host = photo_settings().device == "cpu"  # --memory is the GPU's otherwise
+        resident = (limit or default_memory_limit()) if on_host else None
+        plan = plan_training(folder, photo_settings(), memory_bytes=resident, holdout=rule)
         if json:
             console.result(folder, plan.to_json())
         else:
