@@ -13,7 +13,7 @@ from nerfcli.field.background import Background, colours_behind
 from nerfcli.render.depth import DepthRequest, disagreement, median, requested, shares, spread
 from nerfcli.render.model import Model
 from nerfcli.render.pixels import pixels_of_rays
-from nerfcli.render.rays import PictureRays, pixel_rays, places_in_pixel
+from nerfcli.render.rays import PictureRays, successive_rays
 from nerfcli.render.tracing import TOLERANCE, render_rays
 
 RAYS_PER_TILE = 8192
@@ -102,13 +102,12 @@ def render_picture(
     if depth is not None and depth.convention == "background" and depth.background_distance is None:
         raise ValueError("the background convention needs a background distance")
     width, height, count = frame.camera.width, frame.camera.height, quality.samples_per_pixel
-    places = places_in_pixel(count)
     columns: list[tuple[Tensor, ...]] = []
     together = rays_per_tile or (RAYS_PER_TILE if model.device.type == "cpu" else RAYS_PER_GPU_TILE)
     block, tile = max(1, RAYS_PER_BLOCK // count), max(1, together // count)
     for first in range(0, width * height, block):
-        chosen = np.arange(first, min(first + block, width * height))
-        rays = pixel_rays(frame, model.training_from_scene, pixels=chosen, places=places, device=model.device)
+        chosen = range(first, min(first + block, width * height))
+        rays = successive_rays(frame, model.training_from_scene, pixels=chosen, count=count, device=model.device)
         behind = colours_behind(background, rays.directions)
         for begin in range(0, len(chosen), tile):
             part = slice(begin * count, min((begin + tile) * count, len(rays.directions)))
@@ -135,8 +134,8 @@ def render_picture(
 
 def _refuse_non_finite(frame: Frame, maps: dict[str, np.ndarray]) -> None:
     for name, values in maps.items():
-        bad = ~np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1)
-        if bad.any():
+        if not np.isfinite(values).all():
+            bad = ~np.isfinite(values.reshape(*values.shape[:2], -1)).all(-1)
             y, x = np.argwhere(bad)[0]
             raise UserError(
                 f"{name} of {frame.name} is not finite at pixel ({x}, {y}), of {bad.sum()} in all",

@@ -4,6 +4,7 @@ Ray of pixel p:  origin = R c + t scaled,  direction = R_frame R_cam bearing(p) 
 along rays are lengths and density times length is an optical depth.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity
 
@@ -47,23 +49,48 @@ def pixel_rays(
     frame: Frame, training_from_scene: Similarity, *, pixels: np.ndarray, places: np.ndarray, device: torch.device
 ) -> PictureRays:
     """Rays of pixels (M,), counted row by row, at the same places (P, 2) inside [0, 1]^2 of each: N = M * P."""
-    corners = np.stack([pixels % frame.camera.width, pixels // frame.camera.width], axis=-1)
-    bearings, valid = frame.camera.bearings((corners[:, None] + places).reshape(-1, 2))
-    world_from_cam = training_from_scene.apply_pose(frame.world_from_cam)
+    return _turned(frame, training_from_scene, *_bearings(frame.camera, pixels, places, device), count=len(places))
+
+
+def successive_rays(
+    frame: Frame, training_from_scene: Similarity, *, pixels: range, count: int, device: torch.device
+) -> PictureRays:
+    """`pixel_rays` at `places_in_pixel(count)`; a GPU keeps what the next picture of the same camera needs again."""
+    bearings = _bearings_of_range if device.type == "cpu" else _kept_bearings
+    return _turned(frame, training_from_scene, *bearings(frame.camera, pixels, count, device), count=count)
+
+
+def _turned(
+    frame: Frame, training_from_scene: Similarity, bearings: Tensor, valid: Tensor, *, count: int
+) -> PictureRays:
+    """Rays from bearings (N, 3), float64, in the axes of the camera; `count` of them are of the same pixel."""
+    world_from_cam = torch.from_numpy(training_from_scene.apply_pose(frame.world_from_cam)).to(bearings.device)
     # Component by component: products of matrices round differently with the number of rows.
     columns = world_from_cam[:3, :3].T
     directions = bearings[:, :1] * columns[0] + bearings[:, 1:2] * columns[1] + bearings[:, 2:] * columns[2]
-
-    def tensor(values: np.ndarray) -> Tensor:
-        return torch.as_tensor(values, dtype=torch.float32, device=device)
-
+    width = 1.0 / (frame.camera.focal_px * math.sqrt(count))
     return PictureRays(
-        origin=tensor(world_from_cam[:3, 3]),
-        directions=tensor(directions),
-        valid=torch.as_tensor(valid, device=device),
-        cosines=tensor(bearings[:, 2]),
-        cones=tensor(np.full(len(bearings), 1.0 / (frame.camera.focal_px * math.sqrt(len(places))))),
+        origin=world_from_cam[:3, 3].float(),
+        directions=directions.float(),
+        valid=valid,
+        cosines=bearings[:, 2].float(),
+        cones=torch.full((len(bearings),), width, device=bearings.device),
     )
+
+
+def _bearings(camera: Camera, pixels: np.ndarray, places: np.ndarray, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(N, 3) float64 and (N,) bool, whether there are any."""
+    corners = np.stack([pixels % camera.width, pixels // camera.width], axis=-1)
+    bearings, valid = camera.bearings((corners[:, None] + places).reshape(-1, 2))
+    return torch.from_numpy(bearings).to(device), torch.from_numpy(valid).to(device)
+
+
+def _bearings_of_range(camera: Camera, pixels: range, count: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    return _bearings(camera, np.arange(pixels.start, pixels.stop), places_in_pixel(count), device)
+
+
+# For 2 million rays, 25 bytes each.
+_kept_bearings = functools.lru_cache(maxsize=8)(_bearings_of_range)
 
 
 def places_in_pixel(count: int) -> np.ndarray:
