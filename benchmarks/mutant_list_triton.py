@@ -85,7 +85,7 @@ TRITON: tuple[Group, ...] = (
         (
             Mutant("tl.where(h2 > 0, tl.dot(d, tl.trans(fourth)), 0.0)", "tl.dot(d, tl.trans(fourth))"),
             Mutant("slope = a / ((1.0 + a) * (1.0 + a))", "slope = a / (1.0 + a)"),
-            Mutant("scale = tl.where(most > 0.0, LARGEST / most, 1.0)", "scale = tl.where(most > 0.0, 1.0, 1.0)"),
+            Mutant("scale = LARGEST / tl.maximum(tl.load(largest), LEAST)", "scale = 1.0 + tl.load(largest) * 0.0"),
             Mutant("tl.clamp(first, -LIMIT, LIMIT, propagate_nan=tl.PropagateNan.ALL)", "first"),
         ),
     ),

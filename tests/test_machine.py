@@ -22,7 +22,7 @@ def two_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: named)
     monkeypatch.setattr(kernels, "_why_not_triton", lambda index: None if index == 0 else "it is too old")
-    monkeypatch.setattr(kernels, "gpu_launcher", lambda: "CUDA driver")
+    monkeypatch.setattr(kernels, "gpu_launcher", lambda device: "CUDA driver")
     monkeypatch.setattr(kernels, "driver_version", lambda: "13.0")
 
 

@@ -67,7 +67,13 @@ class Waits(TorchDispatchMode):
                 self.note()
             if here:
                 assert first is not None
-                return torch.full(first.shape, ANY, dtype=kwargs.get("dtype") or first.dtype)
+                dtype = kwargs.get("dtype") or first.dtype
+                is_poses = first.shape[-2:] == (4, 4)
+                return (
+                    torch.eye(4, dtype=dtype).expand(first.shape)
+                    if is_poses
+                    else torch.full(first.shape, ANY, dtype=dtype)
+                )
         if name == "copy_" and args[0].device != args[1].device and not (len(args) > 2 and args[2]):
             self.note()
         masks = (
@@ -112,7 +118,7 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device=None: SimpleNamespace(cuda_stream=0))
     monkeypatch.setattr(launch, "_function", count)
-    monkeypatch.setattr(launch, "_with_triton", False)
+    monkeypatch.setattr(launch, "_with_triton", set())
     monkeypatch.setattr(pools, "backend_for", lambda device, dtype: TritonBackend(device))
     with found:
         yield found
@@ -134,7 +140,6 @@ def test_a_step_waits_once_for_the_device(components, most, waits, spheres: Scen
     photos = load_photos(spheres.train_frames[:3], factor=4, threads=1)
     opaque = [photo.__class__(photo.frame, photo.pixels[..., :3].copy(), photo.used) for photo in photos]
     pool = PixelPool(opaque, Similarity(1.0, np.eye(3), np.zeros(3)), GPU)
-    pool.poses = torch.eye(4).repeat(3, 1, 1)  # the host looks at these
     settings = TrainSettings(budget_seconds=None, steps=40, components=components, device="cuda", samples_per_step=2**9)
     known = [PointDepths(*(torch.zeros(9, device=GPU).to(t) for t in (torch.int64, torch.float32, torch.float32)))]
     fitting = Fitting(

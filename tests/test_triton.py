@@ -204,7 +204,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Callable[[FakeDriver], torch.devi
         monkeypatch.setattr(driver, "library", lambda: fake)
         monkeypatch.setattr(driver, "_of_thread", threading.local())
         monkeypatch.setattr(launch, "_loaded", {})
-        monkeypatch.setattr(launch, "_with_triton", False)
+        monkeypatch.setattr(launch, "_with_triton", set())
         monkeypatch.setattr(torch.cuda, "device", lambda device: nullcontext())
         monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device=None: capability)
@@ -273,6 +273,17 @@ def test_an_old_triton_is_refused(device, monkeypatch):
     assert launch.choose_launcher(here) == "Triton 3.5.1 is too old, 3.6 or newer is needed"
 
 
+def test_each_device_has_its_own_launcher(device, kernel_cache, monkeypatch):
+    """One that no launcher works on leaves the others as they are."""
+    here = device(FakeDriver())
+    monkeypatch.setattr(launch, "_counts", lambda device: torch.cuda.current_device() == 1)
+    assert launch.choose_launcher(here) is None
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 2)
+    assert launch.choose_launcher(here) is not None
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
+    assert launch.launcher(here) == "CUDA driver"
+
+
 def test_a_device_on_which_neither_way_works_is_refused_with_both_reasons(device, kernel_cache, monkeypatch):
     """Here the fake driver computes nothing, and Triton's launcher finds no driver."""
     here = device(FakeDriver())
@@ -292,7 +303,7 @@ def test_triton_launches_where_the_driver_cannot(device, kernel_cache, monkeypat
 
     monkeypatch.setattr(JITFunction, "run", counts)
     assert launch.choose_launcher(here) is None
-    assert launch.launcher() == "Triton"
+    assert launch.launcher(here) == "Triton"
 
 
 def test_machine_code_is_kept_on_disk_and_damage_is_noticed(monkeypatch, tmp_path):

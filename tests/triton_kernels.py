@@ -132,6 +132,25 @@ def test_networks(samples, hidden, degree, generator):
         assert_close(a, b.grad if samples else torch.zeros_like(b), name, relative=4 * HALF)
 
 
+@pytest.mark.parametrize(("weights", "gradient"), [(300.0, 1e-6), (1.0, 1e-42), (1.0, 0.0)])
+def test_gradients_of_networks_stay_finite(weights, gradient, generator):
+    """Where layers multiply them beyond float16, and where they are too small to be scaled to it."""
+    layers = layers_of(32, generator)
+    for part in (layers[0], layers[1], layers[2][:, :16]):
+        part *= weights
+    layers[1][0] = 0.0  # densities stay as they are
+    code = (torch.rand(123, 32, generator=generator) / weights**2).half()
+    given = on_device(code, torch.nn.functional.normalize(torch.ones(1, 3), dim=-1), torch.zeros(123).long())
+    density, _ = networks.radiance(*given, on_device(*layers), degree=3)
+    by_code, scale, by_direction, of_layers = networks.radiance_gradients(
+        *given, on_device(*layers), degree=3, density=density, by_density=torch.zeros(123, device=DEVICE),
+        by_rgb=torch.full((123, 3), gradient, device=DEVICE), rays_learn=True,
+    )  # fmt: skip
+    for found in (by_code.float() / scale, by_direction, *of_layers):
+        assert found.isfinite().all()
+    assert (of_layers[4].abs().max() > 0) == (gradient > 1e-30)
+
+
 def test_densities_end_where_their_logarithms_do():
     layers = [torch.zeros(s) for s in ((32, 32), (16, 32), (32, 32), (32, 32), (3, 32))]
     layers[0][0, 0], layers[0][1, 0], layers[1][0, 0], layers[1][0, 1] = 1.0, -1.0, 1.0, -1.0

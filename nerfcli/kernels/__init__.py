@@ -88,11 +88,11 @@ def why_not_triton(device: torch.device) -> str | None:
     return _why_not_triton(device.index if device.index is not None else torch.cuda.current_device())
 
 
-def gpu_launcher() -> str:
-    """Return what starts the GPU kernels, where they work."""
+def gpu_launcher(device: torch.device) -> str:
+    """Return what starts the GPU kernels on a device where they work."""
     from nerfcli.kernels.triton_cuda.launch import launcher
 
-    return launcher()
+    return launcher(device)
 
 
 def driver_version() -> str:

@@ -35,7 +35,9 @@ def describe_machine(processors: int) -> dict[str, Any]:
         )
         why_not = kernels.why_not_triton(device)
         described[f"backend on {device}"] = (
-            f"triton_cuda, launched by {kernels.gpu_launcher()}" if why_not is None else f"reference, because {why_not}"
+            f"triton_cuda, launched by {kernels.gpu_launcher(device)}"
+            if why_not is None
+            else f"reference, because {why_not}"
         )
     return {**described, "cuda of torch": torch.version.cuda, "cuda of the driver": kernels.driver_version()}
 

@@ -155,7 +155,8 @@ def _points_backward(
 def can_hash_encode(table: Tensor, resolutions: tuple[int, ...]) -> bool:
     """Return whether this module supports a table; malformed ones go to the reference's checks."""
     levels, rows, features = table.shape
-    return features == FEATURES and len(resolutions) == levels and rows & (rows - 1) == 0
+    fits = table.numel() < 2**31  # places in the table are counted in 32 bits
+    return features == FEATURES and len(resolutions) == levels and rows & (rows - 1) == 0 and fits
 
 
 def encode(

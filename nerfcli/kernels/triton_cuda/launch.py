@@ -67,7 +67,8 @@ jit: Callable[[Callable[..., Any]], Any] = triton.jit
 # The variants of all launches so far, for those who want to know what to compile.
 seen: dict[Variant, None] = {}
 _loaded: dict[tuple[Variant, int], driver.Function] = {}
-_with_triton = False
+# The devices on which Triton's own launcher is taken.
+_with_triton: set[int] = set()
 
 
 def launch(
@@ -89,15 +90,14 @@ def launch(
         seen[variant] = None
         kernel[grid](*arguments, **constants)
         return
-    device = next(value.device for value in arguments if isinstance(value, Tensor))
+    (device,) = {value.device for value in arguments if isinstance(value, Tensor)}
     with torch.cuda.device(device):
-        if _with_triton:
+        number = torch.cuda.current_device()
+        if number in _with_triton:
             kernel[grid](*arguments, **constants, num_warps=warps, num_stages=stages)
         else:
             values = [value.data_ptr() if isinstance(value, Tensor) else value for value in arguments]
-            _function(variant, torch.cuda.current_device()).launch(
-                grid, values, torch.cuda.current_stream().cuda_stream
-            )
+            _function(variant, number).launch(grid, values, torch.cuda.current_stream().cuda_stream)
 
 
 def choose_launcher(device: torch.device) -> str | None:
@@ -106,14 +106,14 @@ def choose_launcher(device: torch.device) -> str | None:
     Returns:
         None, or why they cannot be launched at all.
     """
-    global _with_triton
     capability = torch.cuda.get_device_capability(device)
     if capability < LEAST_CAPABILITY:
         return f"it has compute capability {capability[0]}.{capability[1]}, and 8.0 or newer is needed"
     if tuple(int(part) for part in triton.__version__.split(".")[:2]) < LEAST_TRITON:
         return f"Triton {triton.__version__} is too old, 3.6 or newer is needed"
     failures = []
-    for _with_triton in (False, True):
+    for change in (_with_triton.discard, _with_triton.add):
+        change(_number(device))
         try:
             if _counts(device):
                 return None
@@ -128,9 +128,14 @@ def blocks(count: int, size: int) -> int:
     return -(-count // size)
 
 
-def launcher() -> str:
-    """Return who launches kernels: "CUDA driver" or "Triton"."""
-    return "Triton" if _with_triton else "CUDA driver"
+def launcher(device: torch.device) -> str:
+    """Return who launches kernels on a device: "CUDA driver" or "Triton"."""
+    return "Triton" if _number(device) in _with_triton else "CUDA driver"
+
+
+def _number(device: torch.device) -> int:
+    with torch.cuda.device(device):
+        return torch.cuda.current_device()
 
 
 def variant_of(

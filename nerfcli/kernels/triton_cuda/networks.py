@@ -25,6 +25,8 @@ PROGRAMS_PER_PROCESSOR = 4
 LIMIT = tl.constexpr(LOG_DENSITY_LIMIT)
 # What the largest gradient of an output becomes in float16: 2^12 below its end, 2^28 above its smallest number.
 LARGEST = tl.constexpr(16.0)
+# Gradients are never scaled beyond float32, and end in float16 at its largest number.
+LEAST, END = tl.constexpr(1e-30), tl.constexpr(65504.0)
 
 
 @jit
@@ -99,6 +101,12 @@ def _forward(
 
 
 @jit
+def _half(gradient):
+    """In float16. Infinity would spoil the sums of all samples; NaN stays, so that it is found."""
+    return tl.clamp(gradient, -END, END, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
+
+
+@jit
 def _largest(by_density, density, by_rgb, out, samples, BLOCK: tl.constexpr):
     """The largest gradient of a log density or a colour."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -116,8 +124,7 @@ def _backward(
     largest, by_encoded, by_direction, by_w1, by_w2, by_c1, by_c2, by_c3,
     scale_out, samples, H: tl.constexpr, DEGREE: tl.constexpr, RAYS_LEARN: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    most = tl.load(largest)
-    scale = tl.where(most > 0.0, LARGEST / most, 1.0)
+    scale = LARGEST / tl.maximum(tl.load(largest), LEAST)
     if tl.program_id(0) == 0:
         tl.store(scale_out, scale)
     first, second = _transposed(w1, H, 32, 0, 32), _transposed(w2, 16, H, 0, H)
@@ -148,9 +155,9 @@ def _backward(
         d = tl.load(by_rgb + i[:, None] * 3 + column, mask=valid[:, None] & (column < 3), other=0.0) * slope
         d_out = (d * scale).to(tl.float16)
         d_fifth = tl.dot(tl.trans(h3), d_out, d_fifth)
-        d = tl.where(h3 > 0, tl.dot(d_out, tl.trans(fifth)), 0.0).to(tl.float16)
+        d = _half(tl.where(h3 > 0, tl.dot(d_out, tl.trans(fifth)), 0.0))
         d_fourth = tl.dot(tl.trans(h2), d, d_fourth)
-        d = tl.where(h2 > 0, tl.dot(d, tl.trans(fourth)), 0.0).to(tl.float16)
+        d = _half(tl.where(h2 > 0, tl.dot(d, tl.trans(fourth)), 0.0))
         d_third = tl.dot(tl.trans(g16), d, d_third)
         d_seen = tl.dot(tl.trans(sh), d, d_seen)
         if RAYS_LEARN:
@@ -160,11 +167,11 @@ def _backward(
             tl.store(by_direction + i * 3 + 1, tl.sum(of_harmonics * along_y, 1), mask=valid)
             tl.store(by_direction + i * 3 + 2, tl.sum(of_harmonics * along_z, 1), mask=valid)
         d_log = tl.load(by_density + i, mask=valid, other=0.0) * density * scale
-        d_g = (tl.dot(d, tl.trans(third)) + tl.where(column == 0, d_log[:, None], 0.0)).to(tl.float16)
+        d_g = _half(tl.dot(d, tl.trans(third)) + tl.where(column == 0, d_log[:, None], 0.0))
         d_second = tl.dot(tl.trans(h1), d_g, d_second)
-        d = tl.where(h1 > 0, tl.dot(d_g, tl.trans(second)), 0.0).to(tl.float16)
+        d = _half(tl.where(h1 > 0, tl.dot(d_g, tl.trans(second)), 0.0))
         d_first = tl.dot(tl.trans(x), d, d_first)
-        d_x = tl.dot(d, tl.trans(first)).to(tl.float16)
+        d_x = _half(tl.dot(d, tl.trans(first)))
         tl.store(by_encoded + i[:, None] * 32 + code[None, :], d_x, mask=valid[:, None])
     wide, out, unscale = tl.arange(0, H), tl.arange(0, 16), 1.0 / scale
     tl.atomic_add(by_w1 + wide[None, :] * 32 + code[:, None], d_first * unscale, sem="relaxed")
