@@ -17,14 +17,15 @@ from conftest import SPHERES
 
 from nerfcli import scene as scenes
 from nerfcli.field.checkpoint import load_tensors
-from nerfcli.media.images import write_png
+from nerfcli.media.images import read_image, write_png
+from nerfcli.multiview.sky import sky_masks
 from nerfcli.runs.components import Components
 from nerfcli.runs.files import FIELD
 from nerfcli.runs.log import read_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.search import selection
-from nerfcli.train import loop, preparation, waypoints
+from nerfcli.train import evidence, loop, preparation, waypoints
 from nerfcli.train.loop import train
 
 HELD_OUT = "test"  # the folder of these photos in the capture
@@ -76,10 +77,19 @@ def is_held_out(name: str, capture: Path) -> bool:
     return str(capture / HELD_OUT) + "/" in name
 
 
+def fill_background(capture: Path) -> None:
+    """Put a bright sky behind the objects of all photos, which then have no alpha."""
+    for photo in capture.glob("*/*.png"):
+        rgba = read_image(photo).astype(np.float64)
+        opacity = rgba[..., 3:] / 255
+        write_png(photo, (rgba[..., :3] * opacity + np.array([90, 160, 250]) * (1 - opacity)).astype(np.uint8))
+
+
 CASES = {
     "default": ("default", Components()),
     "auto": ("auto", Components()),
     "stereo": ("default", Components(points=0.1, stereo=True, exposure="learned")),
+    "sky": ("default", Components(background="sphere")),
     "exposures": ("default", Components(exposure="learned", masks="empty")),
 }
 
@@ -96,9 +106,20 @@ def test_no_held_out_photo_is_opened_before_the_training_is_over(case, capture, 
         measure(*arguments, **named)
 
     monkeypatch.setattr(loop, "measure_waypoints", after_training)
+    skies: list[float] = []
+
+    def count_sky(photos, *, threads: int) -> list[np.ndarray]:
+        masks = sky_masks(photos, threads=threads)
+        skies.append(float(np.mean([mask.mean() for mask in masks])))
+        return masks
+
+    monkeypatch.setattr(evidence, "sky_masks", count_sky)
+    if case == "sky":
+        fill_background(capture)
     scene = scenes.load(capture)
     opened.clear()
     fit(scene, tmp_path / "run", settings(*CASES[case]))
+    assert (max(skies, default=0.0) > 0.01) == (case == "sky")
     assert any(str(capture / "train") in name for name in until_then), "the audit sees training photos"
     assert [name for name in until_then if is_held_out(name, capture)] == []
     assert any(is_held_out(name, capture) for name in opened), "they are compared with afterwards"

@@ -92,8 +92,8 @@ def judge_supported(base: Sequence[Trial], change: Change, tried: Sequence[Trial
     measured = judge_one(base, change, tried, by_time=by_time)
     gain, error = measured.gain_db or 0.0, measured.error_db or 0.0
     if gain > -error:
-        return replace(measured, kept=True, why="supported by matched features and does not lose")
-    return replace(measured, kept=False, why="loses, although matched features support it")
+        return replace(measured, kept=True, why="measured before training, and does not lose")
+    return replace(measured, kept=False, why="loses, although measured before training")
 
 
 def judge_removal(base: Sequence[Trial], change: Change, tried: Sequence[Trial], *, by_time: bool) -> Decision:
