@@ -147,7 +147,7 @@ class ComposedBackend(abc.ABC):
         light = self.parts.light_ends(density, starts, ends, offsets=offsets, shares=shares)
         stopped = transmittance <= math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
         behind = torch.maximum(background, 1.0 - background).amax(-1)  # how far any colour is from the background's
-        left_out = UNSEEN * sum_along_rays(torch.where(unseen, weights, 0.0), offsets)
+        left_out = UNSEEN * self._sum_along_rays(torch.where(unseen, weights, 0.0), offsets)
         error = left_out + torch.where(stopped, transmittance * behind, 0.0)
         return RaysSeen(colour, light, error, Intervals(density, starts, ends, offsets))
 
@@ -194,6 +194,10 @@ class ComposedBackend(abc.ABC):
     ) -> Tensor:
         """`reference.off_target`; `rays` (N,) are those of the samples."""
         return off_target(weights, transmittance, middles, offsets=offsets, distances=distances)
+
+    def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
+        """`reference.sum_along_rays` of numbers (N,), without gradients."""
+        return sum_along_rays(values, offsets)
 
     def _radiance(
         self,

@@ -133,6 +133,9 @@ class TritonBackend(ReferenceBackend):
     ) -> Tensor:
         return compositing.off_target(weights, transmittance, middles, rays=rays, distances=distances)
 
+    def _sum_along_rays(self, values: Tensor, offsets: Tensor) -> Tensor:
+        return rays.sum_along_rays(values[:, None], offsets)[:, 0]
+
     def _networks(self, encoded: Tensor, directions: Tensor, index: Tensor, grid: HashGrid) -> tuple[Tensor, Tensor]:
         if not _fits(grid):
             return super()._networks(encoded, directions, index, grid)
