@@ -127,6 +127,7 @@ class ComposedBackend(abc.ABC):
         background: Tensor,
         shares: tuple[float, ...] = (),
         negligible: float = 0.0,
+        keep_intervals: bool = True,
     ) -> RaysSeen:
         samples = self._visible(rays.detached(), march, medium)
         starts, ends, density, offsets = samples.starts, samples.ends, samples.density, samples.offsets

@@ -149,7 +149,7 @@ class RaysSeen(NamedTuple):
         rgb: (R, 3) sRGB on the background.
         ends: where their light ends, distances along the ray in the training frame.
         truncation_error: (R,) bound on what was left out of each channel of rgb.
-        intervals: the samples.
+        intervals: the samples; without rays where they were not to be kept.
     """
 
     rgb: Tensor
@@ -253,6 +253,7 @@ class Backend(Protocol):
         background: Tensor,
         shares: tuple[float, ...] = (),
         negligible: float = 0.0,
+        keep_intervals: bool = True,
     ) -> RaysSeen:
         """Render rays for pictures, without gradients.
 
@@ -260,6 +261,7 @@ class Backend(Protocol):
             background: (R, 3) or (3,) sRGB.
             shares: quantiles to compute, each between 0 and 1.
             negligible: what samples of a ray together may weigh that are not asked for their colour.
+            keep_intervals: whether the samples are wanted; a backend may return them all the same.
         """
         ...
 

@@ -138,6 +138,7 @@ def _renderings(
             shares=shares(depth) if depth is not None else (),
             tolerance=wanted,
             cones=rays.cones[rays.valid],
+            keep_intervals=False,
         )
         for parts, wanted in ((1, tolerance), (1, TIGHT), (2, TIGHT), (4, TIGHT))
     ]

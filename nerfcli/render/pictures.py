@@ -16,7 +16,7 @@ from nerfcli.render.pixels import pixels_of_rays
 from nerfcli.render.rays import PictureRays, successive_rays
 from nerfcli.render.tracing import TOLERANCE, render_rays
 
-RAYS_PER_TILE = 8192
+RAYS_PER_TILE = 2**14
 RAYS_PER_GPU_TILE = 2**16
 # Rays and what is behind them are made for this many at a time: their last bits must not depend on the tile.
 RAYS_PER_BLOCK = 2**18
@@ -168,6 +168,7 @@ def _render_tile(
         shares=wanted,
         tolerance=quality.tolerance,
         cones=rays.cones[part],
+        keep_intervals=count > 1,
     )
     scale = model.training_from_scene.scale
     # From the training frame's distance along the ray to the scene's along the axis; there is no z behind the camera.

@@ -7,6 +7,7 @@ of the field with its steps, not on the field.
 """
 
 import math
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -35,6 +36,7 @@ def render_rays(
     shares: tuple[float, ...] = (),
     tolerance: float = TOLERANCE,
     cones: Tensor | None = None,
+    keep_intervals: bool = True,
 ) -> RaysSeen:
     """March rays through the model. The answer of a ray does not depend on the others.
 
@@ -45,13 +47,23 @@ def render_rays(
         shares: quantiles to compute.
         tolerance: bound on what is left out of a colour, > 0.
         cones: (R,) width per distance of what each ray stands for, see `kernels.Rays`; None for lines.
+        keep_intervals: whether the samples are wanted.
     """
     cuts = uniform_cuts(model.marching).to(directions)
     return render_cut_rays(
-        model, origins, directions, cuts=cuts, background=background, shares=shares, tolerance=tolerance, cones=cones
+        model,
+        origins,
+        directions,
+        cuts=cuts,
+        background=background,
+        shares=shares,
+        tolerance=tolerance,
+        cones=cones,
+        keep_intervals=keep_intervals,
     )
 
 
+@lru_cache(maxsize=4)
 def uniform_cuts(marching: Marching) -> Tensor:
     """(S + 1,) float64 distances at which pictures cut all rays: in the middle between those of a training."""
     edges = marching.edges()
@@ -68,6 +80,7 @@ def render_cut_rays(
     shares: tuple[float, ...],
     tolerance: float,
     cones: Tensor | None = None,
+    keep_intervals: bool = True,
 ) -> RaysSeen:
     """`render_rays` with all rays cut at the same distances `cuts` (S + 1,)."""
     field = model.field
@@ -80,4 +93,5 @@ def render_cut_rays(
         shares=shares,
         # All negligible samples of a ray together weigh no more than their share of the tolerance allows.
         negligible=(1.0 - STOP_SHARE) * tolerance / UNSEEN,
+        keep_intervals=keep_intervals,
     )

@@ -39,11 +39,18 @@ class NumbaBackend(ComposedBackend):
         background: Tensor,
         shares: tuple[float, ...] = (),
         negligible: float = 0.0,
+        keep_intervals: bool = True,
     ) -> RaysSeen:
         if not isinstance(medium, HashGrid) or not _fits(medium, medium.layers):
             return super().trace_rays(rays, march, medium, background=background, shares=shares, negligible=negligible)
         return numba_cpu.trace_rays(
-            rays.detached(), march, medium, background=background, shares=shares, negligible=negligible
+            rays.detached(),
+            march,
+            medium,
+            background=background,
+            shares=shares,
+            negligible=negligible,
+            keep_intervals=keep_intervals,
         )
 
     def hash_encode(

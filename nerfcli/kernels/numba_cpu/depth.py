@@ -54,7 +54,7 @@ def add_interval(sums: Any, ray: Any, start: Any, length: Any, density: Any, tar
     """
     depth, own = sums[ray, DEPTH], density * length
     alpha = -np.expm1(-own)
-    weight = np.exp(-depth) * alpha
+    weight = (1.0 - sums[ray, MASS]) * alpha  # exp(-depth) within 1e-15, without computing it
     if weight > 0.0:
         place = start + length * _mean_fraction(own, alpha)
         sums[ray, MASS] += weight

@@ -45,10 +45,10 @@ def _layer_32(x: Any, weights: Any, at: Any, out: Any) -> None:
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _rectified_32(x: Any, weights: Any, at: Any, out: Any) -> None:
-    """out (TILE, 32) = max(0, x (TILE, 32) @ weights[at:] (32, 32))."""
+def _rectified_32(x: Any, weights: Any, at: Any, out: Any, first: Any = 0) -> None:
+    """out (TILE, 32) = max(0, x[first:] (TILE, 32) @ weights[at:] (32, 32))."""
     for row in range(0, TILE, ROWS):
-        rectified_product_32(x, row * WIDTH, WIDTH, 1, weights, at, WIDTH, WIDTH, out, row * WIDTH, WIDTH)
+        rectified_product_32(x, (first + row) * WIDTH, WIDTH, 1, weights, at, WIDTH, WIDTH, out, row * WIDTH, WIDTH)
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -125,12 +125,10 @@ def _channels(out: Any, channels: Any) -> None:
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def density_tile(
-    encoded: Any, first: Any, count: Any, weights: Any, x: Any, h: Any, geometry: Any, density: Any
-) -> None:
-    """Outputs (TILE, 16) of the density network and densities (TILE,) of `count` samples; see `density_range`."""
-    _load_rows(encoded, first, count, x)
-    _rectified_32(x, weights, D1, h)
+def density_tile(encoded: Any, first: Any, weights: Any, h: Any, geometry: Any, density: Any) -> None:
+    """Outputs (TILE, 16) of the density network and densities (TILE,) of a tile of the flat `encoded`, which is whole;
+    see `density_range`."""
+    _rectified_32(encoded, weights, D1, h, first)
     _layer_16(h, weights, D2, geometry)
     _densities(geometry, density)
 
@@ -143,7 +141,8 @@ def density_range(
     own = np.empty(TILE, np.float32)
     for first in range(begin, end, TILE):
         count = min(TILE, end - first)
-        density_tile(encoded, first, count, weights, x, h, geometry, own)
+        _load_rows(encoded, first, count, x)
+        density_tile(x, 0, weights, h, geometry, own)
         for i in range(count):
             density[first + i] = own[i]
 

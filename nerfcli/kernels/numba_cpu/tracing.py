@@ -24,19 +24,18 @@ from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.visible import LANES, ROUND, fill_round, new_round, occupied_blocks
 
 # A sample may go without its colour if it weighs no more than this part of what all of a ray together may weigh.
-PART = 1 / 8
+PART = 1 / 32
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _add_colours(
     inputs: Any, count: Any, ray: Any, weight: Any, weights: Any, x: Any, h: Any, out: Any, channels: Any, colours: Any
 ) -> None:
-    """Add the weighted colours of a tile of samples to those of their rays, and clear the tile."""
+    """Add the weighted colours of the first `count` samples of a tile to those of their rays."""
     colour_range(inputs, weights, x, h, out, channels)
     for i in range(count):
         for channel in range(3):
             colours[ray[i], channel] += weight[i] * np.float64(channels[3 * i + channel])
-    inputs[:] = np.float32(0)
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -48,7 +47,7 @@ def _trace(
 ) -> Any:  # fmt: skip
     """Add all that rays `coming` to `last_ray` meet to their rows of sums, quantiles, colours and unseen weight.
 
-    The samples go to `owner` and `record` in the order in which they are found.
+    The samples go to `owner` and `record`, if there is room, in the order in which they are found.
 
     Returns:
         how many samples there are.
@@ -56,14 +55,14 @@ def _trace(
     intervals = edges.shape[0] - 2 - CHUNK
     (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
     widths = np.empty(ROUND if cones.shape[0] > 0 else 0, np.float32)
-    encoded = np.empty((ROUND, WIDTH), np.float32)
+    encoded = np.empty(ROUND * WIDTH, np.float32)
     scratch = new_scratch()
     x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
     geometry, out = np.empty(TILE * OUT, np.float32), np.empty(TILE * OUT, np.float32)
     density, channels = np.empty(TILE, np.float32), np.empty(3 * TILE, np.float32)
     inputs, waiting = np.zeros(TILE * WIDTH, np.float32), 0
     waiting_ray, waiting_weight = np.empty(TILE, np.int64), np.empty(TILE, np.float64)
-    found = 0
+    found, keep = 0, len(owner) > 0
     while True:
         filled, coming = fill_round(
             origins, directions, edges, jitter, occupied, blocks, side, contraction, cones, coming, last_ray, lane_ray,
@@ -71,12 +70,10 @@ def _trace(
         )  # fmt: skip
         if filled == 0:
             break
-        encode_range(
-            points.reshape(-1), ROUND, widths, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1)
-        )
+        encode_range(points.reshape(-1), ROUND, widths, 0, filled, flat, rows, resolutions, scratch, encoded)
         for first in range(0, filled, TILE):
             count = min(TILE, filled - first)
-            density_tile(encoded, first, count, weights, x, h, geometry, density)
+            density_tile(encoded, first, weights, h, geometry, density)
             for i in range(count):
                 lane = sample_lane[first + i]
                 if not lane_depth[lane] < deepest:
@@ -85,10 +82,11 @@ def _trace(
                 length, own = np.float64(end) - np.float64(start), np.float64(density[i])
                 weight = add_interval(sums, ray, np.float64(start), length, own, targets, quantiles)
                 lane_depth[lane] += own * length
-                owner[found] = ray
-                record[found, 0], record[found, 1], record[found, 2] = start, end, density[i]
-                counts[ray] += 1
-                found += 1
+                if keep:
+                    owner[found] = ray
+                    record[found, 0], record[found, 1], record[found, 2] = start, end, density[i]
+                    counts[ray] += 1
+                    found += 1
                 if weight <= PART * negligible and unseen[ray] + weight <= negligible:
                     unseen[ray] += weight
                     continue
@@ -136,16 +134,23 @@ def _sort(borders: Any, offsets: Any, owner: Any, record: Any, found: Any, spans
 
 
 def trace_rays(
-    rays: Rays, along: March, grid: HashGrid, *, background: Tensor, shares: tuple[float, ...], negligible: float
+    rays: Rays,
+    along: March,
+    grid: HashGrid,
+    *,
+    background: Tensor,
+    shares: tuple[float, ...],
+    negligible: float,
+    keep_intervals: bool = True,
 ) -> RaysSeen:
     """See `Backend.trace_rays`; float32 on the CPU."""
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
     cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
     borders = np.arange(threads + 1) * count // threads
     # Room for all samples of all rays: memory that nobody writes to is never really taken.
-    room = (threads, -(-count // threads) * intervals)
+    room = (threads, -(-count // threads) * intervals if keep_intervals else 0)
     owner, record = np.empty(room, np.int64), np.empty((*room, 3), np.float32)
-    counts, found = np.zeros(count, np.int64), np.zeros(threads, np.int64)
+    counts, found = np.zeros(count if keep_intervals else 0, np.int64), np.zeros(threads, np.int64)
     sums, quantiles, targets = new_sums(count, shares)
     colours, unseen = np.zeros((count, 3)), np.zeros(count)
     _trace_all(
@@ -159,7 +164,8 @@ def trace_rays(
     )  # fmt: skip
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     spans = torch.empty(3, int(offsets[-1]))
-    _sort(borders, offsets, owner, record, found, spans.numpy())
+    if keep_intervals:
+        _sort(borders, offsets, owner, record, found, spans.numpy())
     starts, ends, density = spans
     light, left = light_ends_of(sums, quantiles, shares), torch.from_numpy(np.exp(-sums[:, 0]))
     seen = torch.from_numpy(colours + UNSEEN * unseen[:, None]) + left[:, None] * background
