@@ -5,6 +5,7 @@ import json
 import multiprocessing
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from fog import fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
@@ -19,6 +21,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.errors import OUT_OF_MEMORY, UserError
 from nerfcli.export.frames import RAYS_PER_PROCESS, Workers, automatic_workers, export_frames, export_part
+from nerfcli.export.one_frame import render_frame
 from nerfcli.export.order import Order
 from nerfcli.export.presentation import playing_order
 from nerfcli.export.settings import ExportSettings, VideoSettings
@@ -162,18 +165,65 @@ def test_parts_are_put_together_without_rendering(model, tmp_path, in_one_go):
 
 
 @pytest.mark.parametrize(
-    ("rays", "device", "threads", "jobs"),
+    ("rays", "thread_safe", "threads", "jobs"),
     [
-        (0, "cpu", 2, 1),
-        (2 * RAYS_PER_PROCESS - 1, "cpu", 8, 1),
-        (2 * RAYS_PER_PROCESS, "cpu", 8, 2),
-        (100 * RAYS_PER_PROCESS, "cpu", 1, 1),
-        (100 * RAYS_PER_PROCESS, "cpu", 64, 4),
-        (100 * RAYS_PER_PROCESS, "cuda", 64, 1),
+        (0, False, 2, 1),
+        (2 * RAYS_PER_PROCESS - 1, False, 8, 1),
+        (2 * RAYS_PER_PROCESS, False, 8, 2),
+        (100 * RAYS_PER_PROCESS, False, 1, 1),
+        (100 * RAYS_PER_PROCESS, False, 64, 4),
+        (100 * RAYS_PER_PROCESS, True, 64, 1),
     ],
 )
-def test_processes_are_started_where_there_is_work_for_them(rays, device, threads, jobs):
-    assert automatic_workers(rays, device=device, threads=threads) == Workers(jobs, threads)
+def test_processes_are_started_where_threads_cannot_share_the_work(rays, thread_safe, threads, jobs):
+    assert automatic_workers(rays, threads=threads, thread_safe=thread_safe) == Workers(jobs, threads)
+
+
+def test_threads_leave_the_same_files(model, tmp_path, in_one_go):
+    done: list[int] = []
+    before = torch.get_num_threads()
+    export_frames(
+        *(model, order(), tmp_path / "views"), on_rays=done.append, notify=lambda text: None, workers=Workers(threads=3)
+    )
+    assert done == [PIXELS] * 4
+    assert contents(tmp_path / "views") == in_one_go
+    assert torch.get_num_threads() == before
+
+
+def test_frames_in_progress_render_in_threads_of_their_own(model, tmp_path):
+    """Two frames wait for each other in the middle of their rendering."""
+    meeting = threading.Barrier(2, timeout=60)
+    workers = Workers(threads=2)
+    met = []
+
+    def on_rays(rays: int) -> None:
+        met.append(threading.get_ident())
+
+    def render(*given: Any, **options: Any) -> None:
+        meeting.wait()
+        render_frame(*given, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nerfcli.export.threads.render_frame", render)
+        export_frames(
+            *(model, order(2), tmp_path / "views"), on_rays=on_rays, notify=lambda text: None, workers=workers
+        )
+    assert len(set(met)) == 2
+    assert threading.get_ident() not in met
+
+
+def test_an_error_in_a_thread_ends_the_others_and_keeps_what_is_complete(model, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        export_frames(
+            *(model, order(8), tmp_path / "views"),
+            on_rays=stop_in_frame(3, KeyboardInterrupt()),
+            notify=lambda text: None,
+            workers=Workers(threads=2),
+        )
+    (unfinished,) = tmp_path.glob(".views.unfinished-*")
+    assert 2 <= len(list(unfinished.rglob("done/**/*.json"))) <= 4
+    assert not list(unfinished.rglob("*partial*"))
+    assert threading.active_count() == 1
 
 
 def test_processes_leave_the_same_files_though_one_is_killed(model, tmp_path, in_one_go):

@@ -12,6 +12,7 @@ from nerfcli.export.order import DESCRIPTION, Order
 from nerfcli.export.presentation import write_previews, write_videos
 from nerfcli.export.processes import render_in_processes
 from nerfcli.export.settings import depth_meta
+from nerfcli.export.threads import render_in_threads
 from nerfcli.export.unfinished import Unfinished, take_over, unfinished_of
 from nerfcli.export.visibility import removed_in_words
 from nerfcli.media.levels import scale_in_words
@@ -20,8 +21,10 @@ from nerfcli.render.model import Model
 
 # A process costs seconds to start: it has to have this many rays to render, about 20 s of work for a core.
 RAYS_PER_PROCESS = 2**22
-# Each process holds the model and a picture, and a few hundred megabytes of libraries.
+# Each process holds the model and a picture, and a few hundred megabytes of libraries. Of threads with a picture each,
+# more would wait for Python's lock.
 MOST_PROCESSES = 4
+MOST_AT_A_TIME = 4
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Workers:
     """Number of processes and threads to render with.
 
     Args:
-        jobs: processes that each take a frame at a time; 1 renders in this process.
+        jobs: processes that each take a frame at a time; 1 renders in this process, on CPUs a frame per thread.
         threads: of all of them together.
     """
 
@@ -37,18 +40,17 @@ class Workers:
     threads: int = 1
 
 
-def automatic_workers(rays: int, *, device: str, threads: int) -> Workers:
-    """A process for each thread where there is enough to do: on CPUs a picture per thread beats threads per picture.
+def automatic_workers(rays: int, *, threads: int, thread_safe: bool) -> Workers:
+    """Return one process; where its threads cannot render frames at the same time, several if there is enough to do.
 
-    Two threads share a picture in 0.6 of the time of one, as its samples are put in order by one of them; two processes
-    with a picture each take half. A GPU is used by one process.
+    A picture per thread takes less time than threads per picture: some steps of a picture run on one of them.
 
     Args:
         rays: of all pictures together.
-        device: where they are rendered.
-        threads: to share.
+        threads: to divide.
+        thread_safe: see `Model.thread_safe`; or a GPU, which is used by one process.
     """
-    if device != "cpu":
+    if thread_safe:
         return Workers(1, threads)
     return Workers(max(1, min(threads, MOST_PROCESSES, rays // RAYS_PER_PROCESS)), threads)
 
@@ -95,7 +97,7 @@ def export_frames(
             model, order, everything, unfinished=unfinished, on_rays=on_rays, notify=notify, workers=workers
         )
         meta = depth_meta(model, order.settings.depth)
-        ranges = write_previews(unfinished.folder, order, meta)
+        ranges = write_previews(unfinished.folder, order, meta, threads=workers.threads)
         levels = {}
         if order.settings.in_levels:
             written = write_levels(unfinished.folder, order.names, settings=order.settings, meaning=meta)
@@ -174,6 +176,18 @@ def _render_missing(
             threads=workers.threads,
             on_rays=on_rays,
             notify=notify,
+        )
+        return
+    at_a_time = min(workers.threads, MOST_AT_A_TIME, len(missing))
+    if at_a_time > 1 and model.thread_safe:
+        render_in_threads(
+            model,
+            order,
+            missing,
+            unfinished=unfinished,
+            at_a_time=at_a_time,
+            threads=workers.threads,
+            on_rays=on_rays,
         )
         return
     for index in missing:

@@ -53,6 +53,7 @@ __all__ = [
     "ray_indices",
     "spherical_harmonics",
     "sum_along_rays",
+    "thread_safe",
     "why_not_triton",
 ]
 
@@ -110,6 +111,12 @@ def driver_version() -> str:
 def has_compiled() -> bool:
     """Return whether the compiled CPU kernels work on this machine."""
     return _numba_cpu() is not None
+
+
+def thread_safe() -> bool:
+    """Return whether several threads may call the CPU kernels at the same time: not all of Numba's pools allow it."""
+    numba_cpu = _numba_cpu()
+    return numba_cpu is None or numba_cpu.thread_safe()
 
 
 def prepare(notify: Callable[[str], None], device: str = "cpu") -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nerfcli import kernels
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.field.background import Background, SphereBackground
@@ -82,6 +83,11 @@ class Model:
     @property
     def device(self) -> torch.device:
         return self.occupied.device
+
+    @property
+    def thread_safe(self) -> bool:
+        """Whether several threads may render it at the same time; on a CPU alone."""
+        return self.device.type == "cpu" and kernels.thread_safe()
 
     def stretched(self, factor: float) -> "Model":
         """The same field, looked at in steps along rays `factor` times as long as those of the training."""

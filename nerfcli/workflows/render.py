@@ -111,7 +111,8 @@ def render_run(
         progress(done / total, f"{len(chosen)} frames")
 
     progress(0.0, "")
-    workers = Workers(jobs, cores) if jobs else automatic_workers(total, device=torch_device, threads=cores)
+    thread_safe = torch_device != "cpu" or model.thread_safe
+    workers = Workers(jobs, cores) if jobs else automatic_workers(total, threads=cores, thread_safe=thread_safe)
     if part is not None:
         return [export_part(model, order, folder, chosen, on_rays=on_rays, notify=notify, workers=workers)]
     return export_frames(model, order, folder, on_rays=on_rays, notify=notify, workers=workers)

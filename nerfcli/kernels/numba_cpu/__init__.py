@@ -15,6 +15,7 @@ from nerfcli.kernels.numba_cpu.pixels import pixel_rays
 from nerfcli.kernels.numba_cpu.projection import back_project, project
 from nerfcli.kernels.numba_cpu.rays import ray_indices
 from nerfcli.kernels.numba_cpu.row_adam import adam_rows
+from nerfcli.kernels.numba_cpu.threads import thread_safe
 from nerfcli.kernels.numba_cpu.total_variation import denoise_total_variation
 from nerfcli.kernels.numba_cpu.tracing import trace_rays
 from nerfcli.kernels.numba_cpu.visible import visible_samples
@@ -40,6 +41,7 @@ __all__ = [
     "radiance",
     "ray_indices",
     "sample_coordinates",
+    "thread_safe",
     "trace_rays",
     "visible_samples",
     "warm_up",

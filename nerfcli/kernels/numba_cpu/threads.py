@@ -3,6 +3,7 @@
 import numba
 import torch
 from numba.core import config
+from numba.np.ufunc.parallel import threading_layer
 
 
 def use_threads() -> int:
@@ -10,6 +11,11 @@ def use_threads() -> int:
     count = min(torch.get_num_threads(), int(config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
     numba.set_num_threads(count)
     return count
+
+
+def thread_safe() -> bool:
+    """Return whether several threads may run compiled loops at the same time; workqueue then ends the process."""
+    return threading_layer() != "workqueue"
 
 
 def _launch() -> None:
