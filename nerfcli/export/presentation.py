@@ -1,7 +1,8 @@
 """Outputs that need all frames of an order: previews with a common range of colours, and videos."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,15 +21,18 @@ from nerfcli.media.video import FORMATS, write_video
 
 # The ends of a colour range: shares of all valid pixels of the clip, so that a single speck does not stretch it.
 RANGE_SHARES = (0.01, 0.99)
+# Maps are read three times; as many as fit are kept in memory meanwhile.
+_KEPT_BYTES = 2**28
 
 
-def write_previews(folder: Path, order: Order, meta: DepthMeta) -> dict[str, tuple[float, float]]:
+def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int = 1) -> dict[str, tuple[float, float]]:
     """A coloured PNG beside each file that is measured; all of an output on one range, or depth on the range given.
 
     Args:
         folder: holds the complete files of every frame.
         order: what was ordered.
         meta: the meaning of the depth.
+        threads: previews that are written at the same time.
 
     Returns:
         The range of each output that is measured, in the unit of `meta`.
@@ -39,18 +43,35 @@ def write_previews(folder: Path, order: Order, meta: DepthMeta) -> dict[str, tup
     ranges = {}
     for output in order.settings.measured:
         meaning = meta.of(output, opacity_floor=floor_of(order.settings.depth, output))
-
-        def maps(meaning: DepthMeta = meaning) -> Iterator[np.ndarray]:
-            for name in order.names:
-                yield read_map(folder, name, meaning)
-
-        given = order.settings.colour_range if output == "depth" else None
-        lo, hi = ranges[output] = given or value_range(maps, output)
-        metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": order.settings.colour_map}
-        for name, values in zip(order.names, maps(), strict=True):
-            picture = preview(values, meaning, lo=lo, hi=hi, colour_map=order.settings.colour_map)
-            write_png(_picture(folder, output, name), picture, metadata=metadata)
+        ranges[output] = _write_previews_of(output, folder, order, meaning, threads=threads)
     return ranges
+
+
+def _write_previews_of(
+    output: str, folder: Path, order: Order, meaning: DepthMeta, *, threads: int
+) -> tuple[float, float]:
+    """`write_previews` of one output."""
+    kept: dict[str, np.ndarray] = {}
+
+    def read(name: str) -> np.ndarray:
+        if name in kept:
+            return kept[name]
+        values = read_map(folder, name, meaning)
+        if (len(kept) + 1) * values.nbytes <= _KEPT_BYTES:
+            kept[name] = values
+        return values
+
+    given, colour_map = order.settings.colour_range if output == "depth" else None, order.settings.colour_map
+    lo, hi = given or value_range(lambda: map(read, order.names), output)
+    metadata = _texts(meaning) | {"range": f"{lo} {hi}", "colour map": colour_map}
+
+    def write(name: str) -> None:
+        picture = preview(read(name), meaning, lo=lo, hi=hi, colour_map=colour_map)
+        write_png(_picture(folder, output, name), picture, metadata=metadata)
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(write, order.names))
+    return lo, hi
 
 
 def write_videos(
@@ -93,7 +114,7 @@ def write_videos(
             write_video(path, pictures, form=form, fps=settings.fps, crf=settings.crf, plays=plays, comment=comment)
 
 
-def value_range(maps: Callable[[], Iterator[np.ndarray]], output: str) -> tuple[float, float]:
+def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[float, float]:
     """The range of colours of a clip: the 1st to the 99th percentile; from 0 for what is not a distance.
 
     (0, 1) where no pixel has a value.

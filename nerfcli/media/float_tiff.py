@@ -10,6 +10,9 @@ from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
 from nerfcli.media.depth_pictures import DepthMeta, check_map
 
+# Of zlib: the lower bits of depths are noise, so that more effort saves 0.5 %, in twice the time.
+_LEVEL = 1
+
 
 def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
     """Write a depth map as float TIFF; atomic.
@@ -31,6 +34,7 @@ def write_tiff(path: Path, depth: np.ndarray, meta: DepthMeta) -> None:
             depth,
             photometric="minisblack",
             compression="zlib",
+            compressionargs={"level": _LEVEL},
             description=description,
             metadata=None,  # else tifffile appends a description of its own
         )

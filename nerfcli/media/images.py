@@ -49,8 +49,9 @@ _FORMATS = "JPEG, PNG, TIFF, WebP or BMP"
 _SRGB = ImageCms.createProfile("sRGB")
 # Two colour spaces that agree within this many of 255 levels on a grid of colours are the same one.
 _SAME_COLOUR_LEVELS = 2
-# Of zlib: for a rendered picture, files are 1 % larger than at the usual 6, in less than half the time.
-_PNG_LEVEL = 4
+# Of zlib; and PNG's filter "up": 9 % larger than with a filter chosen for each line, in half the time.
+_PNG_LEVEL, _PNG_UP = 4, 2
+_PNG_COLOURS = {1: 0, 3: 2, 4: 6}  # PNG's colour types by channels
 
 
 @dataclass(frozen=True)
@@ -214,11 +215,25 @@ def write_png(path: Path, image: np.ndarray, *, metadata: dict[str, str] | None 
         ValueError: not an 8-bit picture.
     """
     _check_pixels(image)
-    chunks = PngInfo()
+    texts = PngInfo()
     for key, value in (metadata or {}).items():
-        chunks.add_text(key, value)
-    with atomic_path(path) as partial:
-        Image.fromarray(image).save(partial, format="PNG", pnginfo=chunks, compress_level=_PNG_LEVEL)
+        texts.add_text(key, value)
+    height, width = image.shape[:2]
+    lines = np.ascontiguousarray(image).reshape(height, -1)
+    filtered = np.full((height, 1 + lines.shape[1]), _PNG_UP, np.uint8)
+    filtered[:1, 1:] = lines[:1]
+    np.subtract(lines[1:], lines[:-1], out=filtered[1:, 1:])
+    chunks = [
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, _PNG_COLOURS[lines.shape[1] // width], 0, 0, 0)),
+        *((kind, content) for kind, content, *_ in texts.chunks),
+        (b"IDAT", zlib.compress(filtered.data, _PNG_LEVEL)),
+        (b"IEND", b""),
+    ]
+    with atomic_path(path) as partial, partial.open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for kind, content in chunks:
+            file.write(struct.pack(">I", len(content)) + kind + content)
+            file.write(struct.pack(">I", zlib.crc32(kind + content)))
 
 
 def _check_pixels(image: np.ndarray) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -35,7 +36,8 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
         ValueError: lo and hi are not finite or not in order.
     """
     picture = coloured(depth, lo=lo, hi=hi, colour_map=colour_map)
-    legend = _legend(meta, lo=lo, hi=hi, colour_map=colour_map, width=depth.shape[1])
+    suffix = " m" if meta.unit == "metre" else ""
+    legend = _legend(_lines(meta), suffix, lo=lo, hi=hi, colour_map=colour_map, width=depth.shape[1])
     sheet = np.full((len(picture) + len(legend), legend.shape[1], 3), _PAPER, dtype=np.uint8)
     left = (legend.shape[1] - depth.shape[1]) // 2
     sheet[: len(picture), left : left + depth.shape[1]] = picture
@@ -49,10 +51,15 @@ def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.
         raise ValueError(f"lo <= hi must be finite, got {lo}, {hi}")
     valid = np.isfinite(depth)
     # float64, and clipped before the division: a narrow range neither underflows nor overflows.
-    level = (np.where(valid, depth, lo).astype(np.float64).clip(lo, hi) - lo) / (hi - lo or 1.0)
-    picture = levels_of(colour_map)[np.rint(level * 255).astype(np.uint8)]
-    rows, columns = np.indices(depth.shape)
-    picture[~valid] = _HATCH[(rows + columns) // 4 % 2][~valid]
+    level = np.where(valid, depth, lo).astype(np.float64)
+    np.clip(level, lo, hi, out=level)
+    level -= lo
+    level /= hi - lo or 1.0
+    level *= 255
+    picture = levels_of(colour_map).take(np.rint(level, out=level).astype(np.uint8), axis=0)
+    if not valid.all():
+        rows, columns = np.nonzero(~valid)
+        picture[rows, columns] = _HATCH[(rows + columns) // 4 % 2]
     return picture
 
 
@@ -71,15 +78,12 @@ def beside(sheets: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(filled, axis=1)
 
 
-def _legend(meta: DepthMeta, *, lo: float, hi: float, colour_map: str, width: int) -> np.ndarray:
-    """Colour bar, numbers and two lines of text; wider than `width` if the text needs it."""
+@lru_cache(maxsize=8)  # that of all frames of a clip
+def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, colour_map: str, width: int) -> np.ndarray:
+    """Colour bar, numbers with a suffix, lines of text; wider than `width` if the text needs it."""
     size = min(max(round(width / 40), 12), 28)
     font = ImageFont.load_default(size)
-    unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
-    lines = [f"{meta.title} in {unit}", f"{AXES[meta.axis]}; hatched: no value"]
-    if meta.quantity in UNIT_OF:
-        lines = [meta.title, f"in {unit}; hatched: no surface"]
-    numbers = _tick_labels(lo, hi, suffix=" m" if meta.unit == "metre" else "")
+    numbers = _tick_labels(lo, hi, suffix=suffix)
     margin, line = size, round(1.4 * size)
     numbers_width = len(numbers) * max(font.getlength(f"  {text}") for text in numbers)
     text_width = max(numbers_width, *(font.getlength(text) for text in lines))
@@ -100,6 +104,14 @@ def _legend(meta: DepthMeta, *, lo: float, hi: float, colour_map: str, width: in
     for index, text in enumerate(lines):
         draw.text((margin, size // 2 + line * (2 + index)), text, fill=_INK, font=font)
     return np.asarray(sheet)
+
+
+def _lines(meta: DepthMeta) -> tuple[str, ...]:
+    """What the legend says of the values."""
+    unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
+    if meta.quantity in UNIT_OF:
+        return meta.title, f"in {unit}; hatched: no surface"
+    return f"{meta.title} in {unit}", f"{AXES[meta.axis]}; hatched: no value"
 
 
 def _tick_labels(lo: float, hi: float, *, suffix: str) -> list[str]:
