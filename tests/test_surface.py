@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
+from nerfcli.media.las_files import write_las
 from nerfcli.media.mesh_files import read_glb_json, read_ply_header, read_ply_mesh, write_glb, write_ply
 from nerfcli.media.volume_files import Volume, read_nrrd, read_volume_npz, write_nrrd, write_volume_npz
 from nerfcli.photos.undistorted import pinhole_of, undistorted
@@ -332,6 +334,43 @@ def test_damaged_files_are_told(name, tmp_path):
     (tmp_path / name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\n")
     with pytest.raises(UserError, match=r"a\."):
         describe(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("far", [0.0, 5e6])
+def test_points_come_back_from_las_files(suffix, far, tmp_path):
+    """With eight digits of their extent, wherever they are; read by laspy."""
+    laspy = pytest.importorskip("laspy", reason="an extra")
+    rng = np.random.default_rng(0)
+    places = far + rng.uniform(-40, 40, (500, 3))
+    columns: dict[str, np.ndarray] = dict(zip("xyz", places.T, strict=True))
+    columns |= {name: rng.integers(0, 256, 500, np.uint8) for name in ("red", "green", "blue")}
+    columns |= {"photos": np.arange(500, dtype=np.int32), "spread": rng.random(500, np.float32)}
+    path = tmp_path / f"a{suffix}"
+    write_las(path, columns, description={"unit": "metre", "frame": "its own"})
+    again = laspy.read(path)
+    np.testing.assert_allclose(again.xyz, places, rtol=0, atol=1e-6)
+    for name in ("red", "green", "blue"):
+        np.testing.assert_array_equal(again[name], columns[name].astype(int) * 257)
+    for name in ("photos", "spread"):
+        np.testing.assert_array_equal(again[name], columns[name])
+    facts = describe(path)
+    assert (facts["vertices"], facts["unit"], facts["frame"]) == (500, "metre", "its own")
+    np.testing.assert_allclose(facts["low"], places.min(0), rtol=0, atol=1e-6)
+
+
+def test_damaged_las_files_are_told(tmp_path):
+    pytest.importorskip("laspy", reason="an extra")
+    (tmp_path / "a.las").write_bytes(b"LASF" + bytes(400))
+    with pytest.raises(UserError, match="damaged or not a LAS file"):
+        describe(tmp_path / "a.las")
+
+
+def test_las_files_say_what_they_need(monkeypatch, blocked, tmp_path):
+    monkeypatch.setitem(sys.modules, "lazrs", None)
+    result = nerfcli("export", blocked, "--to", "points", "-o", tmp_path / "a.laz")
+    assert result.exit_code == 3
+    assert error_of(result) == ("Error: .las and .laz files need laspy and lazrs", "Hint:  pip install 'nerfcli[las]'")
 
 
 # Photos without distortion

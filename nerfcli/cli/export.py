@@ -19,7 +19,9 @@ def export(
     output: Output = None,
     form: Annotated[
         str | None,
-        typer.Option("--format", help="File format if -o does not determine it: ply, glb or obj; npz or nrrd."),
+        typer.Option(
+            "--format", help="File format if -o does not determine it: ply, glb or obj; ply, las or laz; npz or nrrd."
+        ),
     ] = None,
     box: Annotated[
         str | None,
@@ -48,8 +50,8 @@ def export(
     \b
     page          one .html that renders the field in a browser (WebGL2), from the disk, without a server
     mesh          .ply, .glb or .obj: zero level of truncated signed distances from median depths, with colours
-    points        .ply: where median and mean depth agree and two photos see the same point, with normals, photos,
-                  parallax and spread
+    points        .ply, .las or .laz: where median and mean depth agree and two photos see the same point, with normals,
+                  photos, parallax and spread
     volume        .npz (density, colour) or .nrrd (density, 1 / unit)
     tsdf          .npz (signed distance, weight) or .nrrd (signed distance): the input of the mesh
     colmap-dense  folder with undistorted photos, depth and normal maps for COLMAP's stereo fusion

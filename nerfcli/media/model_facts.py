@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from nerfcli.errors import UserError
+from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
+from nerfcli.media.las_files import las_facts
 from nerfcli.media.mesh_files import KEY, read_glb_json, read_ply_header
 from nerfcli.media.volume_files import Volume, read_nrrd, read_volume_npz
 
 # Of files that say nothing about themselves.
 NOT_STATED = "nothing in the file says its unit or its frame"
-SUFFIXES = (".ply", ".glb", ".obj", ".nrrd")
+SUFFIXES = (".ply", ".glb", ".obj", ".nrrd", *LAS_SUFFIXES)
 
 
 def model_facts(path: Path) -> dict[str, Any] | None:
@@ -32,6 +34,8 @@ def model_facts(path: Path) -> dict[str, Any] | None:
             return _glb_facts(path)
         case ".obj":
             return _obj_facts(path)
+        case ".las" | ".laz":
+            return las_facts(path)
         case ".nrrd":
             values, fields = read_nrrd(path)
             origin = np.array([float(value) for value in fields["space origin"].strip("()").split(",")])

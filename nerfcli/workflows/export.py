@@ -33,7 +33,7 @@ PAGE_BYTES = 9_700_000
 TARGETS = {
     "page": (".html",),
     "mesh": (".ply", ".glb", ".obj"),
-    "points": (".ply",),
+    "points": (".ply", ".las", ".laz"),
     "volume": (".npz", ".nrrd"),
     "tsdf": (".npz", ".nrrd"),
     "colmap-dense": ("",),

@@ -13,6 +13,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.layout import up_direction
 from nerfcli.cameras.rigid import look_at
 from nerfcli.errors import UserError
+from nerfcli.media.las_files import SUFFIXES as LAS_SUFFIXES
+from nerfcli.media.las_files import las_module, write_las
 from nerfcli.media.mesh_files import write_glb, write_obj, write_ply
 from nerfcli.media.volume_files import Volume, write_nrrd, write_volume_npz
 from nerfcli.photos.loading import load_photo
@@ -70,7 +72,10 @@ def export_mesh(
 def export_points(
     run: Run, model: Model, path: Path, *, settings: SurfaceSettings, notify: Notify, progress: Progress
 ) -> None:
-    """Write points of the surfaces as .ply."""
+    """Write points of the surfaces as .ply, .las or .laz."""
+    las = path.suffix.lower() in LAS_SUFFIXES
+    if las:
+        las_module()  # before the work, not after it
     views, grid = _seen(run, model, settings, progress)
     points = agreed_points(views, grid, on_progress=_part(progress, _DEPTHS, 1.0, "compares"))
     if not len(points.places):
@@ -83,7 +88,8 @@ def export_points(
         "parallax_deg": PARALLAX,
         "spread": "standard deviation of where the light of the pixel ends, in the unit",
     }
-    write_ply(path, columns, description=described)
+    write = write_las if las else write_ply
+    write(path, columns, description=described)
     notify(f"{len(points.places)} points that two photos or more see, {_grid_in_words(grid, model)}")
 
 
