@@ -1,11 +1,13 @@
-"""Meshes of the desk against its true surface: accuracy, completeness and F-score at 1 and 2 cm.
+"""Meshes against a true or a measured surface: accuracy, completeness and F-score at 1, 2 and 5 cm.
 
     python benchmarks/surfaces.py desk-run
+    python benchmarks/surfaces.py kitchen-run --sensor path/to/redkitchen --voxel-size 0.02
 
-RUN was trained on the desk with its true cameras in metres (`sample_scenes/desk/truth`). The truth is what the six
-true depth maps show inside the box. Of a mesh only what one of these views could see counts: up to 5 cm behind its
-depth. Three surfaces with the same voxels: signed distances of median depths, as `nerfcli export --to mesh` has them;
-the same of conditional depths; and a threshold on the density, the one of several with the best F-score at 1 cm.
+RUN was trained in metres: on the desk with its true cameras (`sample_scenes/desk/truth`), or on the scene that
+`benchmarks/depth.py redkitchen` writes. The truth is what the desk's six true depth maps, or every tenth of the
+sensor's, show inside the box. Of a mesh only what one of these views could see counts: up to 5 cm behind its depth.
+Three surfaces with the same voxels: signed distances of median depths, as `nerfcli export --to mesh` has them; the same
+of conditional depths; and a threshold on the density, the one of several with the best F-score at 1 cm.
 """
 
 import json
@@ -13,6 +15,7 @@ import time
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import numpy as np
 import typer
 from scipy.spatial import KDTree
@@ -33,28 +36,47 @@ from nerfcli.surface.volume import density_at
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk" / "truth"
 THRESHOLDS = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
 SAMPLES, THINNED = 200_000, 0.0025
-BEHIND, LEVELS = 0.05, (0.01, 0.02)
+BEHIND, LEVELS = 0.05, (0.01, 0.02, 0.05)
+SENSOR_EVERY = 10
+
+
+def desk_views() -> tuple[Camera, list[tuple[np.ndarray, np.ndarray]]]:
+    """The camera of the desk, and pose and true z of six photos."""
+    known = json.loads((DESK / "cameras.json").read_text(encoding="utf-8"))
+    depths = {image["name"]: DESK / "depth" / f"{Path(image['name']).stem}.tiff" for image in known["images"]}
+    images = [image for image in known["images"] if depths[image["name"]].exists()]
+    views = [(np.array(image["world_from_cam"]), read_any_tiff(depths[image["name"]])[0]) for image in images]
+    return Camera.from_json(known["camera"]), views
+
+
+def sensor_views(capture: Path) -> tuple[Camera, list[tuple[np.ndarray, np.ndarray]]]:
+    """The depth camera of an RGB-D video (pose/, depth/ in millimetres), and pose and measured z of some frames."""
+    matrix = np.loadtxt(capture / "camera-intrinsics.txt")
+    camera = Camera("PINHOLE", 640, 480, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
+    views = []
+    for path in sorted((capture / "depth").glob("*.png"))[::SENSOR_EVERY]:
+        levels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert levels is not None
+        depth = np.where((levels > 0) & (levels < 65535), levels / 1000.0, np.nan)
+        views.append((np.loadtxt(capture / "pose" / f"{path.stem}.txt"), depth))
+    return camera, views
 
 
 class Truth:
-    """The true surface of the desk inside a box.
+    """The true surface inside a box.
 
     Args:
+        camera: of all views.
+        views: world_from_cam and z of each.
         box: low and high corner, metres.
     """
 
-    def __init__(self, box: tuple[float, ...]):
-        known = json.loads((DESK / "cameras.json").read_text(encoding="utf-8"))
-        self.camera = Camera.from_json(known["camera"])
+    def __init__(self, camera: Camera, views: list[tuple[np.ndarray, np.ndarray]], box: tuple[float, ...]):
+        self.camera, self.views = camera, views
         self.low, self.high = np.array(box[:3]), np.array(box[3:])
-        self.views, parts = [], []
+        parts = []
         directions, valid = self.camera.pixel_bearings()
-        for image in known["images"]:
-            path = DESK / "depth" / f"{Path(image['name']).stem}.tiff"
-            if not path.exists():
-                continue
-            pose, depth = np.array(image["world_from_cam"]), read_any_tiff(path)[0]
-            self.views.append((pose, depth))
+        for pose, depth in views:
             kept = valid & np.isfinite(depth.ravel())
             points = directions[kept] * (depth.ravel()[kept] / directions[kept, 2])[:, None]
             parts.append(points @ pose[:3, :3].T + pose[:3, 3])
@@ -109,6 +131,7 @@ def samples_of(mesh: Mesh) -> np.ndarray:
 
 def main(
     run: Path,
+    sensor: Annotated[Path | None, typer.Option(help="Folder of the RGB-D video; the desk without.")] = None,
     voxel_size: Annotated[float, typer.Option(help="Metres.")] = 0.005,
     max_size: Annotated[int, typer.Option(help="Longer side of the pictures that are fused, pixels.")] = 480,
 ) -> None:
@@ -116,7 +139,7 @@ def main(
     opened = load_run(run)
     model = opened.model()
     box = scene_box(model, opened.cameras.train)
-    grid, truth = Grid.over(box, voxel_size), Truth(box)
+    grid, truth = Grid.over(box, voxel_size), Truth(*(desk_views() if sensor is None else sensor_views(sensor)), box)
     for name in ("median", "conditional"):
         began = time.perf_counter()
         views = depth_views(model, opened.cameras.train, max_size=max_size, depth=DepthRequest(name, "z"))
