@@ -95,6 +95,23 @@ def test_a_picture_of_the_worked_example():
     assert told["per_step"]["operations"] == 3 * 2**16 * 8000
 
 
+@pytest.mark.parametrize(
+    ("log2_rows", "contraction", "footprint", "finest"),
+    [
+        (16, "l2", 1 / 500, 1024),
+        (17, "l2", 1 / 500, 2000),
+        (18, "none", 1 / 1000, 2000),
+        (18, "l2", 1 / 100, 1024),
+        (18, "l2", 1 / 5000, 4096),
+    ],
+)
+def test_large_tables_have_cells_as_small_as_a_footprint(log2_rows, contraction, footprint, finest):
+    """The cube's side is 2 units of a bounded scene, and 4 of a contracted one."""
+    grid = HashFieldSettings(contraction=contraction, log2_rows=log2_rows)
+    chosen = chosen_size("hash", hash_grid=grid, footprint=footprint, memory_bytes=None)
+    assert chosen == replace(grid, finest=finest)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("megabytes", [1, 4, 16, 64])
 def test_the_chosen_size_is_the_largest_that_fits(kind, megabytes):

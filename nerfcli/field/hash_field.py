@@ -15,6 +15,8 @@ GEOMETRY = 16
 HARMONICS = 16
 # The levels that learn from the start, and the share of the budget from which on all do.
 FIRST_LEVELS, ALL_LEVELS_SHARE = 4, 0.5
+# Trainings of smaller tables are too short to come to details.
+DETAILED_LOG2_ROWS = 17
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,10 @@ class HashFieldSettings(FieldSettings):
     finest: int = 1024
     width: int = 32
     antialias: bool = False
+
+    @property
+    def detailed(self) -> bool:
+        return self.log2_rows >= DETAILED_LOG2_ROWS
 
     @property
     def resolutions(self) -> tuple[int, ...]:

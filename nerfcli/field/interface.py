@@ -24,6 +24,11 @@ class FieldSettings(abc.ABC):
     contraction: str
     view_degree: int = 3
 
+    @property
+    def detailed(self) -> bool:
+        """Whether the field shows more in rendering steps shorter than those of its training."""
+        return False
+
     def to_json(self) -> dict[str, Any]:
         """Plain values, the kind among them; see `kinds.settings_from_json`."""
         return {"kind": self.kind, **asdict(self)}

@@ -18,6 +18,8 @@ VOXEL_BYTES, NETWORK_BYTES = 2**26, 2**18
 # Harmonics above this degree would make a vertex of a dense grid larger by three quarters.
 VOXEL_DEGREE = 2
 LOG2_ROWS = range(8, 25)
+# A detailed hash grid has cells as small as a pixel's footprint, but no more than so many along the side of its cube.
+MOST_CELLS = 4096
 LOG2_VERTICES = range(6, 28)
 WIDTHS = range(16, 8193, 16)
 OCTAVES = (4, 12)
@@ -28,8 +30,9 @@ def chosen_size(
 ) -> FieldSettings:
     """The field of a kind that fits a capture.
 
-    What is finer than a pixel, no photo shows: a dense grid has no cells smaller than a pixel's footprint, and the
-    finest octave of Fourier features has no shorter period than two footprints. How many numbers there are is the
+    What is finer than a pixel, no photo shows: a dense grid has no cells smaller than a pixel's footprint, the finest
+    octave of Fourier features has no shorter period than two footprints, and a large hash grid's finest level, where
+    it does not have smaller cells anyway, has those of the footprint. How many numbers there are is the
     memory's business.
 
     Args:
@@ -47,6 +50,10 @@ def chosen_size(
     contraction, view_degree = hash_grid.contraction, hash_grid.view_degree
     cells = cells_of_footprint(footprint, contraction)
 
+    def tables(log2_rows: int) -> HashFieldSettings:
+        size = replace(hash_grid, log2_rows=log2_rows)
+        return replace(size, finest=max(size.finest, min(round(cells), MOST_CELLS))) if size.detailed else size
+
     def voxels(log2_vertices: int) -> VoxelFieldSettings:
         degree = min(view_degree, VOXEL_DEGREE)
         return VoxelFieldSettings(contraction=contraction, view_degree=degree, log2_vertices=log2_vertices)
@@ -58,8 +65,8 @@ def chosen_size(
     match kind:
         case HashFieldSettings.kind:
             if memory_bytes is None:
-                return hash_grid
-            return largest_within(LOG2_ROWS, lambda log2_rows: replace(hash_grid, log2_rows=log2_rows), memory_bytes)
+                return tables(hash_grid.log2_rows)
+            return largest_within(LOG2_ROWS, tables, memory_bytes)
         case VoxelFieldSettings.kind:
             sizes = [size for size in LOG2_VERTICES if voxels(size).resolution <= cells] or LOG2_VERTICES[:1]
             return largest_within(sizes, voxels, memory_bytes or VOXEL_BYTES)
