@@ -103,6 +103,13 @@ def test_a_trial_has_its_cameras_learn_from_the_fork_on(trials, start, monkeypat
     assert begun == [0.02]  # what the start has forked at
 
 
+def test_trials_have_the_small_tables_of_short_trainings(trials, monkeypatch):
+    for given, used in ((18, 16), (8, 8)):
+        monkeypatch.setattr(trials, "_settings", replace(trials._settings, log2_rows=given))
+        fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
+        assert fitting.field.settings.to_json()["log2_rows"] == used
+
+
 def test_cameras_learn_from_the_fork_on(trials, start):
     """Before it no step moves them, however far the training; behind it one does."""
     fitting = trials._fitting(Components(view=0, cameras="poses"), seed=0, log_gains=None, cameras_from=0.6)

@@ -23,7 +23,7 @@ DOUBLING_STEPS, MOST_DOUBLINGS = 600, 16
 SAMPLES_PER_SECOND = 1e6
 # Short trainings learn more with few rows, each of which is seen often; long ones have room for what photos show. Four
 # times as many at the end make the file of a field 34 MB and a sample a quarter slower.
-FEWEST_LOG2_ROWS, MOST_LOG2_ROWS, SAMPLES_PER_ROW = 16, 18, 900
+FEWEST_LOG2_ROWS, MOST_LOG2_ROWS, SAMPLES_PER_ROW = 16, 18, 400
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from nerfcli.photos.pool import PixelPool
 from nerfcli.photos.psnr import psnr_of
 from nerfcli.photos.storage import IN_MEMORY, PhotoStorage
 from nerfcli.runs.components import Components
-from nerfcli.runs.settings import TrainSettings
+from nerfcli.runs.settings import FEWEST_LOG2_ROWS, TrainSettings
 from nerfcli.search.diagnostics import Diagnostics, diagnose
 from nerfcli.search.sky import paint
 
@@ -235,7 +235,9 @@ class Trials:
         return seen
 
     def _fitting(self, components: Components, *, seed: int, log_gains: Tensor | None, cameras_from: float) -> Fitting:
-        settings = replace(self._settings, components=components, seed=seed)
+        # A trial is a short training, whatever comes after it.
+        rows = min(self._settings.chosen_log2_rows, FEWEST_LOG2_ROWS)
+        settings = replace(self._settings, components=components, seed=seed, log2_rows=rows)
         return Fitting(
             self._pool,
             self._extent.before(components.background).marching,
