@@ -261,6 +261,16 @@ def test_a_training_that_goes_on_to_a_larger_total_keeps_its_rows(views, tmp_pat
         fit(views, tmp_path / "run", replace(FEW, steps=4, log2_rows=17), resume=True)
 
 
+def test_detailed_fields_are_rendered_in_half_of_the_steps_of_their_training(views, tmp_path):
+    saved = {}
+    for rows in (16, 17):
+        fit(views, tmp_path / str(rows), replace(FEW, steps=1, log2_rows=rows))
+        marching = load_model(tmp_path / str(rows) / "field.safetensors", "cpu").marching
+        trained = load_tensors(tmp_path / str(rows) / "state.safetensors", "cpu")[1]["extent"]["marching"]
+        saved[rows] = (marching.shortest_step / trained["shortest_step"], marching.far == trained["far"])
+    assert saved == {16: (1.0, True), 17: (0.5, True)}
+
+
 def test_resume_goes_on_to_a_larger_total(views, tmp_path):
     fit(views, tmp_path / "run", replace(FEW, steps=3))
     second = fit(views, tmp_path / "run", replace(FEW, steps=5), resume=True)

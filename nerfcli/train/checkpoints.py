@@ -30,6 +30,9 @@ STATE_FORMAT = "nerfcli training 2"
 # Photos without alpha fill the frame; what the field lets through is black, and little does.
 OPAQUE_BACKGROUND = (0.0, 0.0, 0.0)
 ALPHA_BACKGROUND = (1.0, 1.0, 1.0)
+# Steps along the rays of pictures of detailed fields, in those of the training, where as many samples in longer steps
+# belong to more rays.
+DETAILED_STEP = 0.5
 
 
 @dataclass
@@ -62,10 +65,11 @@ class Checkpoints:
         """Return the current field as a model."""
         fitting, prepared = self._fitting, self._prepared
         alone = ALPHA_BACKGROUND if prepared.pool.has_alpha else OPAQUE_BACKGROUND
+        marching = prepared.extent.marching
         return Model(
             fitting.field,
             fitting.occupied,
-            prepared.extent.marching,
+            marching.stretched(DETAILED_STEP) if fitting.field.settings.detailed else marching,
             fitting.parts.background or alone,
             prepared.extent.training_from_scene,
             self._scene.unit,
