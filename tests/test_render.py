@@ -1,9 +1,11 @@
 """Whole pictures of a fog that fills chosen cells: every pixel has a closed form, in colour, opacity and each depth."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from fog import SIDE, STEP, fog, foggy_cells
 
 from nerfcli.cameras.camera import Camera
@@ -11,7 +13,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts, look_at, rotation_from_quaternion
 from nerfcli.render.depth import CONVENTIONS
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import DepthRequest, RenderedPicture, render_picture
+from nerfcli.render.pictures import DepthRequest, RenderedPicture, default_rays_per_tile, render_picture
 from nerfcli.render.rays import frame_rays
 
 # From a scene that is turned, moved and four times as large as the training frame.
@@ -209,6 +211,16 @@ def test_tiles_leave_no_trace(tile):
     np.testing.assert_array_equal(tiled.depth, whole.depth)
     assert sum(counts) == 16 * 12
     assert max(counts) <= tile
+
+
+@pytest.mark.parametrize(("gigabytes", "rays"), [(80, 2**16), (8, 2**8 * 142), (1, 2**13)])
+def test_tiles_of_a_gpu_fit_into_its_memory(gigabytes, rays, monkeypatch):
+    """An eighth of it, were every step of 250 in an occupied cell; but never so few that they do not fill a GPU."""
+    device = SimpleNamespace(total_memory=gigabytes * 10**9)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda of: device)
+    marching = SimpleNamespace(edges=lambda: torch.zeros(250))
+    model = SimpleNamespace(device=torch.device("cuda:1"), marching=marching)
+    assert default_rays_per_tile(model) == pytest.approx(rays, rel=0.01)  # type: ignore[arg-type]
 
 
 def test_unknown_conventions_are_programming_errors():

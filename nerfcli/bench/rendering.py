@@ -28,7 +28,7 @@ from nerfcli.evaluate.sampled import background_of
 from nerfcli.field.cost import field_bytes
 from nerfcli.render.accuracy import TIGHT
 from nerfcli.render.model import Model
-from nerfcli.render.pictures import Quality, RenderedPicture, render_picture
+from nerfcli.render.pictures import RAYS_PER_TILE, Quality, RenderedPicture, render_picture
 
 MOST_PHOTOS = 3
 LEAST_ROUNDS, MOST_ROUNDS = 3, 9
@@ -204,7 +204,7 @@ def _render(model: Model, photo: HeldOutPhoto, setting: RenderSetting) -> Render
         photo.frame,
         background=background_of(model, photo),
         quality=Quality(tolerance=setting.tolerance),
-        rays_per_tile=setting.rays_per_tile,
+        rays_per_tile=None if setting.rays_per_tile == RAYS_PER_TILE else setting.rays_per_tile,
     )
 
 

@@ -28,7 +28,7 @@ class RenderSetting:
         threads: CPU threads.
         step: length of the steps along rays, in those of the training.
         tolerance: see `render.pictures.Quality`.
-        rays_per_tile: rendered at a time.
+        rays_per_tile: rendered at a time; the default is what suits the device.
         stored_in: one of `STORED_IN`.
     """
 

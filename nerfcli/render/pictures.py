@@ -18,6 +18,9 @@ from nerfcli.render.tracing import TOLERANCE, render_rays
 
 RAYS_PER_TILE = 2**14
 RAYS_PER_GPU_TILE = 2**16
+# A tile of a GPU takes this share of its memory at most, even where every step of its rays is in an occupied cell and
+# takes so many bytes.
+SHARE_OF_GPU, BYTES_PER_STEP = 1 / 8, 110
 # Rays and what is behind them are made for this many at a time: their last bits must not depend on the tile.
 RAYS_PER_BLOCK = 2**18
 
@@ -103,7 +106,7 @@ def render_picture(
         raise ValueError("the background convention needs a background distance")
     width, height, count = frame.camera.width, frame.camera.height, quality.samples_per_pixel
     columns: list[tuple[Tensor, ...]] = []
-    together = rays_per_tile or (RAYS_PER_TILE if model.device.type == "cpu" else RAYS_PER_GPU_TILE)
+    together = rays_per_tile or default_rays_per_tile(model)
     block, tile = max(1, RAYS_PER_BLOCK // count), max(1, together // count)
     for first in range(0, width * height, block):
         chosen = range(first, min(first + block, width * height))
@@ -130,6 +133,15 @@ def render_picture(
         truncation_error=error,
         valid=valid,
     )
+
+
+def default_rays_per_tile(model: Model) -> int:
+    """Return how many rays are rendered at a time on the device of a model."""
+    if model.device.type != "cuda":
+        return RAYS_PER_TILE
+    total = torch.cuda.get_device_properties(model.device).total_memory
+    fitting = int(SHARE_OF_GPU * total / (BYTES_PER_STEP * len(model.marching.edges())))
+    return min(RAYS_PER_GPU_TILE, max(RAYS_PER_TILE, fitting))
 
 
 def _refuse_non_finite(frame: Frame, maps: dict[str, np.ndarray]) -> None:
