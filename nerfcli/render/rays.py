@@ -55,9 +55,8 @@ def pixel_rays(
 def successive_rays(
     frame: Frame, training_from_scene: Similarity, *, pixels: range, count: int, device: torch.device
 ) -> PictureRays:
-    """`pixel_rays` at `places_in_pixel(count)`; a GPU keeps what the next picture of the same camera needs again."""
-    bearings = _bearings_of_range if device.type == "cpu" else _kept_bearings
-    return _turned(frame, training_from_scene, *bearings(frame.camera, pixels, count, device), count=count)
+    """`pixel_rays` at `places_in_pixel(count)`; what the next picture of the same camera needs again is kept."""
+    return _turned(frame, training_from_scene, *_bearings_of_range(frame.camera, pixels, count, device), count=count)
 
 
 def _turned(
@@ -85,12 +84,9 @@ def _bearings(camera: Camera, pixels: np.ndarray, places: np.ndarray, device: to
     return torch.from_numpy(bearings).to(device), torch.from_numpy(valid).to(device)
 
 
+@functools.lru_cache(maxsize=8)  # 2 million rays, 25 bytes each
 def _bearings_of_range(camera: Camera, pixels: range, count: int, device: torch.device) -> tuple[Tensor, Tensor]:
     return _bearings(camera, np.arange(pixels.start, pixels.stop), places_in_pixel(count), device)
-
-
-# For 2 million rays, 25 bytes each.
-_kept_bearings = functools.lru_cache(maxsize=8)(_bearings_of_range)
 
 
 def places_in_pixel(count: int) -> np.ndarray:
