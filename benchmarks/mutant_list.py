@@ -686,4 +686,29 @@ GROUPS: tuple[Group, ...] = (
             Mutant("(points < grid.high)", "(points < grid.high - 0.3)"),
         ),
     ),
+    Group(
+        "render/depth_errors.py",
+        ("tests/test_depth_errors.py",),
+        "",
+        (),
+        (
+            Mutant("counts[-1] >= LEAST_PIXELS and ", ""),
+            Mutant("len(np.unique(photos[inside])) >= LEAST_PHOTOS", "True"),
+            Mutant("np.where(number >= 0, 1.0 + of_strata[number], np.nan)", "1.0 + of_strata[number]"),
+            Mutant('side="right"', 'side="left"'),
+            Mutant("((1 - level) / 2, (1 + level) / 2)", "(1 - level, level)"),
+        ),
+    ),
+    Group(
+        "evaluate/depth_errors.py",
+        ("tests/test_depth_errors.py",),
+        "",
+        (),
+        (
+            Mutant("found.distances[chosen] / median - 1.0", "1.0 - found.distances[chosen] / median"),
+            Mutant("photos[len(train) :], measured[len(train) :]", "photos[len(train) :], measured"),
+            Mutant("bearings(pixels + 0.5)", "bearings(pixels * 0.0)"),
+            Mutant("rays = points[own] - view.frame.centre", "rays = points[own]"),
+        ),
+    ),
 )

@@ -58,7 +58,7 @@ MAY_IMPORT = {
         *("search", "fit", "multiview", "runs", "photos", "render", "field", "kernels", "scene"),
         "cameras",
     },
-    "evaluate": {"runs", "photos", "render", "field", "scene", "cameras", "media"},
+    "evaluate": {"multiview", "runs", "photos", "render", "field", "scene", "cameras", "media"},
     "export": {"render", "field", "scene", "cameras", "media"},
     "ablate": {"runs"},
     "bench": {

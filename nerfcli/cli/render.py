@@ -57,7 +57,7 @@ def render(
     outputs: Annotated[
         str | None,
         typer.Option(
-            help="Any of rgb,depth,opacity,spread,disagreement,coverage,parallax; for scans "
+            help="Any of rgb,depth,opacity,spread,disagreement,coverage,parallax,lower,upper; for scans "
             "projection,transmission,residual.  "
             "[default: rgb,depth,opacity; projection]"
         ),
@@ -88,6 +88,9 @@ def render(
             max=180,
         ),
     ] = 0.0,
+    level: Annotated[
+        float, typer.Option(help="Level of the interval of depth between lower and upper.", min=0.5, max=0.99)
+    ] = 0.9,
     background_distance: Annotated[
         float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
     ] = None,
@@ -183,7 +186,9 @@ def render(
       quantile:0.05  distance at which 5 % of all light is absorbed        (NaN if less is)
     spread is the standard deviation of that distance, disagreement |median - conditional|: both are large where no
     single depth is right (edges, glass, fog). coverage is the number of training photos that see the surface (its
-    median depth), parallax the largest angle between two of them. Every file describes its values: nerfcli info FILE.
+    median depth), parallax the largest angle between two of them. lower and upper are an interval of --level around
+    that depth, measured by stereo matching of the held-out photos; where no training photo sees the surface, there is
+    none. Every file describes its values: nerfcli info FILE.
     \b
     Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos and previews of
     views that were already rendered are made without rendering again (add --overwrite to replace existing ones).
@@ -244,6 +249,7 @@ def render(
     finite(min_opacity, "--min-opacity")
     finite(step, "--step")
     finite(min_parallax, "--min-parallax")
+    finite(level, "--level")
     if (min_views or min_parallax) and "depth" not in chosen:
         hint = "--min-views" if min_views else "--min-parallax"
         raise typer.BadParameter("it removes depth; add depth to --outputs", param_hint=hint)
@@ -254,6 +260,7 @@ def render(
         background_distance=background_distance,
         min_views=min_views,
         min_parallax_deg=min_parallax,
+        level=level,
     )
     one_of(colour_map, COLOUR_MAPS, "--colour-map")
     if max_size is not None and (width is not None or height is not None):

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.export.file_names import with_suffix
-from nerfcli.export.settings import FLOAT_FORMATS, LEVELS_FOLDER, TOGETHER, ExportSettings, floor_of
+from nerfcli.export.settings import FLOAT_FORMATS, LEVELS_FOLDER, TOGETHER, ExportSettings, meaning_of
 from nerfcli.media.arrays import read_arrays, write_npy, write_npz
 from nerfcli.media.depth_pictures import DepthMeta, difference_of, mixed
 from nerfcli.media.descriptions import depth_meta_of
@@ -71,7 +71,7 @@ def write_maps(
         UserError: a file cannot be written.
     """
     maps = {output: _map_of(picture, output) for output in settings.measured}
-    metas = {output: meta.of(output, opacity_floor=floor_of(settings.depth, output)) for output in maps}
+    metas = {output: meaning_of(meta, settings.depth, output) for output in maps}
     written: list[Path] = []
     for file_format in settings.float_formats:
         if file_format in TOGETHER:
@@ -106,7 +106,8 @@ def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
     path, output = _floats_of(folder, name, meaning.quantity), meaning.quantity
     found = depth_meta_of(path)
     if found is not None and path.suffix in (".exr", ".npz"):
-        found = found.of(output, opacity_floor=found.layers.get(output, {}).get("opacity_floor"))
+        layer = found.layers.get(output, {})
+        found = found.of(output, opacity_floor=layer.get("opacity_floor"), convention=layer.get("convention"))
     difference = "it does not state what its values mean" if found is None else difference_of(meaning, found)
     if difference:
         raise mixed(path, Path("the other frames"), difference)

@@ -14,6 +14,7 @@ from nerfcli.errors import UserError
 from nerfcli.export.file_names import describe_frames, file_names
 from nerfcli.export.settings import ExportSettings
 from nerfcli.media.video import FORMATS, check_encoders
+from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.visibility import DepthMap
 
 DESCRIPTION = "render.json"
@@ -30,12 +31,14 @@ class Order:
         provenance: what else decides over the pictures, the run and the hash of its field first of all; plain values.
         photo_depths: what each training photo sees of the surface, where `ExportSettings.needs_visibility`; the
             provenance says which photos.
+        depth_errors: of the field, where `ExportSettings.needs_errors`.
     """
 
     frames: tuple[Frame, ...]
     settings: ExportSettings
     provenance: dict[str, Any]
     photo_depths: tuple[DepthMap, ...] = ()
+    depth_errors: DepthErrors | None = None
 
     @cached_property
     def names(self) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 from nerfcli import __version__
 from nerfcli.export.depth_files import read_map
 from nerfcli.export.order import Order
-from nerfcli.export.settings import MEASURED, floor_of
+from nerfcli.export.settings import MEASURED, meaning_of
 from nerfcli.media.depth_pictures import KEY, DepthMeta
 from nerfcli.media.images import read_image, write_png
 from nerfcli.media.preview import beside, preview
@@ -42,7 +42,7 @@ def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int 
     """
     ranges = {}
     for output in order.settings.measured:
-        meaning = meta.of(output, opacity_floor=floor_of(order.settings.depth, output))
+        meaning = meaning_of(meta, order.settings.depth, output)
         ranges[output] = _write_previews_of(output, folder, order, meaning, threads=threads)
     return ranges
 
@@ -123,7 +123,7 @@ def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[
     if not found:
         return 0.0, 1.0
     lo, hi = found
-    return (lo if output == "depth" else 0.0), hi
+    return (lo if output in ("depth", "lower", "upper") else 0.0), hi
 
 
 def playing_order(count: int, direction: str) -> list[int]:

@@ -8,9 +8,9 @@ from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Quality
 
-OUTPUTS = ("rgb", "depth", "opacity", "spread", "disagreement", "coverage", "parallax")
+OUTPUTS = ("rgb", "depth", "opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper")
 # Those that are measured: floats on disk, and pictures in colours to look at.
-MEASURED = ("depth", "spread", "disagreement", "coverage", "parallax")
+MEASURED = ("depth", "spread", "disagreement", "coverage", "parallax", "lower", "upper")
 FLOAT_FORMATS = ("tiff", "exr", "npy", "npz")
 FORMATS = (*FLOAT_FORMATS, "png16")
 # A file of these holds all that was asked for of a view, in a folder under the name of the format.
@@ -76,7 +76,12 @@ class ExportSettings:
     def needs_visibility(self) -> bool:
         """Whether it must be known which photos see the surface."""
         wanted = {"coverage", "parallax"} & set(self.outputs)
-        return bool(wanted or self.depth.min_views or self.depth.min_parallax_deg)
+        return bool(wanted or self.depth.min_views or self.depth.min_parallax_deg or self.needs_errors)
+
+    @property
+    def needs_errors(self) -> bool:
+        """Whether the errors of depth must be known."""
+        return "lower" in self.outputs or "upper" in self.outputs
 
     @property
     def float_formats(self) -> tuple[str, ...]:
@@ -104,6 +109,8 @@ class ExportSettings:
         for name in ("min_views", "min_parallax_deg"):
             if not settings["depth"][name]:  # as in folders that were made before there was a choice
                 del settings["depth"][name]
+        if not self.needs_errors:
+            del settings["depth"]["level"]
         return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
 
     def of_presentation(self) -> dict[str, Any]:
@@ -126,6 +133,12 @@ def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
         min_views=request.min_views,
         min_parallax_deg=request.min_parallax_deg,
     )
+
+
+def meaning_of(meta: DepthMeta, request: DepthRequest, output: str) -> DepthMeta:
+    """Return the meaning of an output that is measured, beside depth that means `meta`."""
+    convention = f"{output}:{request.level:g}" if output in ("lower", "upper") else None
+    return meta.of(output, opacity_floor=floor_of(request, output), convention=convention)
 
 
 def floor_of(request: DepthRequest, output: str) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from nerfcli.cameras.frame import Frame
 from nerfcli.media.depth_pictures import limits_in_words
 from nerfcli.render.depth import DepthRequest
+from nerfcli.render.depth_errors import DepthErrors
 from nerfcli.render.pictures import RenderedPicture
 from nerfcli.render.visibility import DepthMap, coverage_and_parallax
 
@@ -34,6 +35,14 @@ def with_visibility(
     coverage, parallax = coverage_and_parallax(photo_depths, points)
     shape = picture.median.shape
     return replace(picture, coverage=coverage.reshape(shape), parallax=parallax.reshape(shape))
+
+
+def with_interval(picture: RenderedPicture, errors: DepthErrors, *, level: float) -> RenderedPicture:
+    """Return the picture, with median and coverage, with an interval of depth in each pixel."""
+    assert picture.median is not None
+    assert picture.coverage is not None
+    lower, upper = errors.bounds(picture.median, picture.coverage, level=level)
+    return replace(picture, lower=lower, upper=upper)
 
 
 def without_unseen_depth(picture: RenderedPicture, request: DepthRequest) -> tuple[RenderedPicture, dict[str, Any]]:

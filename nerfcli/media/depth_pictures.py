@@ -20,13 +20,15 @@ FORMAT = "nerfcli depth 2"
 # The word under which a description stands in PNG text chunks, OpenEXR attributes and NPZ archives.
 KEY = "nerfcli"
 AXES = {"ray": "along the ray", "z": "along the optical axis (z)"}
-QUANTITIES = ("depth", "spread", "disagreement", "coverage", "parallax")
+QUANTITIES = ("depth", "spread", "disagreement", "coverage", "parallax", "lower", "upper")
 # The convention of what is no depth itself.
 CONVENTION_OF = {
     "spread": "standard-deviation",
     "disagreement": "median-conditional",
     "coverage": "photos-that-see",
     "parallax": "largest-angle",
+    "lower": "lower",
+    "upper": "upper",
 }
 # The unit of what is no length.
 UNIT_OF = {"coverage": "photos", "parallax": "degrees"}
@@ -40,6 +42,8 @@ _IN_WORDS = {
     "standard-deviation": "the standard deviation of the distance at which light is absorbed",
     "median-conditional": "|median - conditional|, large where no single depth is right (edges, glass, fog)",
     "photos-that-see": "the number of training photos that see the surface, by the field's own depths",
+    "lower": "measured on held-out photos by stereo matching; none where no training photo sees the surface",
+    "upper": "measured on held-out photos by stereo matching; none where no training photo sees the surface",
     "largest-angle": "the largest angle between the rays of two training photos that see the surface; 0 below two",
 }
 _WHAT_MUST_AGREE = (
@@ -96,15 +100,18 @@ class DepthMeta:
         if self.quantity not in QUANTITIES:
             raise ValueError(f"quantity must be one of {', '.join(QUANTITIES)}, got {self.quantity}")
 
-    def of(self, quantity: str, *, opacity_floor: float | None = None) -> Self:
-        """The meaning of another map of the same picture, along the same axis; the floor too if none is given."""
+    def of(self, quantity: str, *, opacity_floor: float | None = None, convention: str | None = None) -> Self:
+        """The meaning of another map of the same picture, along the same axis; the floor too if none is given.
+
+        The convention is that of `CONVENTION_OF` if none is given.
+        """
         if quantity == self.quantity:
             return self
         floor = self.opacity_floor if opacity_floor is None else opacity_floor
         return replace(
             self,
             quantity=quantity,
-            convention=CONVENTION_OF[quantity],
+            convention=convention or CONVENTION_OF[quantity],
             unit=UNIT_OF.get(quantity, self.unit),
             unit_source=None if quantity in UNIT_OF else self.unit_source,
             opacity_floor=floor,
@@ -121,8 +128,15 @@ class DepthMeta:
             "disagreement": "|median - conditional| depth",
             "coverage": "coverage: training photos that see the surface",
             "parallax": "parallax: largest angle between two of them",
+            "lower": f"lower end of the {self._level} interval of depth",
+            "upper": f"upper end of the {self._level} interval of depth",
         }
         return named.get(self.quantity, f"{self.convention} depth")
+
+    @property
+    def _level(self) -> str:
+        """The level of an interval in words: "90 %"."""
+        return f"{100 * float(self.convention.partition(':')[2] or 'nan'):g} %"
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, with the format and the version that wrote them."""

@@ -9,6 +9,7 @@
     disagreement.V    |median - conditional|
     coverage.V        number of training photos that see the surface
     parallax.V        largest angle between the rays of two of them, degrees
+    lower.V, upper.V  interval of depth
 
 Pixels without a value are NaN. The header carries the description as JSON in the attribute "nerfcli", and a sentence
 for people in "comments". Source: https://openexr.com/en/latest/TechnicalIntroduction.html, "Channel Names".
@@ -33,7 +34,7 @@ from nerfcli.media.srgb import linear_light
 
 CHANNELS = {
     "depth": "Z",
-    **{name: f"{name}.V" for name in ("opacity", "spread", "disagreement", "coverage", "parallax")},
+    **{name: f"{name}.V" for name in ("opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper")},
 }
 
 

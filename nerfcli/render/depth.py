@@ -41,6 +41,7 @@ class DepthRequest:
             scene's unit; needed by that convention only.
         min_views, min_parallax_deg: coverage and parallax of the median point below which an export removes the depth;
             see `visibility`.
+        level: of the interval between the outputs lower and upper, see `depth_errors`.
 
     Raises:
         ValueError: no such convention or axis.
@@ -52,6 +53,7 @@ class DepthRequest:
     background_distance: float | None = None
     min_views: int = 0
     min_parallax_deg: float = 0.0
+    level: float = 0.9
 
     def __post_init__(self) -> None:
         if not is_convention(self.convention):

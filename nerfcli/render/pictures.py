@@ -59,6 +59,7 @@ class RenderedPicture:
         truncation_error: (H, W) bound on what was left out of each channel of rgb; the tolerance at most.
         valid: (H, W) bool; False where the lens has no ray (rgb is then the background, opacity 0).
         coverage, parallax: (H, W) of the points at `median`, see `visibility`; None unless an export adds them.
+        lower, upper: (H, W) of an interval of depth, see `depth_errors`; None unless an export adds them.
     """
 
     rgb: np.ndarray
@@ -71,6 +72,8 @@ class RenderedPicture:
     valid: np.ndarray
     coverage: np.ndarray | None = None
     parallax: np.ndarray | None = None
+    lower: np.ndarray | None = None
+    upper: np.ndarray | None = None
 
 
 @torch.no_grad()

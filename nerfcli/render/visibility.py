@@ -30,6 +30,13 @@ class DepthMap:
     frame: Frame
     distances: np.ndarray
 
+    def points(self) -> np.ndarray:
+        """Points (N, 3) of the surface in the scene's frame, row by row, without the pixels that see none."""
+        rays, _ = self.frame.camera.pixel_bearings()
+        there = np.isfinite(self.distances.ravel())
+        pose = self.frame.world_from_cam
+        return (rays[there] * self.distances.ravel()[there, None]) @ pose[:3, :3].T + pose[:3, 3]
+
 
 def depth_maps(
     model: Model,

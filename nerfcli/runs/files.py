@@ -7,6 +7,7 @@ FIELD = "field.safetensors"
 STATE = "state.safetensors"
 LOG = "log.jsonl"
 METRICS = "metrics.json"
+DEPTH_ERRORS = "depth_errors.json"
 PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
 LOCK = ".train.lock"
@@ -17,6 +18,7 @@ RECONSTRUCTION = "reconstruction.json"
 __all__ = [
     "CAMERAS",
     "CONFIG",
+    "DEPTH_ERRORS",
     "FIELD",
     "LIVE",
     "LOCK",

@@ -59,13 +59,8 @@ def _near(view: DepthMap) -> float:
 
 def surface_points(views: Sequence[DepthMap], grid: Grid) -> np.ndarray:
     """Return a point (N, 3) of the surface for each voxel of a grid in which a view sees one; the first view's."""
-    parts = []
-    for view in views:
-        rays, _ = view.frame.camera.pixel_bearings()
-        pose = view.frame.world_from_cam
-        points = (rays * view.distances.reshape(-1, 1)) @ pose[:3, :3].T + pose[:3, 3]
-        parts.append(points[((points >= grid.low) & (points < grid.high)).all(axis=1)])  # False at NaN
-    points = np.concatenate(parts)
+    points = np.concatenate([view.points() for view in views])
+    points = points[((points >= grid.low) & (points < grid.high)).all(axis=1)]
     cells = np.floor((points - grid.low) / grid.voxel_size).astype(np.int64)
     keys = np.ravel_multi_index(tuple(cells.T), grid.shape)
     return points[np.unique(keys, return_index=True)[1]]

@@ -1,15 +1,18 @@
-"""What each training photo sees of the surface: rendered once per field, kept in the run."""
+"""What each training photo sees of the surface, and how wrong depth is: made once per field, kept in the run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
+from nerfcli.evaluate.depth_errors import measure_depth_errors
 from nerfcli.media.masks import read_mask
+from nerfcli.render.depth_errors import STRATA, DepthErrors
 from nerfcli.render.model import Model
 from nerfcli.render.visibility import MAX_SIZE, DepthMap, depth_maps
+from nerfcli.runs.depth_errors import read_depth_errors, write_depth_errors
 from nerfcli.runs.photo_depths import photo_depths_digest, read_photo_depths, write_photo_depths
 from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify
@@ -42,6 +45,34 @@ def photo_depths(
     except UserError as error:  # a run of somebody else can be rendered, too
         notify(f"the depths of the training photos are not kept: {error.message}")
     return tuple(maps)
+
+
+def depth_errors(
+    run: Run,
+    model: Model,
+    photos: Sequence[DepthMap],
+    *,
+    threads: int,
+    on_progress: Callable[[float], None],
+    notify: Notify,
+) -> DepthErrors:
+    """Return the errors of the field's depth, from the run if they belong to this field.
+
+    Raises:
+        UserError: see `measure_depth_errors`.
+    """
+    expected = photo_depths_digest(model.sha256, [*run.cameras.train, *run.cameras.test], max_size=MAX_SIZE)
+    errors = read_depth_errors(run.path, expected=expected)
+    if errors is None:
+        errors = measure_depth_errors(run, model, photos, threads=threads, on_progress=on_progress)
+        try:
+            write_depth_errors(run.path, errors, digest=expected)
+        except UserError as error:
+            notify(f"the errors of depth are not kept: {error.message}")
+    for least, pixels, quantiles in zip(STRATA, errors.pixels, errors.quantiles, strict=True):
+        if np.isnan(quantiles).any():
+            notify(f"no intervals where {least} photos see the surface: only {pixels} pixels could be measured")
+    return errors
 
 
 def _without_masked(view: DepthMap, frame: Frame, notify: Notify) -> DepthMap:

@@ -14,7 +14,7 @@ from nerfcli.render.depth import DepthRequest
 from nerfcli.runs.run import Run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
-from nerfcli.workflows.photo_depths import photo_depths
+from nerfcli.workflows.photo_depths import depth_errors, photo_depths
 from nerfcli.workflows.views import Views, chosen_frames, refuse_z_all_around
 
 RENDERS = "renders"
@@ -83,6 +83,17 @@ def render_run(
             trained, model, on_progress=lambda share: progress(share, "depths of the training photos"), notify=notify
         )
         provenance["training_photos"] = len(seen)
+    errors = None
+    if settings.needs_errors:
+        errors = depth_errors(
+            trained,
+            model,
+            seen,
+            threads=cores,
+            on_progress=lambda share: progress(share, "depth of the held-out photos"),
+            notify=notify,
+        )
+        provenance["measured_photos"] = errors.photos
     model = model.stretched(step)
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
         farthest = model.marching.far / model.training_from_scene.scale
@@ -93,7 +104,7 @@ def render_run(
         refuse_z_all_around(frames, notify=notify)
     if step != 1.0:
         provenance["step"] = step
-    order = Order(tuple(frames), settings, provenance, seen)
+    order = Order(tuple(frames), settings, provenance, seen, errors)
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
         raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)

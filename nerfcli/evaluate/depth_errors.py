@@ -1,0 +1,97 @@
+"""Errors of a field's depth without a true depth: stereo matching of held-out photos with the training photos.
+
+The field has not seen the held-out photos; what their pixels match in other photos is independent of its depth, except
+for the poses and for the range in which depth is sought. Where nothing can be matched, nothing is measured.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from nerfcli.cameras.frame import Frame
+from nerfcli.errors import UserError
+from nerfcli.multiview.stereo import LONGER_SIDE_PX, dense_depths
+from nerfcli.multiview.tracks import Tracks
+from nerfcli.photos.loading import load_photos
+from nerfcli.render.depth import DepthRequest
+from nerfcli.render.depth_errors import DepthErrors
+from nerfcli.render.model import Model
+from nerfcli.render.pictures import render_picture
+from nerfcli.render.visibility import DepthMap, coverage_and_parallax, depth_maps, sees, small_frame
+from nerfcli.runs.run import Run
+
+# Points of the surface per photo, which say which photos look at the same and where depth is sought.
+_POINTS = 200
+# Measured pixels of a photo that are compared, at most.
+_PIXELS = 20_000
+
+
+def measure_depth_errors(
+    run: Run,
+    model: Model,
+    photo_depths: Sequence[DepthMap],
+    *,
+    threads: int,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> DepthErrors:
+    """Compare the median depth of held-out photos with stereo matching.
+
+    Args:
+        run: with held-out photos on disk.
+        model: its field.
+        photo_depths: of its training photos, in their order.
+        threads: photos at a time.
+        on_progress: called with how much is done.
+
+    Raises:
+        UserError: there are no held-out photos, or a photo cannot be read.
+    """
+    train, test = run.cameras.train, run.cameras.test
+    if not test:
+        raise UserError(
+            f"{run.path} has no held-out photos, and intervals of depth are measured with them",
+            "train with --holdout every:8, or leave lower and upper out of --outputs",
+        )
+    maps = [*photo_depths, *depth_maps(model, test)]
+    tracks = surface_tracks(maps)
+    factor, masks = run.config.downscale, run.components.masks
+    photos = load_photos([*train, *test], factor=factor, threads=threads, masks=masks)
+    on_progress(0.1)
+    measured = dense_depths(photos, tracks, longer_side_px=LONGER_SIDE_PX, threads=threads)
+    parts = []
+    for number, (photo, found) in enumerate(zip(photos[len(train) :], measured[len(train) :], strict=True)):
+        chosen = slice(None, None, 1 + len(found.pixels) // _PIXELS)
+        points, median = _median_points(model, photo.frame, found.pixels[chosen])
+        coverage, _ = coverage_and_parallax(photo_depths, points)
+        errors = found.distances[chosen] / median - 1.0
+        there = np.isfinite(errors)
+        parts.append(np.stack([errors, coverage, np.full(len(errors), number)])[:, there])
+        on_progress(0.7 + 0.3 * (number + 1) / len(test))
+    return DepthErrors.of(*np.concatenate(parts, axis=1))
+
+
+def surface_tracks(maps: Sequence[DepthMap]) -> Tracks:
+    """Return points of the surface as each camera sees them, evenly chosen from the maps."""
+    parts = []
+    for view in maps:
+        points = view.points()
+        parts.append(points[:: 1 + len(points) // _POINTS])
+    points = np.concatenate(parts)
+    columns = []
+    for number, view in enumerate(maps):
+        own = np.flatnonzero(sees(view, points))
+        rays = points[own] - view.frame.centre
+        columns.append((np.full(len(own), number), own, rays / np.linalg.norm(rays, axis=1, keepdims=True)))
+    return Tracks(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+
+def _median_points(model: Model, frame: Frame, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points (N, 3) at the median distances (N,) of pixels (N, 2), rendered at the size of the stereo matching."""
+    small = small_frame(frame, LONGER_SIDE_PX)
+    picture = render_picture(model, small, background=model.background, depth=DepthRequest("median", "ray"))
+    assert picture.depth is not None
+    size = np.array([small.camera.width, small.camera.height])
+    column, row = (pixels * size // (frame.camera.width, frame.camera.height)).T
+    median = picture.depth[row, column].astype(np.float64)
+    rays, _ = frame.camera.bearings(pixels + 0.5)
+    return (rays * median[:, None]) @ frame.world_from_cam[:3, :3].T + frame.centre, median

@@ -1,0 +1,74 @@
+"""Errors of a field's depth by how many photos see the surface, and the intervals of depth that follow from them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+# Coverage from which each stratum begins. Where no photo sees the surface there is nothing to measure an error with.
+STRATA = (1, 2, 4)
+# Of the errors in a stratum, the quantiles that are kept: every half per cent.
+_SHARES = np.linspace(0.0, 1.0, 201)
+# Measured pixels and photos that a stratum needs: those of one photo have errors in common.
+LEAST_PIXELS, LEAST_PHOTOS = 200, 2
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Errors of the median depth, (measured - median) / median, in each of `STRATA`.
+
+    Args:
+        quantiles: (strata, 201) from the least to the largest; NaN where too little was measured.
+        pixels: measured in each stratum.
+        photos: that were measured in.
+    """
+
+    quantiles: np.ndarray
+    pixels: tuple[int, ...]
+    photos: int
+
+    @classmethod
+    def of(cls, errors: np.ndarray, coverage: np.ndarray, photos: np.ndarray) -> Self:
+        """Sum up errors (N,) of pixels with a coverage (N,) in photos with these numbers (N,)."""
+        rows, counts = [], []
+        for number in range(len(STRATA)):
+            inside = _stratum(coverage) == number
+            counts.append(int(inside.sum()))
+            enough = counts[-1] >= LEAST_PIXELS and len(np.unique(photos[inside])) >= LEAST_PHOTOS
+            rows.append(np.quantile(errors[inside], _SHARES) if enough else np.full(len(_SHARES), np.nan))
+        return cls(np.stack(rows), tuple(counts), len(np.unique(photos)))
+
+    def bounds(self, median: np.ndarray, coverage: np.ndarray, *, level: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the central interval of depth, (lower, upper) like `median`, that holds `level` of what was measured.
+
+        lower = median (1 + q), with the quantile q of the errors in the pixel's stratum at (1 - level) / 2; upper with
+        that at (1 + level) / 2. NaN where no photo sees the surface, or too little was measured in the stratum.
+
+        Source: split conformal prediction by groups: Angelopoulos and Bates 2021, arXiv:2107.07511, section 4.1.
+        """
+        number = _stratum(coverage)
+        sides = []
+        for share in ((1 - level) / 2, (1 + level) / 2):
+            of_strata = np.array([np.interp(share, _SHARES, row) for row in self.quantiles])
+            factor = np.where(number >= 0, 1.0 + of_strata[number], np.nan)
+            sides.append((median * factor).astype(np.float32))
+        return sides[0], sides[1]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; null for a stratum without quantiles."""
+        rows = [None if np.isnan(row).any() else row.tolist() for row in self.quantiles]
+        return {"strata": list(STRATA), "quantiles": rows, "pixels": list(self.pixels), "photos": self.photos}
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> Self:
+        """The errors that `to_json` described."""
+        rows: Sequence[Any] = content["quantiles"]
+        empty = np.full(len(_SHARES), np.nan)
+        quantiles = np.stack([empty if row is None else np.array(row) for row in rows])
+        return cls(quantiles, tuple(content["pixels"]), content["photos"])
+
+
+def _stratum(coverage: np.ndarray) -> np.ndarray:
+    """Number of the stratum; -1 where coverage is 0 or NaN."""
+    return np.searchsorted(STRATA, np.nan_to_num(coverage), side="right") - 1

@@ -1,0 +1,159 @@
+"""Intervals of depth: from known errors in closed form, and from stereo matching that is replaced by the truth."""
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from commands import nerfcli
+
+from nerfcli.cameras.formats.run_cameras import RunCameras
+from nerfcli.errors import UserError
+from nerfcli.evaluate import depth_errors
+from nerfcli.evaluate.depth_errors import measure_depth_errors, surface_tracks
+from nerfcli.media.descriptions import depth_meta_of
+from nerfcli.multiview.stereo import DenseDepth
+from nerfcli.multiview.tracks import Tracks
+from nerfcli.multiview.triangulation import triangulate
+from nerfcli.photos.loading import LoadedPhoto
+from nerfcli.render.depth import DepthRequest
+from nerfcli.render.depth_errors import LEAST_PIXELS, DepthErrors
+from nerfcli.render.pictures import render_picture
+from nerfcli.render.visibility import depth_maps
+from nerfcli.runs.files import DEPTH_ERRORS
+from nerfcli.runs.run import Run
+
+TRUTH = Path(__file__).parent.parent / "sample_scenes" / "spheres" / "truth"
+
+
+@pytest.fixture
+def errors() -> DepthErrors:
+    """Evenly spread: within 40 % where one photo sees, 20 % and 10 % farther where two or three, 1 % from four on."""
+    spread = np.linspace(-1, 1, 1001)
+    of_strata = [0.4 * spread, 0.1 + 0.1 * spread, 0.01 * spread]
+    coverage = np.repeat([1.0, 3.0, 7.0], 1001)
+    return DepthErrors.of(np.concatenate(of_strata), coverage, np.arange(3003) % 2)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9])
+def test_intervals_are_those_of_evenly_spread_errors(errors, level):
+    coverage = np.array([0, 1, 2, 3, 4, 20, np.nan])
+    lower, upper = errors.bounds(np.full(7, 2.0), coverage, level=level)
+    half = level * np.array([np.nan, 0.4, 0.1, 0.1, 0.01, 0.01, np.nan])
+    middle = np.array([0, 0, 0.1, 0.1, 0, 0, 0])
+    np.testing.assert_allclose(lower, 2 * (1 + middle - half), rtol=1e-6)
+    np.testing.assert_allclose(upper, 2 * (1 + middle + half), rtol=1e-6)
+    assert lower.dtype == upper.dtype == np.float32
+    assert errors.pixels == (1001, 1001, 1001)
+
+
+def test_where_too_little_was_measured_there_is_no_interval():
+    """Too few pixels in the first stratum, one photo alone in the second."""
+    coverage = np.repeat([1.0, 2.0, 4.0], [LEAST_PIXELS - 1, LEAST_PIXELS, LEAST_PIXELS])
+    photos = np.where(coverage == 2, 0, np.arange(len(coverage)) % 2)
+    errors = DepthErrors.of(np.zeros(len(coverage)), coverage, photos)
+    lower, _ = errors.bounds(np.ones(3), np.array([1.0, 2.0, 4.0]), level=0.9)
+    assert np.isnan(lower).tolist() == [True, True, False]
+    again = DepthErrors.from_json(json.loads(json.dumps(errors.to_json(), allow_nan=False)))
+    np.testing.assert_array_equal(again.quantiles, errors.quantiles)
+    assert (again.pixels, again.photos) == (errors.pixels, 2)
+
+
+def matched_by_truth(share: float = 1.0) -> Callable[..., list[DenseDepth]]:
+    """In place of stereo matching: true distances of the held-out photos, of some of their pixels."""
+
+    def dense_depths(photos: Sequence[LoadedPhoto], tracks: Tracks, **_: object) -> list[DenseDepth]:
+        found = []
+        for photo in photos:
+            path = TRUTH / f"{Path(photo.frame.name).stem}_distance.tiff"
+            pixels, distances = np.zeros((0, 2), np.int64), np.zeros(0)
+            if "test" in photo.frame.name:
+                truth = tifffile.imread(path).astype(np.float64)
+                rows, columns = np.nonzero(np.isfinite(truth))
+                kept = slice(round(share * len(rows)))
+                pixels, distances = np.stack([columns, rows], axis=1)[kept], truth[rows, columns][kept]
+            found.append(DenseDepth(pixels, distances, np.zeros(len(pixels))))
+        return found
+
+    return dense_depths
+
+
+def test_errors_are_those_between_matched_and_median_distances(spheres_run, monkeypatch):
+    run = Run(spheres_run)
+    model = run.model()
+    maps = depth_maps(model, run.cameras.train, max_size=48)
+    monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
+    found = measure_depth_errors(run, model, maps, threads=1)
+    expected = []
+    for frame in run.cameras.test:
+        picture = render_picture(model, frame, background=model.background, depth=DepthRequest("median", "ray"))
+        assert picture.depth is not None
+        truth = tifffile.imread(TRUTH / f"{Path(frame.name).stem}_distance.tiff")
+        expected.append((truth / picture.depth - 1)[np.isfinite(truth) & np.isfinite(picture.depth)])
+    every = np.concatenate(expected)
+    assert found.photos == 3
+    assert 0.9 * len(every) < sum(found.pixels) <= len(every)
+    # Nearly all is in the last stratum.
+    np.testing.assert_allclose(found.quantiles[2][20:181], np.quantile(every, np.linspace(0.1, 0.9, 161)), atol=0.01)
+
+
+def test_tracks_of_a_surface_are_rays_to_its_points(spheres_run):
+    run = Run(spheres_run)
+    maps = depth_maps(run.model(), run.cameras.train[:5], max_size=48)
+    tracks = surface_tracks(maps)
+    found = triangulate([view.frame for view in maps], tracks)
+    points = found.points[np.isfinite(found.points).all(axis=1)]
+    everything = np.concatenate([view.points() for view in maps])
+    away = np.linalg.norm(points[:, None] - everything[None], axis=-1).min(axis=1)
+    assert len(points) > 100
+    assert away.max() < 1e-6
+
+
+def test_a_run_without_held_out_photos_has_no_intervals(spheres_run):
+    run = Run(spheres_run)
+    run.__dict__["cameras"] = RunCameras(run.cameras.train, ())
+    with pytest.raises(UserError, match="has no held-out photos"):
+        measure_depth_errors(run, run.model(), [], threads=1)
+
+
+def test_render_writes_the_interval_and_keeps_the_errors(spheres_run, tmp_path, monkeypatch):
+    run = shutil.copytree(spheres_run, tmp_path / "spheres-run")
+    monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
+    common = ("render", run, "--depth", "median", "--depth-axis", "ray", "--threads", "2", "--level", "0.8")
+    result = nerfcli(*common, "--outputs", "depth,coverage,lower,upper", "-o", tmp_path / "views")
+    assert result.exit_code == 0, result.stderr
+    depth, coverage, lower, upper, truth = (
+        np.stack([tifffile.imread(path) for path in sorted(paths)])
+        for paths in (
+            *((tmp_path / "views" / name).rglob("*.tiff") for name in ("depth", "coverage", "lower", "upper")),
+            TRUTH.glob("*_distance.tiff"),
+        )
+    )
+    seen = coverage >= 4
+    inside = (lower <= truth) & (truth <= upper)
+    assert inside[seen & np.isfinite(truth)].mean() == pytest.approx(0.8, abs=0.01)
+    np.testing.assert_allclose((lower / depth)[seen], (lower / depth)[seen][0], rtol=1e-5)
+    assert np.isnan(lower[coverage == 0]).all()
+    assert np.isnan(upper[np.isnan(depth)]).all()
+    path = next((tmp_path / "views/lower").rglob("*.tiff"))
+    meta = depth_meta_of(path)
+    assert meta is not None
+    assert (meta.quantity, meta.convention, meta.provenance["measured_photos"]) == ("lower", "lower:0.8", 3)
+    assert "lower end of the 80 % interval of depth along the ray" in nerfcli("info", path).stdout
+    # The errors are read, not measured again; another level is another result.
+    monkeypatch.setattr(depth_errors, "dense_depths", pytest.fail)
+    exr = nerfcli(*common, "--outputs", "lower,upper", "--depth-format", "exr", "-o", tmp_path / "other")
+    assert exr.exit_code == 0, exr.stderr
+    assert json.loads((run / DEPTH_ERRORS).read_text())["photos"] == 3
+
+
+def test_render_says_where_there_is_no_interval(spheres_run, tmp_path, monkeypatch):
+    run = shutil.copytree(spheres_run, tmp_path / "spheres-run")
+    monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth(0.01))
+    result = nerfcli("render", run, "--outputs", "lower", "--threads", "2", "-o", tmp_path / "views")
+    assert result.exit_code == 0, result.stderr
+    assert "no intervals where 4 photos see the surface: only" in result.stderr
+    assert np.isnan(tifffile.imread(next((tmp_path / "views/lower").rglob("*.tiff")))).all()
