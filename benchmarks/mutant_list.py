@@ -89,7 +89,7 @@ GROUPS: tuple[Group, ...] = (
             Mutant("contracted_distance(starts), contracted_distance(ends)", "starts, ends"),
             Mutant("middles = (starts + ends) / 2", "middles = starts"),
             Mutant("if not grid.antialias or", "if grid.antialias or"),
-            Mutant("UNSEEN * sum_along_rays", "sum_along_rays"),
+            Mutant("UNSEEN * self._sum_along_rays", "self._sum_along_rays"),
             Mutant("unseen = weights <=", "unseen = weights >="),
             Mutant(
                 "rgb[seen] = self._networks(samples.encoded[seen]", "rgb[seen] = self._networks(samples.encoded[:1]"
