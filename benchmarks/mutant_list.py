@@ -294,6 +294,7 @@ GROUPS: tuple[Group, ...] = (
             Mutant("return 1.0 / x - (1.0 - alpha) / alpha\n", "return 1.0 / x + (1.0 - alpha) / alpha\n"),
             Mutant("(1.0 - alpha) / (alpha * alpha)", "(1.0 - alpha) / alpha"),
             Mutant("step * (weight / sums[ray, MASS])", "step * weight"),
+            Mutant("weight = (1.0 - sums[ray, MASS]) * alpha", "weight = alpha"),
             Mutant("step * (place - sums[ray, MEAN])", "step * step"),
             Mutant("if weight > sums[ray, LARGEST]:", "if weight >= sums[ray, LARGEST]:"),
             Mutant("depth + own >= targets[passed]", "depth >= targets[passed]"),

@@ -51,7 +51,7 @@ class VideoFormat:
 
 
 FORMATS = {
-    # Beside the preset medium: three quarters of the time, files 0.5 % larger, 0.05 dB less.
+    # Beside the preset medium: three quarters of the time, files 1 % (photos) to 15 % (depth) larger, 0.05 dB less.
     "mp4": VideoFormat(".mp4", "libx264", 16, 51, ("-preset", "fast", "-movflags", "+faststart")),
     # Apple's players want the tag hvc1.
     "h265": VideoFormat(
