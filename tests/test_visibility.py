@@ -140,6 +140,41 @@ def test_small_and_large_angles_keep_their_digits(angle):
     np.testing.assert_allclose(found, [angle, 0, 0], atol=0.03)
 
 
+def test_the_largest_angle_is_between_any_two_cameras():
+    """At -30, 0 and 50 degrees around the point, in every order."""
+    angles = np.radians([-30.0, 0.0, 50.0])
+    centres = np.stack([np.cos(angles), np.sin(angles), np.zeros(3)], axis=-1)
+    for order in ([0, 1, 2], [1, 0, 2], [1, 2, 0], [2, 1, 0]):
+        found = largest_angle_deg(np.ones((1, 3), dtype=bool), np.zeros((1, 3)), centres[order])
+        np.testing.assert_allclose(found, [80.0], atol=1e-3)
+
+
+def plane_map(incidence_deg: float) -> DepthMap:
+    """A pinhole camera that sees nothing but a plane, at distance 2 in the middle."""
+    camera = Camera.pinhole(80, 60, 400.0)
+    rays, _ = camera.pixel_bearings()
+    tilt = np.radians(incidence_deg)
+    normal = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
+    distances = 2 * normal[2] / (rays @ normal)
+    return DepthMap(Frame("a", camera, np.eye(4)), distances.reshape(60, 80).astype(np.float32))
+
+
+def test_surfaces_are_seen_up_to_an_incidence_of_80_degrees():
+    for incidence, seen in ((0.0, True), (70.0, True), (75.0, True), (85.0, False)):
+        assert np.isfinite(without_steep(plane_map(incidence)).distances[20:40]).all() == seen
+
+
+def test_nothing_is_seen_beyond_the_edges_of_the_picture():
+    """Points on a plane that fills the picture, half a pixel inside and outside of each edge."""
+    view = plane_map(0.0)
+    for pixel, seen in (
+        *(((0.5, 30), True), ((-0.5, 30), False), ((79.5, 30), True), ((80.5, 30), False)),
+        *(((40, 0.5), True), ((40, -0.5), False), ((40, 59.5), True), ((40, 60.5), False)),
+    ):
+        point = 2 * np.array([(pixel[0] - 40) / 400, (pixel[1] - 30) / 400, 1.0])
+        assert sees(view, point[None]).tolist() == [seen], pixel
+
+
 def test_depths_of_a_field_are_those_of_its_surface():
     """A cube of fog: half of the light ends ln 2 / density behind its face."""
     scene = Similarity(0.5, np.eye(3), np.array([0.0, 0.0, 0.0]))
