@@ -248,7 +248,7 @@ def test_a_run_keeps_background_and_exposures_and_goes_on_bit_for_bit(capture, t
     assert torch.equal(states[0]["parts.exposure.free"], states[1]["parts.exposure.free"])
     assert states[0]["parts.exposure.free"][:, 0].tolist() == pytest.approx(
         [-math.log(2), 0.0, math.log(2)],
-        abs=0.05,  # from EXIF, and a few small steps on
+        abs=0.06,  # from EXIF, and six steps of at most 0.02 on
     )
     model = load_model(tmp_path / "parts" / "field.safetensors", "cpu")
     assert isinstance(model.background, SphereBackground)

@@ -103,6 +103,15 @@ def test_a_trial_has_its_cameras_learn_from_the_fork_on(trials, start, monkeypat
     assert begun == [0.02]  # what the start has forked at
 
 
+def test_the_learning_rate_falls_by_half_a_cosine_after_its_warm_up(trials):
+    """Values by hand: from 0.01 to 0.001, the mean of both halfway."""
+    fitting = trials._fitting(Components(view=0), seed=0, log_gains=None, cameras_from=0.0)
+    assert fitting.learning_rate(0.0) == pytest.approx(0.01 / 50)
+    fitting.step = 1000
+    rates = [fitting.learning_rate(share) for share in (0.0, 0.25, 0.5, 1.0, 1.5)]
+    assert rates == pytest.approx([0.01, 0.001 + 0.009 * (0.5 + 0.125**0.5), 0.0055, 0.001, 0.001])
+
+
 def test_trials_have_the_small_tables_of_short_trainings(trials, monkeypatch):
     for given, used in ((18, 16), (8, 8)):
         monkeypatch.setattr(trials, "_settings", replace(trials._settings, log2_rows=given))

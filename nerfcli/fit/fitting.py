@@ -187,11 +187,12 @@ class Fitting:
         self.rollbacks += 1
 
     def learning_rate(self, fraction: float) -> float:
-        """Linear warm-up, then an exponential from the first to the final rate over the budget."""
+        """Linear warm-up, then half a cosine from the first to the final rate over the budget."""
         settings = self.settings
-        decay = math.log(settings.final_learning_rate / settings.learning_rate)
+        left = 0.5 * (1.0 + math.cos(math.pi * min(1.0, fraction)))
+        rate = settings.final_learning_rate + left * (settings.learning_rate - settings.final_learning_rate)
         warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, fraction / WARMUP_SHARE))
-        return self.rate_factor * settings.learning_rate * warmup * math.exp(decay * min(1.0, fraction))
+        return self.rate_factor * warmup * rate
 
     def _loss(self, drawn: Drawn, *, edges: Tensor, fraction: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
         """Loss over some rays, that of the colour of each, and the number of samples it took."""
