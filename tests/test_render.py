@@ -213,7 +213,7 @@ def test_tiles_leave_no_trace(tile):
     assert max(counts) <= tile
 
 
-@pytest.mark.parametrize(("gigabytes", "rays"), [(80, 2**16), (8, 2**8 * 142), (1, 2**13)])
+@pytest.mark.parametrize(("gigabytes", "rays"), [(80, 2**16), (8, 2**8 * 142), (1, 2**14)])
 def test_tiles_of_a_gpu_fit_into_its_memory(gigabytes, rays, monkeypatch):
     """An eighth of it, were every step of 250 in an occupied cell; but never so few that they do not fill a GPU."""
     device = SimpleNamespace(total_memory=gigabytes * 10**9)
