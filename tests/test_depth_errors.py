@@ -81,6 +81,11 @@ def matched_by_truth(share: float = 1.0) -> Callable[..., list[DenseDepth]]:
     return dense_depths
 
 
+def copied(run: Path, tmp_path: Path) -> Path:
+    """A copy of a run beside it, where the relative paths of its photos hold."""
+    return Path(shutil.copytree(run, run.with_name(f"{tmp_path.name}-run")))
+
+
 def test_errors_are_those_between_matched_and_median_distances(spheres_run, monkeypatch):
     run = Run(spheres_run)
     model = run.model()
@@ -120,7 +125,7 @@ def test_a_run_without_held_out_photos_has_no_intervals(spheres_run):
 
 
 def test_render_writes_the_interval_and_keeps_the_errors(spheres_run, tmp_path, monkeypatch):
-    run = shutil.copytree(spheres_run, tmp_path / "spheres-run")
+    run = copied(spheres_run, tmp_path)
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
     common = ("render", run, "--depth", "median", "--depth-axis", "ray", "--threads", "2", "--level", "0.8")
     result = nerfcli(*common, "--outputs", "depth,coverage,lower,upper", "-o", tmp_path / "views")
@@ -151,7 +156,7 @@ def test_render_writes_the_interval_and_keeps_the_errors(spheres_run, tmp_path, 
 
 
 def test_render_says_where_there_is_no_interval(spheres_run, tmp_path, monkeypatch):
-    run = shutil.copytree(spheres_run, tmp_path / "spheres-run")
+    run = copied(spheres_run, tmp_path)
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth(0.01))
     result = nerfcli("render", run, "--outputs", "lower", "--threads", "2", "-o", tmp_path / "views")
     assert result.exit_code == 0, result.stderr
