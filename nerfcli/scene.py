@@ -313,6 +313,19 @@ def _relative(path: Path, start: Path) -> str:
         return path.resolve().as_posix()
 
 
+def refuse_without_training_photos(scene: Scene) -> None:
+    """Refuse a scene that holds out every photo.
+
+    Raises:
+        UserError: there is no training photo.
+    """
+    if not scene.train_frames:
+        raise UserError(
+            f"{scene.root} has no training photo",
+            "every 8th photo is held out, so at least 2 are needed; check --holdout",
+        )
+
+
 def _no_scene(path: Path) -> UserError:
     looked_for = (
         f"{SCENE_FILE}, {', '.join(name for name in _MODEL_FOLDERS[:-1])} (COLMAP), "

@@ -49,3 +49,13 @@ def test_dry_run_prints_the_plan_and_writes_nothing(capture: Path) -> None:
         CliRunner().invoke(app, ["train", str(capture), "--dry-run"]).stdout.startswith(f"{capture}: 4 training photos")
     )
     assert not capture.with_name("spheres-run").exists()
+
+
+def test_a_scene_whose_only_photo_is_held_out_is_refused(capture: Path) -> None:
+    listed = json.loads((capture / "transforms_train.json").read_text())
+    for split in ("train", "test"):
+        (capture / f"transforms_{split}.json").unlink()
+    (capture / "transforms.json").write_text(json.dumps({**listed, "frames": listed["frames"][:1]}))
+    result = CliRunner().invoke(app, ["train", str(capture), "--dry-run"])
+    assert result.exit_code == 3
+    assert "has no training photo" in result.stderr

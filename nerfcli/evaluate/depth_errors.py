@@ -32,7 +32,7 @@ def measure_depth_errors(
     photo_depths: Sequence[DepthMap],
     *,
     threads: int,
-    on_progress: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> DepthErrors:
     """Compare the median depth of held-out photos with stereo matching.
 

@@ -135,7 +135,7 @@ class DepthMeta:
 
     @property
     def _level(self) -> str:
-        """The level of an interval in words: "90 %"."""
+        """Return the level of an interval as a percentage: "90 %"."""
         return f"{100 * float(self.convention.partition(':')[2] or 'nan'):g} %"
 
     def to_json(self) -> dict[str, Any]:

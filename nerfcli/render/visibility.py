@@ -43,7 +43,7 @@ def depth_maps(
     frames: Sequence[Frame],
     *,
     max_size: int = MAX_SIZE,
-    on_progress: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[DepthMap]:
     """Render the median distance that each photo sees, through its own lens, small; see `without_steep`.
 

@@ -206,7 +206,7 @@ _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("PSNR on the right halves, poses aligned on the left halves", metric("psnr_pose_aligned", "{:.2f} dB")),
     ("PSNR on views between training views (interpolation)", _of_kind("interpolation")),
     ("PSNR on views beyond training views (extrapolation)", _of_kind("extrapolation")),
-    ("PSNR of billboards (a model without geometry)", _shape),
+    ("gain over billboards (a model without geometry)", _shape),
     ("training", last_logged("seconds", "{:.1f} s")),
     ("steps", last_logged("step", "{:,.0f}")),
     ("samples per second", _of("training", "samples_per_second", "{:.2f} M", _MEGA)),

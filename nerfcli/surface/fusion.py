@@ -71,7 +71,9 @@ class Fused:
         return filled[0], filled[1]
 
 
-def fuse(views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda share: None) -> Fused:
+def fuse(
+    views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
+) -> Fused:
     """Fuse depth maps.
 
     Args:

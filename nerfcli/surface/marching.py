@@ -35,7 +35,9 @@ class Mesh:
     colours: np.ndarray | None = None
 
 
-def surface_of(fused: Fused, *, seen: float = SEEN, on_progress: Callable[[float], None] = lambda share: None) -> Mesh:
+def surface_of(
+    fused: Fused, *, seen: float = SEEN, on_progress: Callable[[float], None] = lambda fraction: None
+) -> Mesh:
     """Return where the signed distance is 0, between voxels that were seen.
 
     Args:

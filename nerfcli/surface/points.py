@@ -41,7 +41,7 @@ class Points:
 
 
 def agreed_points(
-    views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda share: None
+    views: Sequence[DepthView], grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
 ) -> Points:
     """Return one point at most for each voxel of a grid: of all depths in it the narrowest, if two photos see it.
 

@@ -60,7 +60,7 @@ def depth_views(
     *,
     max_size: int,
     depth: DepthRequest = DEPTH,
-    on_progress: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[DepthView]:
     """Render what the pinhole cameras of frames see.
 

@@ -23,7 +23,7 @@ def automatic_volume_voxel(box: tuple[float, ...]) -> float:
 
 
 def sample_volume(
-    model: Model, grid: Grid, *, on_progress: Callable[[float], None] = lambda share: None
+    model: Model, grid: Grid, *, on_progress: Callable[[float], None] = lambda fraction: None
 ) -> dict[str, np.ndarray]:
     """Return the maps of a grid: density (X, Y, Z) float32 in 1 / scene unit, and colour (X, Y, Z, 3) uint8 sRGB.
 

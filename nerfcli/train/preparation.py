@@ -29,7 +29,7 @@ from nerfcli.photos.storage import PhotoStorage, check_device_memory, needs_of, 
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
-from nerfcli.scene import Scene
+from nerfcli.scene import Scene, refuse_without_training_photos
 from nerfcli.search.selection import (
     LEARN_FOCAL,
     SEARCH_SHARE,
@@ -135,11 +135,7 @@ def prepare(
     Raises:
         UserError: too little memory, no training photo, unreadable photos.
     """
-    if not scene.train_frames:
-        raise UserError(
-            f"{scene.root} has no training photo",
-            "every 8th photo is held out, so at least 2 are needed; check --holdout",
-        )
+    refuse_without_training_photos(scene)
     first = scene.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)
     needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)

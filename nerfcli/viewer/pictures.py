@@ -48,7 +48,7 @@ def page_photos(
     *,
     room_bytes: int,
     threads: int = 1,
-    on_progress: Callable[[float], None] = lambda share: None,
+    on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> PagePhotos:
     """Return the photos of a run, as pinhole cameras took them, in the order of their names.
 

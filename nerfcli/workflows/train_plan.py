@@ -68,6 +68,7 @@ def plan_training(
         UserError: the scene cannot be read, has no training photo, or does not fit into memory.
     """
     loaded = scenes.load(Path(scene), holdout=holdout)
+    scenes.refuse_without_training_photos(loaded)
     first = loaded.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)
     needs = needs_of((*loaded.train_frames, *loaded.test_frames), factor, settings=settings)
