@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import zlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -158,13 +159,14 @@ class PageField:
 
 def element(page: str, name: str) -> str:
     """The text of a script element of the page."""
-    found = re.search(rf'<script type="[^"]*" id="{name}">(.*?)</script>', page, re.S)
+    found = re.search(rf'<script type="[^"]*" id="{name}"[^>]*>(.*?)</script>', page, re.S)
     assert found, name
     return found[1]
 
 
 def array(page: str, name: str, dtype: str) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(element(page, name)), dtype)
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(element(page, name))), np.uint8)
+    return np.ascontiguousarray(planes.reshape(np.dtype(dtype).itemsize, -1).T).view(dtype).reshape(-1)
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:

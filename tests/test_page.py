@@ -1,7 +1,9 @@
 """The page that renders a field by itself: its numbers by NumPy, and all of it in a browser where there is one."""
 
+import base64
 import json
 import re
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -23,17 +25,19 @@ from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.kernels.reference.encoding import hash_encode
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Marching, Model
 from nerfcli.render.pictures import render_picture
-from nerfcli.viewer.packing import pack_model, quantised
-from nerfcli.viewer.page import page_html
+from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows
+from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import PagePhotos
 from nerfcli.viewer.proof import HEIGHT, WIDTH, make_proof
 from nerfcli.workflows.export import export_run
 
 # What 16-bit rows, single precision and the colours that neither side asks for change of a colour in [0, 1].
 COLOUR_BOUND = 2e-3
+COMPRESSED_NOTHING = base64.b64encode(zlib.compress(b"")).decode()
 # The share of pixels within the bound of depths: at edges a median jumps from one surface to another.
 AGREEING = 0.98
 SIMILARITY = Similarity(0.7, rotation_from_vector(np.array([0.2, -0.4, 0.9])), np.array([0.1, -0.2, 0.3]))
@@ -62,9 +66,9 @@ def rough(field: Field, *, sky: bool = False) -> Model:
 
 def page_of(model: Model, frames: list[Frame]) -> str:
     photos = PagePhotos([], 0, 0)
-    proof = make_proof(model, frames)
+    numbers = PageNumbers.of(pack_model(model), make_proof(model, frames))
     box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
-    return page_html(model, pack_model(model), run=Path("a-run"), frames=frames, photos=photos, proof=proof, box=box)
+    return page_html(model, numbers, run=Path("a-run"), frames=frames, photos=photos, box=box)
 
 
 def hash_settings(contraction: str, *, antialias: bool = False, view_degree: int = 3) -> HashFieldSettings:
@@ -109,12 +113,31 @@ def test_the_numbers_in_the_page_render_what_the_kernels_render(field, sky):
         assert alike.mean() > AGREEING
 
 
-def test_levels_are_off_by_half_a_level_and_zero_stays_zero():
-    values = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+@pytest.mark.parametrize(("largest", "worth"), [(1e-3, FINEST_LEVEL), (5.0, FINEST_LEVEL), (100.0, 100.0 / 32767)])
+def test_levels_are_off_by_half_a_level_and_zero_stays_zero(largest, worth):
+    values = np.random.default_rng(0).uniform(-largest, largest, (50, 4)).astype(np.float32)
+    values[0] = (largest, -largest, 0.0, 0.0)
     levels, scale = quantised(values)
+    assert scale == pytest.approx(worth)
     assert np.abs(levels * scale - values).max() <= scale / 2 * (1 + 1e-6)
-    assert np.abs(levels).max() == 32767
+    assert np.abs(levels.astype(int)).max() == round(largest / worth)
     assert not quantised(np.zeros(3))[0].any()
+
+
+@pytest.mark.parametrize("side", [4, 7, 13, 40, 101])
+def test_interpolation_in_occupied_cells_reads_only_reached_rows(side):
+    """Rows that are not reached hold 1e6: nothing of them may arrive at random points, or at corners of cells."""
+    rng, rows = torch.Generator().manual_seed(side), 2**12
+    occupied = torch.rand(8, 8, 8, generator=rng) < 0.02
+    cells = occupied.nonzero().flip(-1)
+    inside = torch.rand(200, 1, 3, generator=rng)
+    inside[0], inside[1] = 0.0, 1.0 - 2**-20
+    points = ((cells + inside) / 8).reshape(-1, 3)
+    reached = reached_rows(occupied, side, rows)
+    table = torch.where(reached, 0.0, 1e6)[None, :, None]
+    assert hash_encode(points, table, (side,)).abs().max() < 1e-3
+    assert reached.sum() <= len(cells) * (side // 8 + 3) ** 3
+    assert not reached_rows(torch.zeros_like(occupied), side, rows).any()
 
 
 def test_rows_that_no_vertex_has_are_left_out():
@@ -157,11 +180,10 @@ def test_names_of_a_capture_stay_text():
     evil = "</script><script>alert(1)</script>"
     page = page_html(
         model,
-        pack_model(model),
+        PageNumbers.of(pack_model(model), make_proof(model, [at((1, 1, 1))])),
         run=Path("a-run"),
         frames=[at((1, 1, 1))],
         photos=PagePhotos([{"name": evil, "split": "train"}], 0, 0),
-        proof=make_proof(model, [at((1, 1, 1))]),
         box=(0, 0, 0, 1, 1, 1),
     )
     assert evil not in page
@@ -211,8 +233,8 @@ def opened(browser, spheres_page) -> Browser:
     """The page of the spheres, drawn."""
     browser.errors.clear()
     browser.open(spheres_page)
-    assert browser.run("document.getElementById('trouble').textContent") == ""
     browser.wait("document.body.dataset.rested > 0")
+    assert browser.run("document.getElementById('trouble').textContent") == ""
     assert not browser.errors
     return browser
 
@@ -368,18 +390,22 @@ def test_a_lost_context_is_told_and_comes_back(opened):
 @pytest.mark.parametrize(
     ("damage", "told"),
     [
-        (lambda text: re.sub(r'(id="table">.{100})....', r"\1", text), "bytes, expected"),
-        (lambda text: re.sub(r'(id="table">.{100})....', r"\1!!!!", text), "not base64"),
+        (lambda text: re.sub(r'(id="table"[^>]*>.{100})....', r"\1", text), "cannot be decompressed"),
+        (lambda text: re.sub(r'(id="table"[^>]*>.{100})....', r"\1!!!!", text), "not base64"),
+        (
+            lambda text: re.sub(r'id="table"([^>]*>).*?<', rf'id="table"\1{COMPRESSED_NOTHING}<', text),
+            "0 bytes, expected",
+        ),
         (lambda text: text.replace('id="cuts"', 'id="cut"'), 'lacks "cuts"'),
         (lambda text: re.sub(r'(id="scene">)', r"\1{", text), "not JSON"),
     ],
-    ids=["short", "letters", "missing", "json"],
+    ids=["short", "letters", "empty", "missing", "json"],
 )
 def test_a_damaged_page_says_so(damage, told, browser, spheres_page, tmp_path):
     page = tmp_path / "damaged.html"
     page.write_text(damage(spheres_page.read_text(encoding="utf-8")), encoding="utf-8")
     browser.open(page)
-    assert browser.run("document.body.dataset.state") == "trouble"
+    browser.wait("document.body.dataset.state === 'trouble'")
     assert told in browser.run("document.getElementById('trouble').textContent")
 
 
@@ -388,5 +414,5 @@ def test_a_browser_without_webgl2_is_told(spheres_page, tmp_path):
         pytest.skip("there is no Chromium on this machine to open the page with")
     with Browser(tmp_path, flags=("--disable-3d-apis",)) as browser:
         browser.open(spheres_page)
-        assert browser.run("document.body.dataset.state") == "trouble"
+        browser.wait("document.body.dataset.state === 'trouble'")
         assert "no WebGL2" in browser.run("document.getElementById('trouble').textContent")

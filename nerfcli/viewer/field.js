@@ -5,8 +5,8 @@ const MAPS = ["colour", "opacity", "conditional", "median", "max-weight", "momen
   "disagreement"];
 const ROWS = "RGBA16I";
 
-/** The bytes of a base64 element. Throws where it is missing or damaged. */
-function bytesOf(id, expected) {
+/** The bytes of an element that `array_element` in page.py wrote. Throws where it is missing or damaged. */
+async function bytesOf(id) {
   const element = document.getElementById(id);
   if (!element) throw new Error(`this file is incomplete: it lacks "${id}"`);
   let text;
@@ -15,16 +15,28 @@ function bytesOf(id, expected) {
   } catch {
     throw new Error(`this file is damaged: "${id}" is not base64`);
   }
-  if (expected !== undefined && text.length !== expected) {
-    throw new Error(`this file is damaged: "${id}" has ${text.length} bytes, expected ${expected}`);
+  const packed = Uint8Array.from(text, letter => letter.charCodeAt(0));
+  let planes;
+  try {
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+    planes = new Uint8Array(await new Response(stream).arrayBuffer());
+  } catch {
+    throw new Error(`this file is damaged: "${id}" cannot be decompressed`);
   }
-  const bytes = new Uint8Array(text.length);
-  for (let i = 0; i < bytes.length; i++) bytes[i] = text.charCodeAt(i);
+  return interleaved(planes, Number(element.dataset.itemsize));
+}
+
+/** Bytes of equal significance, plane after plane, put back number by number. */
+function interleaved(planes, itemsize) {
+  const bytes = new Uint8Array(planes.length), count = planes.length / itemsize;
+  for (let plane = 0; plane < itemsize; plane++)
+    for (let i = 0; i < count; i++) bytes[i * itemsize + plane] = planes[plane * count + i];
   return bytes;
 }
 
 /** All that the page was made with. */
-function readScene() {
+async function readScene() {
+  if (!globalThis.DecompressionStream) throw new Error("this browser lacks DecompressionStream; use one of 2023 or later");
   const element = document.getElementById("scene");
   if (!element) throw new Error('this file is incomplete: it lacks "scene"');
   let scene;
@@ -34,15 +46,21 @@ function readScene() {
     throw new Error('this file is damaged: "scene" is not JSON');
   }
   if (scene.format !== "nerfcli page 1") throw new Error(`this file has the format ${scene.format}`);
-  scene.colours = bytesOf("colours", 768);
+  scene.colours = await bytesOf("colours");
   if (scene.live) return scene;
-  scene.expected = new Float32Array(bytesOf("expected").buffer);
-  return withField(scene, bytesOf);
+  const names = ["expected", "table", "networks", "cuts", "occupied", ...(scene.field.sky ? ["sky"] : [])];
+  const arrays = Object.fromEntries(await Promise.all(names.map(async name => [name, await bytesOf(name)])));
+  scene.expected = new Float32Array(arrays.expected.buffer);
+  return withField(scene, arrays);
 }
 
-/** The scene with the arrays of its field; `bytes(name, length)` gives them or throws. */
-function withField(scene, bytes) {
+/** The scene with the arrays of its field, from their bytes. Throws where a length is wrong. */
+function withField(scene, arrays) {
   const { field, march } = scene;
+  const bytes = (name, length) => {
+    if (arrays[name]?.length !== length) throw new Error(`the field's "${name}" has ${arrays[name]?.length} bytes, expected ${length}`);
+    return arrays[name];
+  };
   scene.table = new Int16Array(bytes("table", 8 * field.rows).buffer);
   scene.networks = new Float32Array(bytes("networks", 64 * field.networks).buffer);
   scene.cuts = new Float32Array(bytes("cuts", 4 * (march.intervals + 1)).buffer);

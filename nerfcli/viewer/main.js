@@ -16,10 +16,10 @@ function trouble(text) {
   document.body.dataset.state = "trouble";
 }
 
-function start() {
+async function start() {
   let scene;
   try {
-    scene = readScene();
+    scene = await readScene();
   } catch (error) {
     trouble(`This page cannot be shown: ${error.message}. Make it again with nerfcli export RUN --to page --overwrite.`);
     return;

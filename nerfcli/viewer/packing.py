@@ -1,6 +1,8 @@
 """The numbers of a field as the page holds them: rows as 16-bit levels, weights as blocks of 4 x 4, cells as bits.
 
-A level is the largest number of its grid divided by 32,767; vertices that a grid does not have are left out.
+A level is worth 2^-11, or the largest number of its grid divided by 32,767 where that is more. Vertices that a grid
+does not have are left out, and rows that no occupied cell reaches are 0: nothing reads them, and zeros take no room in
+the compressed page.
 """
 
 from dataclasses import dataclass
@@ -15,12 +17,17 @@ from nerfcli.field.background import SphereBackground
 from nerfcli.field.hash_field import GEOMETRY, HARMONICS, HashField
 from nerfcli.field.voxel_field import VoxelField
 from nerfcli.kernels import CONTRACTIONS
+from nerfcli.kernels.reference.encoding import corner_rows
 from nerfcli.render.model import Model
 from nerfcli.render.tracing import uniform_cuts
 
 # Numbers in a texel of the table, and neurons in a block of the networks.
 FOUR = 4
 LEVELS = 32767
+# Changes colours by 5e-5 (rms) and keeps the page of 2^18 rows below 10 MB; see docs/figures.md for other levels.
+FINEST_LEVEL = 2.0**-11
+# Grids with more vertices than this are hashed so densely that occupied cells reach every row.
+MOST_VERTICES = 2**24
 # What every device that draws WebGL2 has room for in a block of uniforms: 16 KiB of 64 bytes each.
 MOST_BLOCKS = 256
 
@@ -48,11 +55,15 @@ def pack_model(model: Model) -> Packed:
     resolutions, table, networks, more = _numbers(model)
     rows = table.shape[1]
     kept = [min(rows, (side + 1) ** 3) if side else 0 for side in resolutions]
-    levels = [quantised(table[index, :count].numpy()) for index, count in enumerate(kept)]
+    occupied = model.occupied.cpu()
+    reached = {side: reached_rows(occupied, side, rows) for side in set(resolutions)}
+    levels = [
+        quantised((table[index] * reached[side][:, None])[:count].numpy())
+        for index, (side, count) in enumerate(zip(resolutions, kept, strict=True))
+    ]
     cuts = uniform_cuts(model.marching).to(torch.float32).numpy()
     behind = model.background
     sky = quantised(behind.logits.detach().cpu().numpy()) if isinstance(behind, SphereBackground) else None
-    occupied = model.occupied.cpu().numpy()
     field = {
         **more,
         "contraction": CONTRACTIONS.index(model.contraction),
@@ -71,16 +82,41 @@ def pack_model(model: Model) -> Packed:
         "table": np.concatenate([values for values, _ in levels]),
         "networks": networks.astype("<f4"),
         "cuts": cuts.astype("<f4"),
-        "occupied": np.packbits(occupied.ravel(), bitorder="little"),
+        "occupied": np.packbits(occupied.numpy().ravel(), bitorder="little"),
         **({} if sky is None else {"sky": sky[0]}),
     }
     return Packed(field, march, arrays)
 
 
 def quantised(values: np.ndarray) -> tuple[np.ndarray, float]:
-    """16-bit levels of numbers, and what a level is worth; off by half a level at most."""
-    scale = float(np.abs(values).max(initial=0.0)) / LEVELS or 1.0
+    """Return 16-bit levels of numbers and what a level is worth; off by half a level at most."""
+    scale = max(FINEST_LEVEL, float(np.abs(values).max(initial=0.0)) / LEVELS)
     return np.rint(values / scale).astype("<i2"), scale
+
+
+def reached_rows(occupied: Tensor, side: int, rows: int) -> Tensor:
+    """Return which rows of a table interpolation in occupied cells reads.
+
+    Args:
+        occupied: (G, G, G) bool, indexed [z, y, x].
+        side: cells per axis of the grid that the table holds; 0 for none.
+        rows: of the table.
+
+    Returns:
+        (rows,) bool; all true for grids of more than 2^24 vertices.
+    """
+    if (side + 1) ** 3 > MOST_VERTICES:
+        return torch.ones(rows, dtype=torch.bool)
+    cell, vertex = torch.arange(len(occupied)), torch.arange(side + 1)[:, None]
+    first, last = cell * side // len(occupied), (cell + 1) * side // len(occupied) + 1
+    touches = ((first <= vertex) & (vertex <= last)).float()
+    vertices = occupied.float()
+    for _ in range(3):
+        # Along the slowest axis, which then becomes the fastest: after three turns the axes are as before.
+        vertices = torch.tensordot(touches, vertices, 1).clamp_max(1.0).movedim(0, -1)
+    reached = torch.zeros(rows, dtype=torch.bool)
+    reached[corner_rows(vertices.nonzero().flip(-1), side, rows)] = True
+    return reached
 
 
 def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[str, Any]]:

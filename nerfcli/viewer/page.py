@@ -1,8 +1,11 @@
 """The page that renders a field: one HTML file by itself, opened from a disk; or live, from a server of ours."""
 
 import base64
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -24,30 +27,46 @@ SCRIPTS = ("geometry.js", "field.js", "render.js", "schedule.js", "walk.js", "pa
 LIVE_SCRIPTS = ("remote.js", "live.js")
 
 
+@dataclass(frozen=True)
+class PageNumbers:
+    """The field and the proof as the page holds them.
+
+    Args:
+        description: plain values.
+        elements: HTML elements of compressed arrays.
+    """
+
+    description: dict[str, Any]
+    elements: str
+
+    @classmethod
+    def of(cls, packed: Packed, proof: Proof) -> "PageNumbers":
+        description = {"field": packed.field, "march": packed.march, "proof": proof.description}
+        arrays = {**packed.arrays, "expected": proof.expected}
+        return cls(description, "\n".join(starmap(array_element, arrays.items())))
+
+
 def page_html(
     model: Model,
-    packed: Packed,
+    numbers: PageNumbers,
     *,
     run: Path,
     frames: Sequence[Frame],
     photos: PagePhotos,
-    proof: Proof,
     box: Sequence[float],
 ) -> str:
     """Return the text of a page that needs no server.
 
     Args:
         model: what it shows.
-        packed: its numbers.
+        numbers: of its field, and what the page compares itself with.
         run: the folder; its name stands on the page.
         frames: pinhole ones, at least one; the page begins at the middle one.
         photos: what it holds of photos.
-        proof: what it compares itself with.
         box: low and high corner that the crop box begins with, scene units.
     """
-    scene = _scene(model, run=run, frames=frames, photos=photos.entries, box=box)
-    scene |= {"field": packed.field, "march": packed.march, "proof": proof.description}
-    return _html(scene, {**packed.arrays, "expected": proof.expected}, run=run, connect=False)
+    scene = _scene(model, run=run, frames=frames, photos=photos.entries, box=box) | numbers.description
+    return _html(scene, numbers.elements, run=run, connect=False)
 
 
 def live_page_html(
@@ -70,7 +89,7 @@ def live_page_html(
     """
     scene = _scene(model, run=run, frames=frames, photos=photos, box=box)
     scene |= {"live": {"refusal": refusal, "version": version}, "march": {"far": model.marching.far}}
-    return _html(scene, {}, run=run, connect=True)
+    return _html(scene, "", run=run, connect=True)
 
 
 def _scene(
@@ -99,14 +118,15 @@ def _scene(
     }
 
 
-def _html(scene: dict[str, Any], arrays: Mapping[str, np.ndarray], *, run: Path, connect: bool) -> str:
+def _html(scene: dict[str, Any], numbers: str, *, run: Path, connect: bool) -> str:
     """The page around a scene."""
     shaders = "".join(_element(part, "x-shader/x-fragment", _text(f"{part}.glsl")) for part in ("trace", "show"))
     body = "\n".join(
         [
             _text("body.html"),
             shaders,
-            *(_element(k, "text/plain", _base64(v)) for k, v in {**arrays, "colours": levels_of("turbo")}.items()),
+            array_element("colours", levels_of("turbo")),
+            numbers,
             page.data_element("scene", scene),
         ]
     )
@@ -126,8 +146,14 @@ def _element(name: str, kind: str, text: str) -> str:
     return f'<script type="{kind}" id="{name}">{text}</script>'
 
 
-def _base64(values: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
+def array_element(name: str, values: np.ndarray) -> str:
+    """Return an element that holds an array, see `bytesOf` in field.js.
+
+    The bytes of equal significance stand together, which deflate makes shorter; then base64.
+    """
+    significance = np.ascontiguousarray(values).view(np.uint8).reshape(-1, values.itemsize).T
+    text = base64.b64encode(zlib.compress(significance.tobytes(), 9)).decode()
+    return f'<script type="text/plain" id="{name}" data-itemsize="{values.itemsize}">{text}</script>'
 
 
 @cache

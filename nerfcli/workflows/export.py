@@ -14,7 +14,7 @@ from nerfcli.surface.extent import scene_box
 from nerfcli.surface.grid import check_box
 from nerfcli.surface.settings import SurfaceSettings
 from nerfcli.viewer.packing import pack_model
-from nerfcli.viewer.page import page_html
+from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import page_photos
 from nerfcli.viewer.proof import make_proof
 from nerfcli.workflows.export_geometry import (
@@ -142,7 +142,8 @@ def _export_page(
     box = settings.box or scene_box(model, frames)
     proof = make_proof(model, frames)
     progress(0.2, "photos")
-    text_bytes = sum(4 * array.nbytes // 3 for array in (*packed.arrays.values(), proof.expected))
+    numbers = PageNumbers.of(packed, proof)
+    text_bytes = len(numbers.elements)
     photos = page_photos(
         model,
         cameras.train,
@@ -157,7 +158,7 @@ def _export_page(
         notify(
             f"the field alone needs {text_bytes / 1000000.0:.0f} MB of text: the page is large and contains no photos"
         )
-    write_page(page_html(model, packed, run=run.path, frames=frames, photos=photos, proof=proof, box=box), path)
+    write_page(page_html(model, numbers, run=run.path, frames=frames, photos=photos, box=box), path)
 
 
 _EXPORTS = {
