@@ -51,6 +51,7 @@ BALLS = (
     Ball((0.3, -0.5, 0.78), 0.16, (0.6, 0.42, 0.68), 22.0),
 )
 BOX = Box((0.05, 0.0, -0.37), (1.05, 0.95, 0.12), (0.55, 0.53, 0.5), 8.0)
+THINGS: tuple[Ball | Box, ...] = (*BALLS, BOX)
 
 
 def camera_pose(index: int) -> np.ndarray:
@@ -122,10 +123,16 @@ def colour(thing: Ball | Box, points: np.ndarray) -> np.ndarray:
     return np.clip((np.array(thing.base) + 0.24 * waves) * shading[..., None], 0, 1)
 
 
-def trace(origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def hit(thing: Ball | Box, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Distance (h, w) to the near side of a thing, infinite where it is missed."""
+    return hit_ball(thing, origin, rays) if isinstance(thing, Ball) else hit_box(thing, origin, rays)
+
+
+def trace(
+    origin: np.ndarray, rays: np.ndarray, *, things: tuple[Ball | Box, ...] = THINGS
+) -> tuple[np.ndarray, np.ndarray]:
     """Colour (h, w, 3) and distance (h, w) of what each ray meets first; black and infinite where nothing is."""
-    things = (*BALLS, BOX)
-    distances = np.stack([hit_ball(ball, origin, rays) for ball in BALLS] + [hit_box(BOX, origin, rays)])
+    distances = np.stack([hit(thing, origin, rays) for thing in things])
     nearest = distances.argmin(axis=0)
     distance = distances.min(axis=0)
     rgb = np.zeros(rays.shape)
@@ -135,13 +142,13 @@ def trace(origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return rgb, distance
 
 
-def picture(pose: np.ndarray) -> np.ndarray:
+def picture(pose: np.ndarray, *, things: tuple[Ball | Box, ...] = THINGS) -> np.ndarray:
     """RGBA (HEIGHT, WIDTH, 4) uint8, straight alpha.
 
     Alpha is the covered share of the pixel and RGB the mean over the covered part, so that blending the stored
     values over any background gives the mean over the pixel.
     """
-    rgb, distance = trace(pose[:3, 3], directions(pose, subpixels=SUBPIXELS))
+    rgb, distance = trace(pose[:3, 3], directions(pose, subpixels=SUBPIXELS), things=things)
     covered = np.isfinite(distance).astype(float)[..., None]
     cells = np.concatenate((rgb * covered, covered), axis=-1)
     mean = cells.reshape(HEIGHT, SUBPIXELS, WIDTH, SUBPIXELS, 4).mean(axis=(1, 3))

@@ -133,18 +133,13 @@ def evaluate(
         return
     folders = [Path(run) for run in runs]
     if seeds > 1:
-        from nerfcli.workflows.train import train_other_seeds
+        from nerfcli.workflows.train import other_seeds, train_again
 
+        first = Run(folders[0])
+        others = other_seeds(first, seeds - 1, device=torch_device, threads=cores)
         with console.progress(f"train {seeds - 1} more seeds") as update:
-            folders += train_other_seeds(
-                Run(folders[0]),
-                seeds - 1,
-                device=torch_device,
-                threads=cores,
-                notify=console.note,
-                warn=console.warn,
-                progress=update,
-            )
+            train_again(first, others, notify=console.note, warn=console.warn, progress=update)
+        folders += others
     measured = [measure(folder) for folder in folders]
     print_spread(folders, measured, console)
     for folder, metrics in zip(folders, measured, strict=True):

@@ -35,6 +35,7 @@ from nerfcli.cli.options import (
     holdout_rule,
     model_name,
     named_components,
+    one_of,
     seconds_from_text,
     thread_count,
 )
@@ -80,6 +81,18 @@ def train(
         ),
     ] = None,
     holdout: Holdout = None,
+    members: Annotated[
+        int | None,
+        typer.Option(
+            help="Train so many further fields, each with the whole budget, into RUN/members/.",
+            min=2,
+            show_default=False,
+        ),
+    ] = None,
+    vary: Annotated[
+        str,
+        typer.Option(help="What differs between --members: seeds, photos (80 % each), prior or field."),
+    ] = "seeds",
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the last checkpoint to the new total.")
     ] = False,
@@ -128,6 +141,10 @@ def train(
     voxels (a dense grid of density and spherical harmonics), mlp (one network on Fourier features: small and slow).
     The resolution of the last two is one pixel's footprint at the centre of the scene.
 
+    --members 4 trains the run and then four more fields of the same scene; render and evaluate show where they differ.
+    They differ in --vary: seeds; photos, of which each has 80 %; prior, a smooth random field that each starts from; or
+    field, where hash, voxels and mlp take turns. The same command resumes an interrupted one.
+
     An X-ray scan, as `nerfcli convert` writes it, is reconstructed as a volume: Poisson likelihood and total variation,
     --field voxels (of --voxel-size; the default, and better) or hash. Its components are tv (the weight of total
     variation), centre (columns between the centre of rotation and where the scan says), tilt (degrees of the detector
@@ -145,6 +162,7 @@ def train(
       nerfcli train photos-scene --budget 5m --model default
       nerfcli train photos-scene --without view --with distortion=0.01
       nerfcli train photos-scene --with cameras=poses
+      nerfcli train photos-scene --budget 60s --members 4 --vary photos
       nerfcli train photos-scene --field voxels --field-memory 16MB
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
@@ -154,11 +172,18 @@ def train(
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
+    from nerfcli.workflows.members import VARIED, train_members
     from nerfcli.workflows.train import train_scene
     from nerfcli.workflows.train_plan import plan_training
 
     if budget is None and steps is None:
         budget = DEFAULT_BUDGET
+    one_of(vary, VARIED, "--vary")
+    if members is not None and (dry_run or view):
+        option = "--dry-run" if dry_run else "--view"
+        raise typer.BadParameter(
+            f"it cannot be combined with {option}, which is about one field", param_hint="--members"
+        )
     console = Console(quiet=quiet, json_lines=json)
     budget_seconds = None if budget is None else seconds_from_text(budget)
     rule = holdout_rule(holdout)
@@ -217,7 +242,7 @@ def train(
 
     def train_one_scene(folder: Path, run: Path) -> None:
         with console.progress(f"train {folder.name}") as update:
-            train_scene(
+            trained = train_scene(
                 folder,
                 run,
                 photo_settings(),
@@ -226,6 +251,21 @@ def train(
                 overwrite=overwrite,
                 holdout=rule,
                 view=view,
+                notify=console.note,
+                warn=console.warn,
+                progress=update,
+            )
+        if members is None:
+            return
+        with console.progress(f"members of {folder.name}") as update:
+            train_members(
+                trained,
+                members,
+                vary=vary,
+                device=photo_settings().device,
+                threads=photo_settings().threads,
+                resume=resume,
+                overwrite=overwrite,
                 notify=console.note,
                 warn=console.warn,
                 progress=update,
@@ -243,8 +283,9 @@ def train(
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
         if is_scan(folder):
-            if dry_run:
-                raise UserError(f"{folder} is a scan; --dry-run is for photos", "remove --dry-run")
+            if dry_run or members:
+                option = "--dry-run" if dry_run else "--members"
+                raise UserError(f"{folder} is a scan; {option} is for photos", f"remove {option}")
             train_one_scan(folder, run)
         elif recognise(folder):
             raise UserError(

@@ -15,6 +15,8 @@ GEOMETRY = 16
 HARMONICS = 16
 # The levels that learn from the start, and the share of the budget from which on all do.
 FIRST_LEVELS, ALL_LEVELS_SHARE = 4, 0.5
+# The levels that are random in `HashField.start_randomly`: those with a row for each vertex.
+RANDOM_LEVELS = 2
 # Trainings of smaller tables are too short to come to details.
 DETAILED_LOG2_ROWS = 17
 
@@ -74,6 +76,15 @@ class HashField(Field):
 
     def rows(self) -> nn.Parameter:
         return self.table
+
+    @torch.no_grad()
+    def start_randomly(self, deviation: float) -> None:
+        """Fill the coarsest levels with normal numbers of this standard deviation.
+
+        The log density is then a smooth random function, with details of a `RANDOM_LEVELS`-th level's cells. Where no
+        training ray passes it stays one: rows without a gradient are never changed.
+        """
+        self.table[:RANDOM_LEVELS].normal_(std=deviation)
 
     def medium(self, detail: float = 1.0) -> HashGrid:
         return HashGrid(

@@ -7,6 +7,7 @@ FIELD = "field.safetensors"
 STATE = "state.safetensors"
 LOG = "log.jsonl"
 METRICS = "metrics.json"
+MEMBERS = "members"
 DEPTH_ERRORS = "depth_errors.json"
 PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
@@ -23,6 +24,7 @@ __all__ = [
     "LIVE",
     "LOCK",
     "LOG",
+    "MEMBERS",
     "METRICS",
     "PHOTO_DEPTHS",
     "RECONSTRUCTION",

@@ -52,6 +52,9 @@ class TrainSettings:
         model: "default" takes the components as they are, "auto" lets the scene decide on those that are not `fixed`,
             see `selection`.
         fixed: names of components that the user has decided on.
+        photo_fraction: of the training photos, drawn by the seed without replacement, in (0, 1]; 1 for all.
+        random_start: standard deviation of the numbers in the coarsest levels of a hash grid at the start, see
+            `HashField.start_randomly`; 0 for a field that starts as fog of density 1 everywhere.
 
     Raises:
         UserError: neither or a non-positive limit, an unknown downscale or kind of field.
@@ -77,6 +80,8 @@ class TrainSettings:
     field_memory_bytes: int | None = None
     model: str = "default"
     fixed: tuple[str, ...] = ()
+    photo_fraction: float = 1.0
+    random_start: float = 0.0
 
     def __post_init__(self) -> None:
         if min(self.levels, self.width) < 1 or not 4 <= (self.log2_rows or 4) <= 24:
@@ -98,6 +103,12 @@ class TrainSettings:
             raise UserError(
                 f"--with antialias does not work with --field {self.field}: it needs the levels of a hash grid",
                 "use --field hash, or remove --with antialias",
+                2,
+            )
+        if self.random_start and self.field != HashFieldSettings.kind:
+            raise UserError(
+                f"a random start does not work with --field {self.field}: it needs the levels of a hash grid",
+                "use --field hash",
                 2,
             )
         if self.components.stereo and not self.components.points and (self.model != "auto" or "points" in self.fixed):

@@ -1,7 +1,7 @@
 """Train a scene, keep an existing run, resume one, or refuse to overwrite another one."""
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,7 +64,7 @@ def train_scene(
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     folder, run = Path(scene), Path(run)
-    loaded = scenes.load(folder, holdout=holdout)
+    loaded = _load(folder, settings, holdout)
     if loaded.missing:
         listed = ", ".join(loaded.missing[:NAMES_SHOWN])
         more = f" and {len(loaded.missing) - NAMES_SHOWN} more" if len(loaded.missing) > NAMES_SHOWN else ""
@@ -105,28 +105,29 @@ def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout:
     trained = Run(run)
     if not trained.is_trained:
         return False
-    loaded = scenes.load(scene, holdout=holdout)
+    loaded = _load(scene, settings, holdout)
     return trained.is_trained_from(loaded, settings) and not trained.is_complete(settings)
 
 
-def train_other_seeds(
+def train_again(
     run: Run,
-    count: int,
+    others: Mapping[Path, TrainSettings],
     *,
-    device: str,
-    threads: int,
+    resume: bool = False,
+    overwrite: bool = False,
     notify: Notify = silent,
     warn: Notify = warn_python,
     progress: Progress = no_progress,
-) -> list[Path]:
-    """Train the scene of a run again with other seeds and otherwise the same settings, in RUN/seeds/SEED.
+) -> None:
+    """Train the scene of a run again with other settings, one training after the other.
 
     Runs that are there and complete are kept, interrupted ones are resumed.
 
     Args:
         run: a complete run.
-        count: how many others; their seeds follow the run's own.
-        device, threads: as for `TrainSettings`.
+        others: the folders to write, and the settings of each.
+        resume: go on from their last checkpoints to the budget or step count of their settings.
+        overwrite: replace other runs.
         notify, warn, progress: see `train_scene`.
 
     Raises:
@@ -134,32 +135,46 @@ def train_other_seeds(
     """
     config = run.config
     folder = config.scene
-    first = replace(config.settings, device=device, threads=threads)
     if not folder.exists():
         raise UserError(
             f"the scene of {run.path} is missing: {folder}",
             "run the command from the folder in which the run was trained, or train again",
         )
-    loaded = scenes.load(folder, holdout=config.holdout)
+    loaded = _load(folder, config.settings, config.holdout)
     if scenes.fingerprint(loaded) != config.scene_fingerprint:
         raise UserError(f"{folder} has changed since {run.path} was trained on it", "train again with --overwrite")
-    others = []
-    for seed in range(first.seed + 1, first.seed + 1 + count):
-        settings, other = replace(first, seed=seed), run.path / "seeds" / str(seed)
-        resume = was_interrupted(folder, other, settings, holdout=config.holdout)
-        notify(f"{other}: seed {seed}")
+    for path, settings in others.items():
+        interrupted = was_interrupted(folder, path, settings, holdout=config.holdout)
         train_scene(
             folder,
-            other,
+            path,
             settings,
-            resume=resume,
+            resume=interrupted or (resume and Run(path).is_trained),
+            overwrite=overwrite,
             holdout=config.holdout,
             notify=notify,
             warn=warn,
             progress=progress,
         )
-        others.append(other)
-    return others
+
+
+def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path, TrainSettings]:
+    """Return the folders RUN/seeds/SEED and settings that differ from those of a run in their seeds.
+
+    Args:
+        run: a complete run.
+        count: how many; their seeds follow the run's own.
+        device, threads: as for `TrainSettings`.
+    """
+    first = replace(run.config.settings, device=device, threads=threads)
+    seeds = range(first.seed + 1, first.seed + 1 + count)
+    return {run.path / "seeds" / str(seed): replace(first, seed=seed) for seed in seeds}
+
+
+def _load(folder: Path, settings: TrainSettings, holdout: str | None) -> Scene:
+    """The scene with the training photos that these settings use."""
+    loaded = scenes.load(folder, holdout=holdout)
+    return scenes.with_fraction_of_photos(loaded, settings.photo_fraction, seed=settings.seed)
 
 
 def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:

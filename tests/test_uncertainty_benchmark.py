@@ -1,0 +1,218 @@
+"""benchmarks/uncertainty.py: who sees what on spheres by closed form, its statistics against closed forms and loops."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import uncertainty_statistics as statistics
+from make_spheres import Ball, Box
+from scipy import stats
+from uncertainty_scenes import STRATA, Solids, looks, sees, stratum_of, true_pixels, withheld
+
+from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.frame import Frame
+
+
+def ball(x: float, y: float, z: float, radius: float) -> Ball:
+    return Ball((x, y, z), radius, (0.5, 0.5, 0.5), 1.0)
+
+
+def camera_at(azimuth_deg: float, *, reach: float = 5.0, name: str = "") -> Frame:
+    """A camera on the circle z = 0 about the origin that looks at it, 40 degrees wide."""
+    a = math.radians(azimuth_deg)
+    outward = np.array([math.cos(a), math.sin(a), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([np.cross(-outward, (0, 0, 1)), (0, 0, -1), -outward], axis=1)
+    pose[:3, 3] = reach * outward
+    return Frame(name or f"{azimuth_deg:g}", Camera.pinhole(80, 80, 110.0), pose)
+
+
+def test_a_camera_sees_the_cap_of_a_ball_that_closed_form_gives():
+    """At an incidence i a point of the unit ball lies at angle a from the camera: sin(i - a) = sin(i) / reach."""
+    truth, camera = Solids((ball(0, 0, 0, 1.0),)), camera_at(0.0)
+    angles = np.radians(np.linspace(0, 180, 3601))
+    points = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    seen = sees(truth, camera, points, points)
+    steepest = math.radians(80.0)
+    expected = steepest - math.asin(math.sin(steepest) / 5.0)
+    assert np.degrees(angles[seen].max()) == pytest.approx(np.degrees(expected), abs=0.05)
+    np.testing.assert_array_equal(seen, angles <= angles[seen].max())
+
+
+def test_a_ball_in_front_hides_what_lies_in_its_shadow():
+    """A ball of radius r at distance d hides the plane behind it, at D, in a disc of radius r D / sqrt(d^2 - r^2)."""
+    wall = Box((-1.0, 0.0, 0.0), (0.5, 3.0, 3.0), (0.5, 0.5, 0.5), 1.0)
+    truth = Solids((ball(2.0, 0, 0, 0.3), wall))
+    y = np.linspace(-1.5, 1.5, 3001)
+    points = np.stack([np.full_like(y, -0.5), y, 0 * y], axis=1)
+    seen = sees(truth, camera_at(0.0), points, np.tile([1.0, 0, 0], (len(y), 1)))
+    shadow = 0.3 * 5.5 / math.sqrt(3.0**2 - 0.3**2)
+    np.testing.assert_array_equal(seen, np.abs(y) > shadow)
+
+
+def test_strata_of_a_ball_are_those_of_the_angles_between_cameras():
+    """Cameras at 0, 1, 40 and 80 degrees; the caps that they see reach 68.6 degrees to each side of them."""
+    cap = 80.0 - math.degrees(math.asin(math.sin(math.radians(80.0)) / 5.0))
+    cameras = [camera_at(azimuth) for azimuth in (0.0, 1.0, 40.0, 80.0)]
+    truth = Solids((ball(0, 0, 0, 1.0),))
+    at = np.array([20.0, 60.0, 68.9, 69.3, 100.0, 130.0, -60.0, -40.0, 180.0])
+    points = np.stack([np.cos(np.radians(at)), np.sin(np.radians(at)), 0 * at], axis=1)
+    seen = np.stack([sees(truth, camera, points, points) for camera in cameras], axis=1)
+    np.testing.assert_array_equal(seen, np.abs(at[:, None] - [0.0, 1.0, 40.0, 80.0]) < cap)
+
+
+def test_pixels_of_a_view_have_the_truth_along_their_rays():
+    """A view from 20 degrees of the ball that cameras at 0 and 40 see: distance, number and angle in closed form."""
+    truth, cameras = Solids((ball(0, 0, 0, 1.0),)), [camera_at(0.0), camera_at(40.0)]
+    view = camera_at(20.0)
+    found = true_pixels(truth, looks([view]), cameras)
+    assert len(found.distance) == 64 * 64
+    bearings, _ = looks([view])[0].camera.pixel_bearings()
+    cosine = bearings[:, 2]
+    inside = 25.0 * (1 - cosine**2) < 1.0
+    np.testing.assert_array_equal(np.isfinite(found.distance), inside)
+    expected = 5.0 * cosine[inside] - np.sqrt(1.0 - 25.0 * (1 - cosine[inside] ** 2))
+    np.testing.assert_allclose(found.distance[inside], expected, atol=1e-9)
+    nearest = np.nanargmin(np.where(inside, found.distance, np.nan))
+    centres = np.array([camera.centre for camera in cameras])
+    point = np.array([math.cos(math.radians(20)), math.sin(math.radians(20)), 0.0])
+    one, other = (centres - point) / np.linalg.norm(centres - point, axis=1)[:, None]
+    assert found.photos[nearest] == 2
+    # The pixel next to the axis is half a pixel off it.
+    assert found.parallax_deg[nearest] == pytest.approx(np.degrees(np.arccos(one @ other)), abs=0.05)
+    assert (found.stratum[~inside] == -1).all()
+
+
+def test_every_point_is_in_the_stratum_that_the_protocol_gives():
+    cases = {
+        (0, 0.0): "U0",
+        (1, 0.0): "U1",
+        (4, 1.9): "U1",
+        (2, 2.0): "W",
+        (5, 9.9): "W",
+        (2, 50.0): "W",
+        (3, 10.0): "D",
+    }
+    photos, angles = np.array(list(cases)).T
+    found = stratum_of(photos.astype(int), angles, hit=np.ones(len(cases), bool))
+    assert [STRATA[index] for index in found] == list(cases.values())
+    assert (stratum_of(photos.astype(int), angles, hit=np.zeros(len(cases), bool)) == -1).all()
+
+
+def test_a_third_of_an_even_ring_is_withheld_and_every_eighth_of_the_rest():
+    frames = [camera_at(azimuth, name=f"{azimuth:03d}") for azimuth in range(0, 360, 10)]
+    inside, controls = withheld(frames, sector=1)
+    assert inside == [f"{azimuth:03d}" for azimuth in range(90, 210, 10)]
+    assert controls == ["000", "080", "280"]
+
+
+def test_sparsification_is_the_mean_of_what_is_left():
+    error = np.random.default_rng(0).exponential(size=200)
+    uncertainty = np.random.default_rng(1).random(200)
+    curve = statistics.sparsification(error, uncertainty)
+    kept = [error[np.argsort(uncertainty)[: max(1, int((1 - removed / 100) * 200 + 1e-9))]] for removed in range(100)]
+    np.testing.assert_allclose(curve, [part.mean() for part in kept])
+
+
+def test_areas_have_their_closed_forms():
+    """The oracle has no AUSE, random order no AURG, and a constant uncertainty is a random order."""
+    error = np.linspace(0, 1, 20_000) ** 2
+    rng = np.random.default_rng(0)
+    assert statistics.ause(error, error) == 0
+    assert statistics.ause(error, np.exp(error)) == 0
+    # Of errors x^2 the mean of the smallest fraction f is f^2 / 3; up to 99 % removed, random order keeps 1 / 3.
+    random = np.trapezoid(1 / 3 - (1 - statistics.RATIOS) ** 2 / 3, statistics.RATIOS)
+    for uncertainty in (rng.random(len(error)), np.zeros(len(error))):
+        assert statistics.ause(error, uncertainty) == pytest.approx(random, abs=0.01)
+        assert statistics.aurg(error, uncertainty) == pytest.approx(0.0, abs=0.01)
+    assert statistics.aurg(error, error) == pytest.approx(random, abs=1e-3)
+
+
+@pytest.mark.parametrize("members", [2, 5, 8])
+def test_members_of_the_distribution_of_the_truth_hold_it_as_stated(members):
+    """The positive control: truth and members are draws of one Gaussian, for each pixel another one."""
+    rng, pixels = np.random.default_rng(members), 40_000
+    middle, deviation = rng.normal(size=pixels), rng.exponential(size=pixels)
+    drawn = middle + deviation * rng.normal(size=(members + 1, pixels))
+    for level in statistics.LEVELS:
+        assert statistics.held_by_interval(drawn[1:], drawn[0], level=level) == pytest.approx(level, abs=0.01)
+    expected = members / (2 * members + 1)
+    assert statistics.variance_fraction(drawn[1:], drawn[0]) == pytest.approx(expected, abs=0.02)
+    # Ten times as far off as the members are apart.
+    assert statistics.held_by_interval(drawn[1:], drawn[0] + 10 * deviation, level=0.5) < 0.1
+    assert statistics.variance_fraction(drawn[1:], drawn[0] + 10 * deviation) < 0.02
+
+
+def test_the_loss_of_a_normal_is_its_log_likelihood():
+    members, true = np.array([[1.0, 2.0], [3.0, 2.0]]), np.array([2.5, 2.0])
+    spread = np.array([math.sqrt(2.0), statistics.NLL_FLOOR])
+    expected = 0.5 * math.log(2 * math.pi) + np.log(spread) + 0.5 * ((true - 2.0) / spread) ** 2
+    assert statistics.log_likelihood_loss(members, true) == pytest.approx(expected.mean())
+
+
+def test_the_area_under_the_roc_counts_pairs():
+    rng = np.random.default_rng(0)
+    values, positive = rng.integers(0, 9, 160).astype(float), rng.random(160) < 0.5
+    pairs = [(a > b) + 0.5 * (a == b) for a in values[positive] for b in values[~positive]]
+    assert statistics.area_under_roc(values, positive) == pytest.approx(np.mean(pairs))
+    assert math.isnan(statistics.area_under_roc(values, np.zeros(160, bool)))
+
+
+def test_the_sign_flip_test_counts_all_flips():
+    differences = np.array([-0.5, -0.2, 0.1, -0.4, -0.3])
+    flips = [np.mean(differences * signs) for signs in itertools.product((1, -1), repeat=5)]
+    expected = np.mean(np.array(flips) <= differences.mean() + 1e-12)
+    assert statistics.sign_flip(differences) == pytest.approx(expected)
+    assert statistics.sign_flip(-np.ones(12)) == pytest.approx(2.0**-12)
+
+
+def test_p_values_are_adjusted_as_in_the_paper():
+    """Holm 1979: the k-th smallest of n times n - k + 1, never falling, at most 1."""
+    adjusted = statistics.holm({"a": 0.01, "b": 0.04, "c": 0.03, "d": 0.6})
+    assert adjusted == pytest.approx({"a": 0.04, "c": 0.09, "b": 0.09, "d": 0.6})
+
+
+def test_the_interval_of_a_mean_is_that_of_its_standard_error():
+    values = np.random.default_rng(0).normal(3.0, 1.0, 400)
+    mean, low, high = statistics.mean_with_interval(np.append(values, np.nan))
+    assert mean == pytest.approx(values.mean())
+    assert (high - low) / 2 == pytest.approx(stats.norm.ppf(0.975) * values.std() / 20, rel=0.05)
+
+
+GOOD = statistics.Summary(
+    held=0.9,
+    v_unseen=0.4,
+    v_seen=0.45,
+    correlation=(0.5, 0.3, 0.6),
+    marks=0.95,
+    p_of_ause=0.01,
+    ause_difference=-0.1,
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, "YES"),
+        ({"held": 0.75, "v_unseen": 0.25}, "LABEL ONLY"),
+        ({"correlation": (0.05, -0.1, 0.2)}, "LABEL ONLY"),
+        ({"correlation": (0.05, -0.1, 0.2), "held": 0.3, "v_unseen": 0.05}, "LABEL ONLY"),
+        ({"marks": 0.7, "v_unseen": 0.05}, "NO"),
+        ({"marks": 0.7, "held": 0.4}, "NO"),
+        ({"marks": 0.7, "ause_difference": 0.1}, "NO"),
+        ({"marks": 0.7, "held": 0.7}, "undecided"),
+        ({"p_of_ause": 0.2}, "undecided"),
+    ],
+)
+def test_verdicts_follow_the_rules_of_the_protocol(changes, expected):
+    assert statistics.verdict(statistics.Summary(**{**vars(GOOD), **changes})) == expected
+
+
+def test_uncertainty_of_another_replicate_tells_nothing():
+    """The negative control: AUSE of a random order."""
+    rng = np.random.default_rng(0)
+    errors = [rng.exponential(size=20_000), rng.exponential(size=15_000)]
+    other = statistics.permuted(errors, 0)
+    assert len(other) == 20_000
+    assert abs(statistics.aurg(errors[0], other)) < 0.03
