@@ -7,21 +7,24 @@ spheres and two more scenes of balls and blocks are met by rays in closed form; 
 import importlib
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import desk_scene
-import make_spheres
 import numpy as np
-from make_spheres import Ball, Box
 from PIL import Image
 
 from nerfcli import scene as scenes
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.visibility import largest_angle_deg, small_frame
 from nerfcli.scene import Scene
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "sample_scenes"))
+import desk_scene
+import make_spheres
+from make_spheres import Ball, Box
 
 DESK = Path(__file__).parent.parent / "sample_scenes" / "desk"
 DESK_SEED = 20260

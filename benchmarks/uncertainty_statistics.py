@@ -83,7 +83,7 @@ def rank_correlation(one: np.ndarray, other: np.ndarray) -> float:
     """Return Spearman's correlation; NaN for few pixels or constant values."""
     if len(one) < LEAST_PIXELS or np.ptp(one) == 0 or np.ptp(other) == 0:
         return float("nan")
-    return float(stats.spearmanr(one, other)[0])
+    return float(np.corrcoef(stats.rankdata(one), stats.rankdata(other))[0, 1])
 
 
 def sign_flip(differences: np.ndarray) -> float:

@@ -10,6 +10,7 @@ HEADINGS = ("field", "weights", "optimiser", "step keeps", "ops/sample", "B/samp
 _UNITS = ("", "k", "M", "G", "T", "P")
 # Of maps that are no lengths.
 _UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees"}
+_LENGTHS = ("depth", "spread", "disagreement", "lower", "upper", "depth_deviation")
 # Letters in a line; what is longer goes on in the next one, further in.
 WIDTH = 110
 
@@ -63,7 +64,7 @@ def _maps(facts: dict[str, Any]) -> Iterator[str]:
     meaning = facts.get("meaning") or {}
     unit = {"metre": " m", "arbitrary": " units"}.get(meaning.get("unit", ""), "")
     for name, of_map in facts.get("maps", {}).items():
-        suffix = unit if name in ("depth", "spread", "disagreement", "lower", "upper") else _UNITS_OF_MAPS.get(name, "")
+        suffix = unit if name in _LENGTHS else _UNITS_OF_MAPS.get(name, "")
         shape = "" if len(of_map["shape"]) == 2 else f" {'x'.join(map(str, of_map['shape']))}"
         line = f"{name}: {of_map['dtype']}{shape}"
         if "valid_share" in of_map:

@@ -57,8 +57,8 @@ def render(
     outputs: Annotated[
         str | None,
         typer.Option(
-            help="Any of rgb,depth,opacity,spread,disagreement,coverage,parallax,lower,upper; for scans "
-            "projection,transmission,residual.  "
+            help="Any of rgb,depth,opacity,spread,disagreement,coverage,parallax,lower,upper,depth_deviation,"
+            "colour_deviation; for scans projection,transmission,residual.  "
             "[default: rgb,depth,opacity; projection]"
         ),
     ] = None,
@@ -188,7 +188,8 @@ def render(
     single depth is right (edges, glass, fog). coverage is the number of training photos that see the surface (its
     median depth), parallax the largest angle between two of them. lower and upper are an interval of --level around
     that depth, measured by stereo matching of the held-out photos; where no training photo sees the surface, there is
-    none. Every file describes its values: nerfcli info FILE.
+    none. depth_deviation and colour_deviation are standard deviations between the members of a run (train --members).
+    Every file describes its values: nerfcli info FILE.
     \b
     Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos and previews of
     views that were already rendered are made without rendering again (add --overwrite to replace existing ones).
@@ -199,6 +200,7 @@ def render(
     Examples:
       nerfcli render photos-scene-run --cameras test --outputs rgb,depth --depth median --depth-axis ray
       nerfcli render photos-scene-run --outputs depth,coverage,parallax --min-views 2 --min-parallax 2
+      nerfcli render photos-scene-run --outputs depth,depth_deviation,colour_deviation
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
       nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-layout side-by-side --video-format gif
       nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8 --jobs 4

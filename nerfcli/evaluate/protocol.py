@@ -134,7 +134,7 @@ def evaluate_model(
             evidence.add(compared.frame, compared.rendered, compared.photo, compared.used)
         entry = {
             "name": photo.frame.name,
-            **_measured(compared, extras.perceptual),
+            **measured(compared, extras.perceptual),
             **_counted(photo, picture, compared),
         }
         if extras.align_poses:
@@ -182,6 +182,11 @@ def over_white(pixels: np.ndarray) -> np.ndarray:
 
 
 def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> Compared:
+    """Return a held-out photo beside the picture of it, as bright as the photo is.
+
+    Raises:
+        UserError: a mask hides the whole photo.
+    """
     used = picture.valid if photo.used is None else picture.valid & photo.used
     if not used.any():
         raise UserError(
@@ -204,7 +209,8 @@ def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
     return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
 
 
-def _measured(compared: Compared, perceptual: Perceptual | None) -> dict[str, float | None]:
+def measured(compared: Compared, perceptual: Perceptual | None) -> dict[str, float | None]:
+    """Return the metrics of a compared pair, see `evaluate_model`."""
     truth, used = compared.photo, compared.used
     rounded = to_8_bit(compared.rendered)
     raw = {

@@ -164,8 +164,7 @@ def _render_missing(
     missing = [index for index in part if index not in held]
     if held:
         notify(f"resuming: {len(held)} of {len(part)} frames are already in {unfinished.folder}")
-        cameras = [order.frames[index].camera for index in held]
-        on_rays(sum(camera.width * camera.height for camera in cameras))
+        on_rays(sum(map(order.rays, held)))
     if workers.jobs > 1 and len(missing) > 1:
         render_in_processes(
             model,

@@ -4,18 +4,16 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from nerfcli.export.depth_files import frame_meta
+from nerfcli.export.members import with_deviations
 from nerfcli.export.order import Order
 from nerfcli.export.picture_files import write_picture
-from nerfcli.export.settings import depth_meta
+from nerfcli.export.settings import BLACK, depth_meta
 from nerfcli.export.unfinished import Unfinished
 from nerfcli.export.visibility import with_interval, with_visibility, without_unseen_depth
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.accuracy import measure_error, truncation_bounds
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture, straight_rgba
-
-# Behind pictures with alpha: their colours are then premultiplied, and nothing of a background is in them.
-BLACK = (0.0, 0.0, 0.0)
 
 
 def render_frame(
@@ -43,6 +41,8 @@ def render_frame(
     )
     if settings.rgba:
         picture = replace(picture, rgb=straight_rgba(picture))
+    if order.members:
+        picture = with_deviations(picture, frame, order.members, settings=settings, on_rays=on_rays)
     removed = {}
     if settings.needs_visibility:
         picture = with_visibility(picture, frame, axis=settings.depth.axis, photo_depths=order.photo_depths)

@@ -15,6 +15,7 @@ from nerfcli.export.file_names import describe_frames, file_names
 from nerfcli.export.settings import ExportSettings
 from nerfcli.media.video import FORMATS, check_encoders
 from nerfcli.render.depth_errors import DepthErrors
+from nerfcli.render.model import Model
 from nerfcli.render.visibility import DepthMap
 
 DESCRIPTION = "render.json"
@@ -32,6 +33,7 @@ class Order:
         photo_depths: what each training photo sees of the surface, where `ExportSettings.needs_visibility`; the
             provenance says which photos.
         depth_errors: of the field, where `ExportSettings.needs_errors`.
+        members: of the run, where `ExportSettings.needs_members`; the provenance has their hashes.
     """
 
     frames: tuple[Frame, ...]
@@ -39,11 +41,17 @@ class Order:
     provenance: dict[str, Any]
     photo_depths: tuple[DepthMap, ...] = ()
     depth_errors: DepthErrors | None = None
+    members: tuple[Model, ...] = ()
 
     @cached_property
     def names(self) -> list[str]:
         """File names of the frames, without suffix."""
         return file_names(self.frames)
+
+    def rays(self, index: int) -> int:
+        """Return the number of rays of a frame, by all fields that are rendered for it."""
+        camera = self.frames[index].camera
+        return (1 + len(self.members)) * camera.width * camera.height
 
     def of_pictures(self) -> dict[str, Any]:
         """Plain values of all that decides over the rendered numbers."""

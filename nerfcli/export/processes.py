@@ -98,8 +98,7 @@ def render_in_processes(
                     continue
                 if failure is not None:
                     raise failure.error()
-                camera = order.frames[worker.index].camera
-                on_rays(camera.width * camera.height)
+                on_rays(order.rays(worker.index))
                 if left:
                     give(worker)
                 else:

@@ -8,15 +8,20 @@ from nerfcli.render.depth import MEDIAN, DepthRequest, effective_floor
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import Quality
 
-OUTPUTS = ("rgb", "depth", "opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper")
+OUTPUTS = (
+    *("rgb", "depth", "opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper"),
+    *("depth_deviation", "colour_deviation"),
+)
 # Those that are measured: floats on disk, and pictures in colours to look at.
-MEASURED = ("depth", "spread", "disagreement", "coverage", "parallax", "lower", "upper")
+MEASURED = tuple(output for output in OUTPUTS if output not in ("rgb", "opacity"))
 FLOAT_FORMATS = ("tiff", "exr", "npy", "npz")
 FORMATS = (*FLOAT_FORMATS, "png16")
 # A file of these holds all that was asked for of a view, in a folder under the name of the format.
 TOGETHER = ("exr", "npz")
 LEVELS_FOLDER = "depth16"
 LAYOUTS = ("separate", "side-by-side")
+# Behind pictures with alpha: their colours are then premultiplied, and nothing of a background is in them.
+BLACK = (0.0, 0.0, 0.0)
 DIRECTIONS = ("forward", "reverse", "ping-pong")
 
 
@@ -84,6 +89,11 @@ class ExportSettings:
         return "lower" in self.outputs or "upper" in self.outputs
 
     @property
+    def needs_members(self) -> bool:
+        """Whether the members of the run are rendered, too."""
+        return "depth_deviation" in self.outputs or "colour_deviation" in self.outputs
+
+    @property
     def float_formats(self) -> tuple[str, ...]:
         """The formats of floats: at least one, because previews and levels are made from them."""
         return tuple(name for name in FLOAT_FORMATS if name in self.formats) or FLOAT_FORMATS[:1]
@@ -144,8 +154,10 @@ def meaning_of(meta: DepthMeta, request: DepthRequest, output: str) -> DepthMeta
 def floor_of(request: DepthRequest, output: str) -> float:
     """The opacity below which a pixel has no value in an output that is measured."""
     match output:
-        case "depth":
+        case "depth" | "depth_deviation":
             return effective_floor(request)
+        case "colour_deviation":
+            return 0.0
         case "spread":
             return request.min_opacity
     return max(request.min_opacity, MEDIAN)  # all others need the median, too

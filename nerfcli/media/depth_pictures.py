@@ -20,7 +20,10 @@ FORMAT = "nerfcli depth 2"
 # The word under which a description stands in PNG text chunks, OpenEXR attributes and NPZ archives.
 KEY = "nerfcli"
 AXES = {"ray": "along the ray", "z": "along the optical axis (z)"}
-QUANTITIES = ("depth", "spread", "disagreement", "coverage", "parallax", "lower", "upper")
+QUANTITIES = (
+    *("depth", "spread", "disagreement", "coverage", "parallax", "lower", "upper"),
+    *("depth_deviation", "colour_deviation"),
+)
 # The convention of what is no depth itself.
 CONVENTION_OF = {
     "spread": "standard-deviation",
@@ -29,9 +32,11 @@ CONVENTION_OF = {
     "parallax": "largest-angle",
     "lower": "lower",
     "upper": "upper",
+    "depth_deviation": "deviation-of-members",
+    "colour_deviation": "deviation-of-members",
 }
 # The unit of what is no length.
-UNIT_OF = {"coverage": "photos", "parallax": "degrees"}
+UNIT_OF = {"coverage": "photos", "parallax": "degrees", "colour_deviation": "sRGB from 0 to 1"}
 
 _IN_WORDS = {
     "conditional": "the mean distance at which light is absorbed, given that it is",
@@ -44,6 +49,7 @@ _IN_WORDS = {
     "photos-that-see": "the number of training photos that see the surface, by the field's own depths",
     "lower": "measured on held-out photos by stereo matching; none where no training photo sees the surface",
     "upper": "measured on held-out photos by stereo matching; none where no training photo sees the surface",
+    "deviation-of-members": "the standard deviation between fields that were trained again; not an error",
     "largest-angle": "the largest angle between the rays of two training photos that see the surface; 0 below two",
 }
 _WHAT_MUST_AGREE = (
@@ -128,6 +134,8 @@ class DepthMeta:
             "disagreement": "|median - conditional| depth",
             "coverage": "coverage: training photos that see the surface",
             "parallax": "parallax: largest angle between two of them",
+            "depth_deviation": "standard deviation of depth between members",
+            "colour_deviation": "standard deviation of colour between members",
             "lower": f"lower end of the {self._level} interval of depth",
             "upper": f"upper end of the {self._level} interval of depth",
         }
@@ -164,7 +172,7 @@ class DepthMeta:
     def in_words(self) -> str:
         """One line for people: "conditional depth along the optical axis (z), in metres (gps): the mean ..."."""
         if self.quantity in UNIT_OF:
-            return f"{self.quantity}, in {self.unit}: {_IN_WORDS[self.convention]}"
+            return f"{self.quantity.replace('_', ' ')}, in {self.unit}: {_IN_WORDS[self.convention]}"
         unit = "metres" if self.unit == "metre" else f"{self.unit} units"
         source = f" (from: {self.unit_source})" if self.unit_source else ""
         convention, _, fraction = self.convention.partition(":")

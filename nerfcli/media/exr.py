@@ -10,6 +10,7 @@
     coverage.V        number of training photos that see the surface
     parallax.V        largest angle between the rays of two of them, degrees
     lower.V, upper.V  interval of depth
+    depth_deviation.V, colour_deviation.V  standard deviation between the members of a run
 
 Pixels without a value are NaN. The header carries the description as JSON in the attribute "nerfcli", and a sentence
 for people in "comments". Source: https://openexr.com/en/latest/TechnicalIntroduction.html, "Channel Names".
@@ -35,6 +36,7 @@ from nerfcli.media.srgb import linear_light
 CHANNELS = {
     "depth": "Z",
     **{name: f"{name}.V" for name in ("opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper")},
+    **{name: f"{name}.V" for name in ("depth_deviation", "colour_deviation")},
 }
 
 

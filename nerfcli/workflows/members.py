@@ -1,10 +1,19 @@
 """The members of a run, RUN/members/1, 2, ...: further fields of the same scene whose differences show what varies."""
 
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
+import torch
+
+from nerfcli.atomic import read_json, write_json
 from nerfcli.errors import UserError
+from nerfcli.evaluate.perceptual import find_perceptual
+from nerfcli.evaluate.protocol import WHITE, compare, mean_of, measured
+from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.field.kinds import KINDS as FIELDS
-from nerfcli.runs.files import MEMBERS
+from nerfcli.render.pictures import render_picture
+from nerfcli.runs.files import MEMBERS, METRICS
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
@@ -88,6 +97,53 @@ def train_members(
         )
         members.append(Run(path))
     return members
+
+
+def evaluate_members(
+    run: Run, *, device: str, threads: int, overwrite: bool = False, notify: Notify, progress: Progress = no_progress
+) -> dict[str, Any]:
+    """Measure the members of a run and the mean of their pictures on the held-out photos, or keep what is there.
+
+    Args:
+        run: with members.
+        device, threads: to render with.
+        overwrite: measure again.
+        notify: takes lines for the user.
+        progress: takes the share of the pictures that is done and a few words.
+
+    Returns:
+        RUN/members/metrics.json: "members", the mean over photos of each measure for each member; "mean_picture", the
+        same of the mean of their pictures; "checkpoints_sha256" of the members.
+
+    Raises:
+        UserError: see `members_of`; nothing was held out, or photos cannot be read.
+    """
+    members, path = members_of(run), run.path / MEMBERS / METRICS
+    torch.set_num_threads(threads)
+    models = [member.model(device) for member in members]
+    checkpoints = [model.sha256 for model in models]
+    if path.exists() and not overwrite:
+        metrics = read_json(path, needed=("members", "mean_picture"), hint="add --overwrite to evaluate again")
+        if metrics.get("checkpoints_sha256") == checkpoints:
+            notify(f"{path} is kept: it is up to date; add --overwrite to evaluate again")
+            return metrics
+    perceptual, test = find_perceptual(notify), run.cameras.test
+    rows: list[list[dict[str, float | None]]] = []
+    for place, frame in enumerate(test):
+        pairs = []
+        for member, model in zip(members, models, strict=True):
+            (photo,) = held_out_photos_of(member.config, [frame], model, threads=threads)
+            background = WHITE if photo.pixels.shape[-1] == 4 else model.background
+            pairs.append(compare(photo, render_picture(model, photo.frame, background=background)))
+            progress((place + len(pairs) / len(members)) / len(test), f"{place}/{len(test)} photos")
+        mean = replace(pairs[0], rendered=np.mean([pair.rendered for pair in pairs], axis=0, dtype=np.float32))
+        rows.append([measured(pair, perceptual) for pair in (*pairs, mean)])
+    if not rows:
+        raise UserError(f"{run.path} has no held-out photos to evaluate on", "train it with some held out: --holdout")
+    *of_members, of_mean = [mean_of(column) for column in zip(*rows, strict=True)]
+    metrics = {"members": of_members, "mean_picture": of_mean, "checkpoints_sha256": checkpoints}
+    write_json(path, metrics)
+    return metrics
 
 
 def members_of(run: Run) -> list[Run]:

@@ -11,8 +11,10 @@ from nerfcli.export.frames import Workers, automatic_workers, export_frames, exp
 from nerfcli.export.order import Order, refuse_foreign
 from nerfcli.export.settings import OUTPUTS, ExportSettings
 from nerfcli.render.depth import DepthRequest
+from nerfcli.render.model import Model
 from nerfcli.runs.run import Run
 from nerfcli.workflows.machine import device_name, thread_count
+from nerfcli.workflows.members import members_of
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.photo_depths import depth_errors, photo_depths
 from nerfcli.workflows.views import Views, chosen_frames, refuse_z_all_around
@@ -94,6 +96,10 @@ def render_run(
             notify=notify,
         )
         provenance["measured_photos"] = errors.photos
+    members: list[Model] = []
+    if settings.needs_members:
+        members = [member.model(torch_device) for member in members_of(trained)]
+        provenance["members_sha256"] = [member.sha256 for member in members]
     model = model.stretched(step)
     if settings.depth.convention == "background" and settings.depth.background_distance is None:
         farthest = model.marching.far / model.training_from_scene.scale
@@ -104,7 +110,7 @@ def render_run(
         refuse_z_all_around(frames, notify=notify)
     if step != 1.0:
         provenance["step"] = step
-    order = Order(tuple(frames), settings, provenance, seen, errors)
+    order = Order(tuple(frames), settings, provenance, seen, errors, tuple(one.stretched(step) for one in members))
     chosen = range(len(frames))[part] if part is not None else range(len(frames))
     if not chosen:
         raise UserError(f"--frames: there are only {len(frames)} views", "views are counted from 0", exit_code=2)
@@ -113,7 +119,7 @@ def render_run(
         notify(f"{folder} is kept: it is complete and has these settings; add --overwrite to render again")
         return order.results(folder)
 
-    total = sum(frames[index].camera.width * frames[index].camera.height for index in chosen)
+    total = sum(map(order.rays, chosen))
     done = 0
 
     def on_rays(rays: int) -> None:

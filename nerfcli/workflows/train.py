@@ -64,6 +64,42 @@ def train_scene(
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     folder, run = Path(scene), Path(run)
+    try:
+        return _trained(
+            folder,
+            run,
+            settings,
+            memory_bytes=memory_bytes,
+            resume=resume,
+            overwrite=overwrite,
+            holdout=holdout,
+            view=view,
+            notify=notify,
+            warn=warn,
+            progress=progress,
+        )
+    except KeyboardInterrupt:
+        if (run / STATE).exists():
+            paths = f"{shlex.quote(str(folder))} -o {shlex.quote(str(run))}"
+            notify(f"checkpoint saved; continue with: nerfcli train {paths} --resume")
+        raise
+
+
+def _trained(
+    folder: Path,
+    run: Path,
+    settings: TrainSettings,
+    *,
+    resume: bool,
+    overwrite: bool,
+    holdout: str | None,
+    notify: Notify,
+    warn: Notify,
+    progress: Progress,
+    memory_bytes: int | None = None,
+    view: bool = False,
+) -> Run:
+    """See `train_scene`."""
     loaded = _load(folder, settings, holdout)
     if loaded.missing:
         listed = ", ".join(loaded.missing[:NAMES_SHOWN])
@@ -145,17 +181,21 @@ def train_again(
         raise UserError(f"{folder} has changed since {run.path} was trained on it", "train again with --overwrite")
     for path, settings in others.items():
         interrupted = was_interrupted(folder, path, settings, holdout=config.holdout)
-        train_scene(
-            folder,
-            path,
-            settings,
-            resume=interrupted or (resume and Run(path).is_trained),
-            overwrite=overwrite,
-            holdout=config.holdout,
-            notify=notify,
-            warn=warn,
-            progress=progress,
-        )
+        try:
+            _trained(
+                folder,
+                path,
+                settings,
+                resume=interrupted or (resume and Run(path).is_trained),
+                overwrite=overwrite,
+                holdout=config.holdout,
+                notify=notify,
+                warn=warn,
+                progress=progress,
+            )
+        except KeyboardInterrupt:
+            notify("what is complete is kept; the same command continues")
+            raise
 
 
 def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path, TrainSettings]:
@@ -227,12 +267,4 @@ def _fit(
         progress(state.share, f"step {state.step}  loss {state.loss:.4f}  {speed}")
 
     progress(0.0, "")
-    try:
-        loop.train(
-            scene, run, settings, resume=resume, memory_bytes=memory_bytes, notify=notify, on_progress=on_progress
-        )
-    except KeyboardInterrupt:
-        if (run / STATE).exists():
-            paths = f"{shlex.quote(str(scene.root))} -o {shlex.quote(str(run))}"
-            notify(f"checkpoint saved; continue with: nerfcli train {paths} --resume")
-        raise
+    loop.train(scene, run, settings, resume=resume, memory_bytes=memory_bytes, notify=notify, on_progress=on_progress)
