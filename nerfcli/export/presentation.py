@@ -141,12 +141,12 @@ def _comment(
     order: Order, meta: DepthMeta, outputs: Sequence[str], ranges: dict[str, tuple[float, float]]
 ) -> dict[str, Any]:
     """What a video's container says about it."""
-    told: dict[str, Any] = {"nerfcli": __version__, "outputs": list(outputs), **order.provenance}
+    description: dict[str, Any] = {"nerfcli": __version__, "outputs": list(outputs), **order.provenance}
     if any(output in MEASURED for output in outputs):
-        told |= meta.to_json()
-        told |= {"ranges": {output: ranges[output] for output in outputs if output in MEASURED}}
-        told |= {"colour_map": order.settings.colour_map}
-    return told
+        description |= meta.to_json()
+        description |= {"ranges": {output: ranges[output] for output in outputs if output in MEASURED}}
+        description |= {"colour_map": order.settings.colour_map}
+    return description
 
 
 def _picture(folder: Path, output: str, name: str) -> Path:

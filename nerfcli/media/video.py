@@ -123,7 +123,7 @@ def write_video(
         raise ValueError(f"fps must be positive, got {fps}")
     with atomic_path(path) as partial:
         if form.encoder == "gif":
-            _write_gif(partial, frames, fps=fps, plays=plays, comment=comment, told=path)
+            _write_gif(partial, frames, fps=fps, plays=plays, comment=comment, target=path)
             return
         quality = form.crf if crf is None else crf
         arguments = [
@@ -131,19 +131,19 @@ def write_video(
             *(*form.arguments, "-metadata", f"comment={comment}"),
         ]
         repeated = chain.from_iterable(frames() for _ in range(plays))
-        _encode(map(_even, repeated), partial, arguments, fps=fps, told=path)
+        _encode(map(_even, repeated), partial, arguments, fps=fps, target=path)
 
 
 def _write_gif(
-    partial: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, plays: int, comment: str, told: Path
+    partial: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, plays: int, comment: str, target: Path
 ) -> None:
     """One palette over the whole clip, then the pixels; ffmpeg would keep all frames in memory to do it in one go."""
     with tempfile.TemporaryDirectory(prefix=f"{partial.name}-", dir=partial.parent) as folder:
         palette, plain = Path(folder) / "palette.png", Path(folder) / "plain.gif"
-        _encode(frames(), palette, ["-vf", "palettegen=reserve_transparent=0", "-update", "1"], fps=fps, told=told)
+        _encode(frames(), palette, ["-vf", "palettegen=reserve_transparent=0", "-update", "1"], fps=fps, target=target)
         # The format counts repetitions; ffmpeg takes -1 for none, 0 for ever.
         arguments = ["-i", f"file:{palette}", "-lavfi", _DITHER, "-loop", f"{plays - 1 or -1 if plays else 0}"]
-        _encode(frames(), plain, arguments, fps=fps, told=told)
+        _encode(frames(), plain, arguments, fps=fps, target=target)
         _add_gif_comment(plain, partial, comment)
 
 
@@ -161,8 +161,8 @@ def _add_gif_comment(plain: Path, commented: Path, comment: str) -> None:
         shutil.copyfileobj(source, target)
 
 
-def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *, fps: float, told: Path) -> None:
-    """Run ffmpeg with `frames` on its standard input; `told` is the path that errors name."""
+def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *, fps: float, target: Path) -> None:
+    """Run ffmpeg with `frames` on its standard input; `target` is the path that errors name."""
     ffmpeg, process, shape = _ffmpeg(), None, (0, 0, 0)
     with tempfile.TemporaryFile() as log:
         try:
@@ -192,12 +192,12 @@ def _encode(frames: Iterable[np.ndarray], output: Path, arguments: list[str], *,
                     process.stdin.write(frame.tobytes())
                 except OSError as error:  # a broken pipe: the encoder's own words are in its log
                     process.wait()
-                    raise _failure(told, log) from error
+                    raise _failure(target, log) from error
             if process is None:
-                raise ValueError(f"there are no frames for {told}")
+                raise ValueError(f"there are no frames for {target}")
             process.communicate()
             if process.returncode != 0:
-                raise _failure(told, log)
+                raise _failure(target, log)
         finally:
             if process is not None:
                 _stop(process)
@@ -225,8 +225,8 @@ def _ffmpeg() -> str:
         ) from error
 
 
-def _failure(told: Path, log: IO[bytes]) -> UserError:
+def _failure(target: Path, log: IO[bytes]) -> UserError:
     log.seek(0)
     lines = log.read().decode("utf-8", errors="replace").strip().splitlines()
     reason = lines[-1] if lines else "the encoder stopped"
-    return UserError(f"cannot write {told}: {reason}", "free some disk space, or write elsewhere")
+    return UserError(f"cannot write {target}: {reason}", "free some disk space, or write elsewhere")
