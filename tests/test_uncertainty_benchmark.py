@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import uncertainty_statistics as statistics
+import uncertainty_tomography as tomography
 from make_spheres import Ball, Box
 from scipy import stats
 from uncertainty_scenes import STRATA, Solids, looks, sees, stratum_of, true_pixels, withheld
@@ -216,3 +217,26 @@ def test_uncertainty_of_another_replicate_tells_nothing():
     other = statistics.permuted(errors, 0)
     assert len(other) == 20_000
     assert abs(statistics.aurg(errors[0], other)) < 0.03
+
+
+def test_lines_of_the_tomography_have_the_integrals_of_a_gaussian():
+    """Of exp(-r^2 / (2 l^2)) at a distance t from its centre: sqrt(2 pi) l exp(-t^2 / (2 l^2))."""
+    angles, side = np.array([0.0, 30.0, 90.0, 135.0]), tomography.SIDE
+    matrix = tomography.Geometry("", angles, 0.6).matrix()
+    at = (np.arange(side) + 0.5) / side * 2 - 1
+    length, x0, y0 = 0.2, 0.1, -0.15
+    image = np.exp(-((at - x0) ** 2 + (at[:, None] - y0) ** 2) / (2 * length**2)).ravel()
+    lines = at[np.abs(at) < 0.6]
+    turned = np.radians(angles)[:, None]
+    t = lines - (x0 * np.cos(turned) + y0 * np.sin(turned))
+    expected = math.sqrt(2 * math.pi) * length * np.exp(-(t**2) / (2 * length**2))
+    np.testing.assert_allclose(matrix @ image, expected.ravel(), atol=0.01)
+
+
+def test_least_squares_keep_the_start_where_the_matrix_sees_nothing():
+    """A matrix that sees the first two of three unknowns: the null space is the third one."""
+    inverse = tomography.Inverse.of(np.array([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0], [2.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(inverse.null, [0, 0, 1], atol=1e-12)
+    start, data = np.array([5.0, 6.0, 7.0]), np.array([2.0, 3.0, 5.0])
+    matrix = np.array([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0], [2.0, 1.0, 0.0]])
+    np.testing.assert_allclose(start + inverse.back @ (data - matrix @ start), [1, 3, 7])
