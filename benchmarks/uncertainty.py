@@ -25,7 +25,7 @@ import uncertainty_statistics as statistics
 from rich.console import Console
 from rich.table import Table
 from scipy import ndimage
-from uncertainty_scenes import STRATA, TruePixels, load_replicate, looks, true_pixels, truth_of, write_capture
+from uncertainty_scenes import STRATA, VIEW_PX, TruePixels, load_replicate, looks, true_pixels, truth_of, write_capture
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.render.depth import DepthRequest
@@ -45,6 +45,8 @@ REPLICATES = {"spheres": (0, 1, 2, 3), "desk": (0, 1, 2, 3), "blocks-1": (0, 2),
 STEPS, DESK_STEPS, DESK_DOWNSCALE = 400, 800, 4
 KINDS = ("seeds", "photos", "prior", "field")
 MEMBERS = 5
+# All captures are four by three.
+PIXELS_PER_VIEW = VIEW_PX * VIEW_PX * 3 // 4
 CONTROLS = ("coverage", "parallax", "true coverage", "opacity", "gradient", "distance", "random", "another replicate")
 
 # By kind, all numbers of each replicate.
@@ -153,6 +155,7 @@ class Pixels:
         members: (M, P) distances.
         true, error: (P,) distance, and |deployed - true|.
         stratum: (P,) index in `STRATA`.
+        views: (P,) number of the view.
         uncertainty: (P,) by name; larger is less certain.
         abstained: of the pixels where something is, the part without a depth, in each stratum.
     """
@@ -161,6 +164,7 @@ class Pixels:
     true: np.ndarray
     error: np.ndarray
     stratum: np.ndarray
+    views: np.ndarray
     uncertainty: dict[str, np.ndarray]
     abstained: dict[str, float]
 
@@ -178,6 +182,7 @@ class Pixels:
             true=self.true[rows],
             error=self.error[rows],
             stratum=self.stratum[rows],
+            views=self.views[rows],
             uncertainty=uncertainty,
         )
 
@@ -205,12 +210,13 @@ def read_pixels(folder: Path, kind: str, members: int = MEMBERS) -> Pixels:
         "random": rng.random(used.sum()),
     }
     return Pixels(
-        distances,
-        true.distance[used],
-        np.abs(deployed - true.distance)[used],
-        true.stratum[used],
-        uncertainty,
-        abstained,
+        members=distances,
+        true=true.distance[used],
+        error=np.abs(deployed - true.distance)[used],
+        stratum=true.stratum[used],
+        views=np.flatnonzero(used) // PIXELS_PER_VIEW,
+        uncertainty=uncertainty,
+        abstained=abstained,
     )
 
 
@@ -220,6 +226,7 @@ def measures(pixels: Pixels) -> dict[str, float]:
     for name, values in pixels.uncertainty.items():
         found[f"AUSE {name}"] = statistics.ause(pixels.error, values)
         found[f"AURG {name}"] = statistics.aurg(pixels.error, values)
+        found[f"AUSE of views {name}"] = statistics.ause_of_views(pixels.error, values, pixels.views)
     found["AUROC error above 5 %"] = statistics.area_under_roc(
         pixels.spread, pixels.error > statistics.WRONG * pixels.true
     )
@@ -246,12 +253,33 @@ def measures(pixels: Pixels) -> dict[str, float]:
     return found
 
 
+def widened(one: Replicate, pixels: Pixels, replicates: list[Replicate], every: list[Pixels]) -> dict[str, float | str]:
+    """Held parts of 90 % intervals that hold 90 % in stratum D of the other scenes, by one factor for all pixels."""
+    others = [of.only("D") for other, of in zip(replicates, every, strict=True) if other.scene != one.scene]
+    if not others:
+        return {}
+    reaches = [statistics.in_reaches(part.members, part.true, level=0.9) for part in others]
+    factor = float(np.quantile(np.concatenate(reaches), 0.9))
+    parts = {name: pixels.only(name) for name in STRATA}
+    held = {
+        f"held 90 % widened {name}": statistics.held_by_interval(part.members, part.true, level=0.9, widened=factor)
+        for name, part in parts.items()
+        if len(part.true) >= statistics.LEAST_PIXELS
+    }
+    return {"factor": factor, **held}
+
+
+def trained(output: Path, kind: str) -> list[Replicate]:
+    """The replicates whose members of a kind are there."""
+    return [one for one in replicates() if (output / one.name / f"{kind}.npz").exists()]
+
+
 @app.command()
 def judge(output: Out) -> None:
     """Print tables and verdicts of what has been trained so far, and write table.csv, summary.json and figures."""
     table: Numbers = {}
     for kind in KINDS:
-        there = [one for one in replicates() if (output / one.name / f"{kind}.npz").exists()]
+        there = trained(output, kind)
         every = [read_pixels(output / one.name, kind) for one in there]
         spreads = [pixels.spread for pixels in every]
         for index, pixels in enumerate(every):
@@ -265,6 +293,7 @@ def judge(output: Out) -> None:
     write_table(table, output / "table.csv")
     found = summaries(table)
     print_tables(table, found)
+    print_by_members(output)
     draw(table, output / "uncertainty.png")
     content = {kind: {**vars(one), "verdict": statistics.verdict(one)} for kind, one in found.items()}
     (output / "summary.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
@@ -315,6 +344,30 @@ def print_tables(table: Numbers, found: dict[str, statistics.Summary]) -> None:
         means = [np.nanmean(column(rows, f"AUSE {name}") / column(rows, "mean error")) for name in names]
         areas.add_row(kind, *(f"{value:.3f}" for value in means))
     console.print(areas)
+    of_views = Table("AUSE as Bayes' Rays", "scene", *names)
+    for kind, rows in table.items():
+        for scene in REPLICATES:
+            of_scene = [row for row in rows if str(row["replicate"]).startswith(f"{scene}-sector")]
+            if of_scene:
+                means = [np.nanmean(column(of_scene, f"AUSE of views {name}")) for name in names]
+                of_views.add_row(kind, scene, *(f"{value:.3f}" for value in means))
+    console.print(of_views)
+
+
+def print_by_members(output: Path) -> None:
+    """Print what fewer of the same members would have given, means over replicates."""
+    counts = range(2, MEMBERS + 1)
+    shown = Table("first members", *(f"{count}: v U0, AUSE / mean error" for count in counts))
+    for kind in KINDS:
+        cells = []
+        for count in counts:
+            every = [read_pixels(output / one.name, kind, count) for one in trained(output, kind)]
+            unseen = [(part.members, part.true) for part in (pixels.only("U0") for pixels in every) if len(part.true)]
+            v = [statistics.variance_fraction(*pair) for pair in unseen]
+            areas = [statistics.ause(pixels.error, pixels.spread) / pixels.error.mean() for pixels in every]
+            cells.append(f"{np.mean(v):.3f}, {np.mean(areas):.3f}" if every else "")
+        shown.add_row(kind, *cells)
+    Console(width=160).print(shown)
 
 
 def write_table(table: Numbers, path: Path) -> None:

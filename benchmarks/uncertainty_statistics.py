@@ -45,6 +45,23 @@ def aurg(error: np.ndarray, uncertainty: np.ndarray) -> float:
     return float(np.trapezoid(error.mean() - sparsification(error, uncertainty), RATIOS))
 
 
+def ause_of_views(error: np.ndarray, uncertainty: np.ndarray, views: np.ndarray) -> float:
+    """Return AUSE as the code of Bayes' Rays has it: of each view, both curves divided by the larger maximum; the mean.
+
+    Args:
+        error, uncertainty: (P,).
+        views: (P,) number of the view of each pixel; those with fewer than `LEAST_PIXELS` pixels do not count.
+    """
+    found = []
+    for view in np.unique(views):
+        rows = views == view
+        if rows.sum() < LEAST_PIXELS:
+            continue
+        ours, best = sparsification(error[rows], uncertainty[rows]), sparsification(error[rows], error[rows])
+        found.append(np.trapezoid(ours - best, RATIOS) / max(ours.max(), best.max()))
+    return float(np.mean(found)) if found else float("nan")
+
+
 def variance_fraction(members: np.ndarray, true: np.ndarray) -> float:
     """Return v = mean(s^2) / (mean(s^2) + mean((m - z)^2)), which part of the squared error members show.
 
@@ -58,11 +75,16 @@ def variance_fraction(members: np.ndarray, true: np.ndarray) -> float:
     return float(variance / (variance + bias))
 
 
-def held_by_interval(members: np.ndarray, true: np.ndarray, *, level: float) -> float:
-    """Return which part of the truth is in m +- t s sqrt(1 + 1/M), t the quantile of Student's t with M - 1 degrees."""
+def in_reaches(members: np.ndarray, true: np.ndarray, *, level: float) -> np.ndarray:
+    """Return |m - z| / (t s sqrt(1 + 1/M)), t the quantile of Student's t with M - 1 degrees: up to 1 inside."""
     count = len(members)
     reach = stats.t.ppf(0.5 * (1.0 + level), count - 1) * members.std(axis=0, ddof=1) * np.sqrt(1.0 + 1.0 / count)
-    return float((np.abs(members.mean(axis=0) - true) <= reach).mean())
+    return np.abs(members.mean(axis=0) - true) / np.maximum(reach, np.finfo(float).tiny)
+
+
+def held_by_interval(members: np.ndarray, true: np.ndarray, *, level: float, widened: float = 1.0) -> float:
+    """Return which part of the truth is in m +- t s sqrt(1 + 1/M), or in an interval `widened` times as wide."""
+    return float((in_reaches(members, true, level=level) <= widened).mean())
 
 
 def log_likelihood_loss(members: np.ndarray, true: np.ndarray) -> float:

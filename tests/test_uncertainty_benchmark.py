@@ -130,6 +130,26 @@ def test_areas_have_their_closed_forms():
     assert statistics.aurg(error, error) == pytest.approx(random, abs=1e-3)
 
 
+def test_ause_of_views_is_the_mean_over_views_of_normalised_areas():
+    """Two views with errors of different size and the uncertainty in the opposite order have the same area."""
+    error = np.concatenate([np.linspace(0, 1, 5000), 100 * np.linspace(0, 1, 5000)])
+    views = np.repeat([0, 1], 5000)
+    # Of errors from 0 to 1 the smallest part f has the mean f / 2, the largest 1 - f / 2.
+    left = 1 - statistics.RATIOS
+    expected = np.trapezoid((1 - left / 2) - left / 2, statistics.RATIOS) / (1 - left.min() / 2)
+    assert statistics.ause_of_views(error, -error, views) == pytest.approx(expected, rel=1e-3)
+    assert statistics.ause_of_views(error, error, views) == 0.0
+    assert math.isnan(statistics.ause_of_views(error[:9], error[:9], views[:9]))
+
+
+def test_intervals_widened_by_their_quantile_hold_their_level():
+    rng = np.random.default_rng(0)
+    members, true = rng.normal(size=(5, 5000)), 3 * rng.normal(size=5000)
+    factor = np.quantile(statistics.in_reaches(members, true, level=0.9), 0.9)
+    assert statistics.held_by_interval(members, true, level=0.9) < 0.7
+    assert statistics.held_by_interval(members, true, level=0.9, widened=factor) == pytest.approx(0.9, abs=1e-3)
+
+
 @pytest.mark.parametrize("members", [2, 5, 8])
 def test_members_of_the_distribution_of_the_truth_hold_it_as_stated(members):
     """The positive control: truth and members are draws of one Gaussian, for each pixel another one."""
