@@ -19,7 +19,7 @@ from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.views import refuse_frames, write_frames
 
 # Longer side of the candidates' depth maps in pixels, and voxels along the longest side of the box.
-_CANDIDATE_PX, _CELLS = 96, 128
+CANDIDATE_PX, CELLS = 96, 128
 # Coverage from which each part of the surface begins.
 STRATA = {"none": 0, "one": 1, "two or three": 2, "four or more": 4}
 
@@ -90,10 +90,10 @@ def examine_run(
     photos = photo_depths(trained, model, on_progress=lambda share: progress(0.4 * share, "photos"), notify=notify)
     box = scene_box(model, frames)
     low, high = np.array(box[:3]), np.array(box[3:])
-    grid = Grid.over(box, float((high - low).max()) / _CELLS)
+    grid = Grid.over(box, float((high - low).max()) / CELLS)
     candidates = candidate_frames(frames, depth_hint=1.0 / model.training_from_scene.scale)
     rendered = depth_maps(
-        model, candidates, max_size=_CANDIDATE_PX, on_progress=lambda share: progress(0.4 + 0.5 * share, "candidates")
+        model, candidates, max_size=CANDIDATE_PX, on_progress=lambda share: progress(0.4 + 0.5 * share, "candidates")
     )
     views = in_free_space(rendered, photos)
     points = surface_points([*photos, *views], grid)
