@@ -67,11 +67,10 @@ class Replicate:
     def name(self) -> str:
         return f"{self.scene}-sector-{self.sector}"
 
-    @property
-    def settings(self) -> TrainSettings:
-        """Of every training: the default components, one thread, steps instead of time."""
+    def settings(self, longer: int) -> TrainSettings:
+        """Of every training: the default components, one thread, `longer` times the usual number of steps."""
         steps, downscale = (DESK_STEPS, DESK_DOWNSCALE) if self.scene == "desk" else (STEPS, 1)
-        return TrainSettings(budget_seconds=None, steps=steps, downscale=downscale, threads=1)
+        return TrainSettings(budget_seconds=None, steps=longer * steps, downscale=downscale, threads=1)
 
 
 def replicates() -> list[Replicate]:
@@ -81,16 +80,21 @@ def replicates() -> list[Replicate]:
 
 
 @app.command()
-def train(output: Out, kinds: str = ",".join(KINDS), scenes: str = ",".join(REPLICATES)) -> None:
+def train(
+    output: Out,
+    kinds: str = ",".join(KINDS),
+    scenes: str = ",".join(REPLICATES),
+    longer: Annotated[int, typer.Option(help="Times the usual number of steps; give another folder, too.")] = 1,
+) -> None:
     """Train what is missing, kind by kind, and keep the distances that the fields show."""
     torch.set_num_threads(1)
     for kind in ("deployed", *kinds.split(",")):
         for one in replicates():
             if one.scene in scenes.split(","):
-                train_kind(one, kind, output)
+                train_kind(one, kind, output, longer=longer)
 
 
-def train_kind(one: Replicate, kind: str, output: Path) -> None:
+def train_kind(one: Replicate, kind: str, output: Path, *, longer: int) -> None:
     """Train the members of a kind for a replicate; fields are deleted when their distances are kept."""
     folder, capture = output / one.name, output / "captures" / one.scene
     kept = folder / f"{kind}.npz"
@@ -103,7 +107,8 @@ def train_kind(one: Replicate, kind: str, output: Path) -> None:
     if kind == "deployed":
         true = true_pixels(truth_of(one.scene), views, scene.train_frames)
         np.savez_compressed(folder / "truth.npz", allow_pickle=False, **vars(true))
-    wanted = [one.settings] if kind == "deployed" else member_settings(one.settings, MEMBERS, vary=kind)
+    first = one.settings(longer)
+    wanted = [first] if kind == "deployed" else member_settings(first, MEMBERS, vary=kind)
     columns, began = [], time.process_time()
     for number, settings in enumerate(wanted, start=1):
         path = folder / kind / str(number)
@@ -286,7 +291,8 @@ def judge(output: Out) -> None:
             pixels.uncertainty["another replicate"] = statistics.permuted(spreads, index)
         if every:
             table[kind] = [
-                {"replicate": one.name, **measures(pixels)} for one, pixels in zip(there, every, strict=True)
+                {"replicate": one.name, **measures(pixels), **widened(one, pixels, there, every)}
+                for one, pixels in zip(there, every, strict=True)
             ]
     if not table:
         raise typer.BadParameter(f"there is nothing in {output}: run train first")

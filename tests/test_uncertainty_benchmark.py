@@ -260,3 +260,11 @@ def test_least_squares_keep_the_start_where_the_matrix_sees_nothing():
     start, data = np.array([5.0, 6.0, 7.0]), np.array([2.0, 3.0, 5.0])
     matrix = np.array([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0], [2.0, 1.0, 0.0]])
     np.testing.assert_allclose(start + inverse.back @ (data - matrix @ start), [1, 3, 7])
+
+
+def test_a_point_is_seen_up_to_two_millimetres_behind_the_surface():
+    truth, camera = Solids((Box((-1.0, 0.0, 0.0), (1.0, 3.0, 3.0), (0.5, 0.5, 0.5), 1.0),)), camera_at(0.0)
+    depths = np.array([-0.003, -0.001, 0.0, 0.001, 0.0019, 0.0021, 0.003])
+    points = np.stack([-depths, 0 * depths, 0 * depths], axis=1)
+    seen = sees(truth, camera, points, np.tile([1.0, 0, 0], (len(depths), 1)))
+    np.testing.assert_array_equal(seen, np.abs(depths) < 0.002)
