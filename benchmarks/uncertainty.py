@@ -310,19 +310,25 @@ def column(rows: list[dict[str, float | str]], name: str) -> np.ndarray:
     return np.array([row.get(name, np.nan) for row in rows], dtype=float)
 
 
+def mean_of(values: np.ndarray) -> float:
+    """The mean of what is not NaN; NaN where nothing is."""
+    there = values[np.isfinite(values)]
+    return float(there.mean()) if len(there) else float("nan")
+
+
 def summaries(table: Numbers) -> dict[str, statistics.Summary]:
     """What decides over each kind."""
     differences = {kind: column(rows, "AUSE spread") - column(rows, "AUSE coverage") for kind, rows in table.items()}
     adjusted = statistics.holm({kind: statistics.sign_flip(values) for kind, values in differences.items()})
     return {
         kind: statistics.Summary(
-            held=float(np.nanmean(column(rows, "held 90 % U0"))),
-            v_unseen=float(np.nanmean(column(rows, "v U0"))),
-            v_seen=float(np.nanmean(column(rows, "v D"))),
+            held=mean_of(column(rows, "held 90 % U0")),
+            v_unseen=mean_of(column(rows, "v U0")),
+            v_seen=mean_of(column(rows, "v D")),
             correlation=statistics.mean_with_interval(column(rows, "Spearman spread U0")),
-            marks=float(np.nanmean(column(rows, "AUROC U0 against D, spread"))),
+            marks=mean_of(column(rows, "AUROC U0 against D, spread")),
             p_of_ause=adjusted[kind],
-            ause_difference=float(np.nanmean(differences[kind])),
+            ause_difference=mean_of(differences[kind]),
         )
         for kind, rows in table.items()
     }
@@ -337,7 +343,7 @@ def print_tables(table: Numbers, found: dict[str, statistics.Summary]) -> None:
     )
     for kind, one in found.items():
         mean, low, high = one.correlation
-        held = np.nanmean(column(table[kind], "held 90 % D"))
+        held = mean_of(column(table[kind], "held 90 % D"))
         shown.add_row(
             kind, str(len(table[kind])), f"{one.v_unseen:.3f}", f"{one.v_seen:.3f}", f"{one.held:.0%}", f"{held:.0%}",
             f"{mean:.2f} ({low:.2f} to {high:.2f})", f"{one.marks:.2f}", f"{one.ause_difference:+.4f}",
@@ -347,7 +353,7 @@ def print_tables(table: Numbers, found: dict[str, statistics.Summary]) -> None:
     names = ("spread", *CONTROLS)
     areas = Table("AUSE / mean error", *names)
     for kind, rows in table.items():
-        means = [np.nanmean(column(rows, f"AUSE {name}") / column(rows, "mean error")) for name in names]
+        means = [mean_of(column(rows, f"AUSE {name}") / column(rows, "mean error")) for name in names]
         areas.add_row(kind, *(f"{value:.3f}" for value in means))
     console.print(areas)
     of_views = Table("AUSE as Bayes' Rays", "scene", *names)
@@ -355,7 +361,7 @@ def print_tables(table: Numbers, found: dict[str, statistics.Summary]) -> None:
         for scene in REPLICATES:
             of_scene = [row for row in rows if str(row["replicate"]).startswith(f"{scene}-sector")]
             if of_scene:
-                means = [np.nanmean(column(of_scene, f"AUSE of views {name}")) for name in names]
+                means = [mean_of(column(of_scene, f"AUSE of views {name}")) for name in names]
                 of_views.add_row(kind, scene, *(f"{value:.3f}" for value in means))
     console.print(of_views)
 
@@ -396,7 +402,7 @@ def draw(table: Numbers, path: Path) -> None:
                 values = column(rows, pattern.format(stratum))
                 at = place + 0.18 * (number - 0.5 * (len(table) - 1))
                 axis.plot(np.full(len(values), at), values, ".", color=f"C{number}", alpha=0.5)
-                axis.plot(at, np.nanmean(values), "_", ms=14, color=f"C{number}", label=kind if place == 0 else None)
+                axis.plot(at, mean_of(values), "_", ms=14, color=f"C{number}", label=kind if place == 0 else None)
         axis.set(title=title, xticks=range(len(STRATA)), xticklabels=STRATA)
         axis.grid(axis="y", alpha=0.3)
     axes[1].axhline(0.9, color="black", lw=0.8, ls=":")

@@ -1,10 +1,14 @@
 """benchmarks/uncertainty.py: who sees what on spheres by closed form, its statistics against closed forms and loops."""
 
+import csv
 import itertools
+import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+import uncertainty
 import uncertainty_statistics as statistics
 import uncertainty_tomography as tomography
 from make_spheres import Ball, Box
@@ -124,9 +128,9 @@ def test_areas_have_their_closed_forms():
     assert statistics.ause(error, np.exp(error)) == 0
     # Of errors x^2 the mean of the smallest fraction f is f^2 / 3; up to 99 % removed, random order keeps 1 / 3.
     random = np.trapezoid(1 / 3 - (1 - statistics.RATIOS) ** 2 / 3, statistics.RATIOS)
-    for uncertainty in (rng.random(len(error)), np.zeros(len(error))):
-        assert statistics.ause(error, uncertainty) == pytest.approx(random, abs=0.01)
-        assert statistics.aurg(error, uncertainty) == pytest.approx(0.0, abs=0.01)
+    for values in (rng.random(len(error)), np.zeros(len(error))):
+        assert statistics.ause(error, values) == pytest.approx(random, abs=0.01)
+        assert statistics.aurg(error, values) == pytest.approx(0.0, abs=0.01)
     assert statistics.aurg(error, error) == pytest.approx(random, abs=1e-3)
 
 
@@ -268,3 +272,47 @@ def test_a_point_is_seen_up_to_two_millimetres_behind_the_surface():
     points = np.stack([-depths, 0 * depths, 0 * depths], axis=1)
     seen = sees(truth, camera, points, np.tile([1.0, 0, 0], (len(depths), 1)))
     np.testing.assert_array_equal(seen, np.abs(depths) < 0.002)
+
+
+def write_replicate(folder: Path, *, seed: int, bias: float) -> None:
+    """Files as `train` leaves them, of four views: members and truth are draws of one Gaussian, and `bias` apart.
+
+    Pixels of U0, where the Gaussian is ten times as wide, are as many as those of D; a fifth has no surface.
+    """
+    rng, pixels = np.random.default_rng(seed), 4 * uncertainty.PIXELS_PER_VIEW
+    unseen = rng.random(pixels) < 0.5
+    deviation = np.where(unseen, 0.1, 0.01) * 4.0 ** rng.uniform(-1.0, 1.0, pixels)
+    middle = 5.0 + rng.random(pixels)
+    true = middle + deviation * rng.normal(size=pixels)
+    true[rng.random(pixels) < 0.2] = np.inf
+    fields = middle + bias + deviation * rng.normal(size=(1 + uncertainty.MEMBERS, pixels))
+    folder.mkdir(parents=True)
+    photos = np.where(unseen, 0, 5)
+    np.savez(folder / "truth.npz", distance=true, photos=photos, parallax_deg=np.where(unseen, 0.0, 40.0))
+    maps = {name: rng.random(pixels) for name in ("coverage", "parallax", "gradient", "opacity")}
+    np.savez(folder / "maps.npz", allow_pickle=False, **maps)
+    np.savez(folder / "deployed.npz", distances=fields[:1])
+    np.savez(folder / "seeds.npz", distances=fields[1:])
+
+
+@pytest.mark.parametrize(("bias", "verdict"), [(0.0, "YES"), (1.0, "LABEL ONLY")])
+def test_ensembles_of_known_quality_get_their_verdicts(tmp_path, bias, verdict):
+    """The positive control through all files: YES for draws of the truth's Gaussian, not with a common error."""
+    for seed, one in enumerate(uncertainty.replicates()):
+        write_replicate(tmp_path / one.name, seed=seed, bias=bias)
+    uncertainty.judge(tmp_path)
+    found = json.loads((tmp_path / "summary.json").read_text())["seeds"]
+    assert found["verdict"] == verdict
+    with (tmp_path / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["replicate"] for row in rows] == [one.name for one in uncertainty.replicates()]
+    assert len(rows) == 12
+    if not bias:
+        assert found["held"] == pytest.approx(0.9, abs=0.01)
+        assert found["v_unseen"] == pytest.approx(5 / 11, abs=0.03)
+        assert found["p_of_ause"] == pytest.approx(2.0**-12)
+    # Nothing is known of the scenes, and another replicate knows no more.
+    for row in rows:
+        for name in ("random", "coverage", "another replicate"):
+            assert abs(float(row[f"AURG {name}"])) < 0.1 * float(row["mean error"])
+    assert (tmp_path / "uncertainty.png").stat().st_size > 10_000
