@@ -119,6 +119,24 @@ def test_trials_have_the_small_tables_of_short_trainings(trials, monkeypatch):
         assert fitting.field.settings.to_json()["log2_rows"] == used
 
 
+@pytest.mark.parametrize(
+    ("rows_of_large", "cameras", "learning"),
+    [(16, "fixed", [4, 6, 8]), (17, "fixed", [4, 4, 4]), (16, "poses", [3, 3, 3])],
+)
+def test_large_tables_have_their_levels_by_steps(trials, monkeypatch, rows_of_large, cameras, learning):
+    """At the start of a budget, however long, half of 4 steps open all 8 levels of tables that count as large, whose
+    rows then move; but cameras find their places in a coarse field."""
+    monkeypatch.setattr("nerfcli.field.hash_field.DETAILED_LOG2_ROWS", rows_of_large)
+    monkeypatch.setattr("nerfcli.fit.fitting.LARGE_TABLE_STEPS", 4)
+    fitting = trials._fitting(Components(view=0, cameras=cameras), seed=0, log_gains=None, cameras_from=0.0)
+    fresh = fitting.field.rows().detach().clone()
+    moved = []
+    for _ in learning:
+        fitting.advance(0.0)
+        moved.append(int((fitting.field.rows() != fresh).any(2).any(1).sum()))
+    assert moved == learning
+
+
 def test_cameras_learn_from_the_fork_on(trials, start):
     """Before it no step moves them, however far the training; behind it one does."""
     fitting = trials._fitting(Components(view=0, cameras="poses"), seed=0, log_gains=None, cameras_from=0.6)

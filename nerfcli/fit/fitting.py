@@ -41,6 +41,8 @@ WARMUP_SHARE, CLOSING_SHARE = 0.1, 0.3
 # Short trainings do not come to details, and learn more from more rays: their shares are those of so many steps.
 STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
 DETAILED_STEPS = 2500
+# Large tables, those of long trainings, have after so many steps all the detail that others have at the end.
+LARGE_TABLE_STEPS = 400
 
 
 @dataclass(frozen=True)
@@ -261,7 +263,11 @@ class Fitting:
     @property
     def _detail(self) -> float:
         """The share of the budget whose details the field has: late cameras meet a field that has its detail."""
-        return self.furthest if self._cameras_from > 0.0 else self.parts.share_of_detail(self.furthest)
+        if self._cameras_from > 0.0:
+            return self.furthest
+        if self.parts.cameras is None and self.field.settings.detailed:
+            return min(1.0, max(self.furthest, self.step / LARGE_TABLE_STEPS))
+        return self.parts.share_of_detail(self.furthest)
 
     def _march(self, edges: Tensor) -> March:
         return March(edges, self.occupied, self.field.settings.contraction, DEEPEST)
