@@ -16,7 +16,7 @@ FOLDERS = sorted(path.parent for path in ROOT.glob("*/__init__.py"))
 
 # A part is a folder of nerfcli, a room of `poses`, or a module beside the folders.
 # What stands on the right may be imported by the left.
-LEAVES = {"errors", "atomic", "sealed", "exclusive", "memory", "interrupts", "finite", "child", "__init__"}
+LEAVES = {"errors", "atomic", "sealed", "exclusive", "memory", "interrupts", "finite", "child", "torchrun", "__init__"}
 MAY_IMPORT = {
     "errors": set(),
     "atomic": set(),
@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "memory": set(),
     "interrupts": set(),
     "child": set(),
+    "torchrun": set(),
     "__init__": set(),
     "cameras": set(),
     "media": set(),

@@ -16,7 +16,7 @@ from nerfcli.cameras.frame import Capture, Frame, Observations
 from nerfcli.cameras.rigid import Similarity
 from nerfcli.errors import UserError
 from nerfcli.fit.losses import opacity_entropy
-from nerfcli.fit.point_depth import LAST_SHARE, PointRays, fading, point_depth_loss, point_depths
+from nerfcli.fit.point_depth import LAST_SHARE, PointRays, fading, point_depths
 from nerfcli.kernels import reference
 from nerfcli.multiview.camera_check import CameraCheck
 from nerfcli.multiview.correspondences import Shared
@@ -139,8 +139,6 @@ def test_light_off_its_target_counts_by_how_far_it_is():
     expected = [0.3 * 0.5 + 0.2, 0.7 + 0.3]
     off = reference.off_target(weights, left, middles, offsets=offsets, distances=distances)
     assert off.tolist() == pytest.approx(expected)
-    trusted = point_depth_loss(off, torch.tensor([1.0, 0.5]))
-    assert trusted.item() == pytest.approx((1.0 * expected[0] + 0.5 * expected[1]) / 2)
     at_targets = reference.off_target(
         torch.tensor([0.0, 1.0, 0.0, 1.0]), torch.zeros(3), torch.tensor([5.0, 2.0, 3.0, 1.0]),
         offsets=offsets, distances=distances,
@@ -183,9 +181,9 @@ def test_undecided_rays_have_the_largest_entropy_and_decided_ones_no_infinite_sl
     share = torch.tensor([0.3, 0.9, 0.02], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(opacity_entropy, (share,))
     extremes = torch.tensor([0.0, 1.0], requires_grad=True)
-    value = opacity_entropy(extremes)
-    value.backward()
-    assert value.item() < 2e-3
+    values = opacity_entropy(extremes)
+    values.sum().backward()
+    assert values.max().item() < 2e-3
     assert extremes.grad is not None
     assert extremes.grad.isfinite().all()
 

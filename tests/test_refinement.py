@@ -410,7 +410,9 @@ def test_a_step_of_all_hands_each_part_what_it_needs(small, monkeypatch):
     monkeypatch.setattr(lenses, "step", lambda gradient, rate: given.update(lens_rate=rate))
     monkeypatch.setattr(refinement.poses, "gradients", lambda *rays, **slopes: slopes["by_origin"].repeat(1, 2))
     monkeypatch.setattr(
-        refinement.poses, "step", lambda slopes, losses, photos, share, *, rate: given.update(slopes=slopes, rate=rate)
+        refinement.poses,
+        "step",
+        lambda slopes, losses, photos, share, *, rate, ranks: given.update(slopes=slopes, rate=rate),
     )
     numbers = torch.arange(50)
     drawn = refinement.refined(pool.rays_of(numbers))

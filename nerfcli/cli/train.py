@@ -172,6 +172,7 @@ def train(
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
+    from nerfcli.torchrun import is_first, is_one_of_several, place_on_machine
     from nerfcli.workflows.members import VARIED, train_members
     from nerfcli.workflows.train import train_scene
     from nerfcli.workflows.train_plan import plan_training
@@ -184,7 +185,9 @@ def train(
         raise typer.BadParameter(
             f"it cannot be combined with {option}, which is about one field", param_hint="--members"
         )
-    console = Console(quiet=quiet, json_lines=json)
+    if is_one_of_several() and (dry_run or members is not None or scene == STDIN or is_scan(Path(scene))):
+        raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
+    console = Console(quiet=quiet or not is_first(), json_lines=json)
     budget_seconds = None if budget is None else seconds_from_text(budget)
     rule = holdout_rule(holdout)
     limit = None if memory is None else bytes_from_text(memory)
@@ -240,13 +243,18 @@ def train(
             field_memory_bytes=None if field_memory is None else bytes_from_text(field_memory, "--field-memory"),
         )
 
+    def memory_of_process() -> int | None:
+        shared = limit or default_memory_limit(photo_settings().device)
+        on_gpu = photo_settings().device != "cpu"
+        return shared if shared is None or on_gpu else shared // place_on_machine()[1]
+
     def train_one_scene(folder: Path, run: Path) -> None:
         with console.progress(f"train {folder.name}") as update:
             trained = train_scene(
                 folder,
                 run,
                 photo_settings(),
-                memory_bytes=limit or default_memory_limit(photo_settings().device),
+                memory_bytes=memory_of_process(),
                 resume=resume,
                 overwrite=overwrite,
                 holdout=rule,
@@ -296,7 +304,8 @@ def train(
             return
         else:
             train_one_scene(folder, run)
-        console.result(run)
+        if is_first():
+            console.result(run)
 
     if scene == STDIN or not is_scan(Path(scene)):
         photo_settings()  # a wrong option is refused before anything is read

@@ -9,6 +9,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.exposure import Exposure
 from nerfcli.fit.losses import over_background
+from nerfcli.fit.ranks import Alone
 from nerfcli.fit.refinement import Refinement, rate_at
 from nerfcli.photos.pool import Drawn, Pool
 from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
@@ -104,7 +105,7 @@ class Appearance(nn.Module):
             origins=refined.origins.clone().requires_grad_(), directions=refined.directions.clone().requires_grad_()
         )
 
-    def step_cameras(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float) -> None:
+    def step_cameras(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float, ranks: Alone) -> None:
         """One step of the cameras against the gradients of rays of `with_learning_rays`.
 
         Args:
@@ -112,9 +113,10 @@ class Appearance(nn.Module):
             losses: (R,) of each of them.
             fraction: of the budget.
             factor: of the rate.
+            ranks: each has rays of its own.
         """
         if self.cameras is not None:
-            self.cameras.step(drawn, losses, fraction, factor=factor)
+            self.cameras.step(drawn, losses, fraction, factor=factor, ranks=ranks)
 
     def forget_gradients(self) -> None:
         """Drop those that a GPU has sent for the next step of the cameras."""

@@ -16,7 +16,8 @@ from nerfcli.fit.delayed import Delayed
 from nerfcli.fit.error_map import BEGINS, ErrorMap
 from nerfcli.fit.losses import colour_losses, opacity_entropy
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
-from nerfcli.fit.point_depth import PointRays, fading, point_depth_loss
+from nerfcli.fit.point_depth import PointRays, fading
+from nerfcli.fit.ranks import ALONE, Alone
 from nerfcli.fit.watch import UNWATCHED, NonFiniteError, Watch
 from nerfcli.kernels import March, Rays, Targets
 from nerfcli.photos.pool import Drawn, Pool
@@ -70,6 +71,7 @@ class Fitting:
         covered: the cells that may be filled, see `coverage.covered_cells`; None for all.
         sky: (pixels,) bool, those of the pool that show a sky that is learned; None where none are known.
         size: of the field; else `sizes.chosen_size` gives one for the settings and the pool.
+        ranks: which train this field together, each in such a state.
     """
 
     def __init__(
@@ -87,12 +89,14 @@ class Fitting:
         covered: Tensor | None = None,
         sky: Tensor | None = None,
         size: FieldSettings | None = None,
+        ranks: Alone = ALONE,
     ):
         device = pool.colours.device
         torch.manual_seed(settings.seed)
         self.pool = pool
         self.marching = marching
         self.settings = settings
+        self.ranks = ranks
         self.step = 0
         # The largest share of a budget so far: a training that goes on to a larger one has used less of that.
         self.furthest = 0.0
@@ -150,20 +154,22 @@ class Fitting:
         watch.state(self.state)
         self.furthest = max(self.furthest, share)
         of_cameras = max(0.0, share - self._cameras_from) / (1.0 - self._cameras_from)
-        drawn = self.parts.with_learning_rays(self.draw(share), of_cameras)
-        rays = len(drawn.origins)
+        ranks, whole = self.ranks, self.draw(share)
+        drawn = self.parts.with_learning_rays(whole.every(ranks.rank, ranks.count), of_cameras)
+        rays = len(whole.origins)
         edges = self.edges[:: self._stride(share)].contiguous()
-        loss, losses, samples = self._loss(drawn, edges=edges, fraction=share, watch=watch)
+        loss, losses, samples = self._loss(drawn, whole=whole, edges=edges, fraction=share, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
         if samples > 0:
             loss.backward()
+        samples = self._add_up_gradients(drawn, samples)
         value = self._finite_loss(loss, drawn, watch)
         rate = self.learning_rate(share)
         self.step += 1
         self.optimiser.step(self.step, rate)
         self.parts_optimiser.step(rate)
-        self.parts.step_cameras(drawn, losses, of_cameras, factor=self.rate_factor)
+        self.parts.step_cameras(drawn, losses, of_cameras, factor=self.rate_factor, ranks=ranks)
         self.samples_per_ray += 0.2 * (samples / rays - self.samples_per_ray)
         watch.state(self.state)
         self.in_step = False
@@ -199,11 +205,15 @@ class Fitting:
         warmup = min(1.0, max((self.step + 1) / settings.warmup_steps, fraction / WARMUP_SHARE))
         return self.rate_factor * warmup * rate
 
-    def _loss(self, drawn: Drawn, *, edges: Tensor, fraction: float, watch: Watch) -> tuple[Tensor, Tensor, int]:
-        """Loss over some rays, that of the colour of each, and the number of samples it took."""
-        count, components, device = len(drawn.origins), self.components, drawn.origins.device
-        jitter = torch.rand(count, generator=self.generator, device=device)
-        background = self.parts.behind(count, self.generator)
+    def _loss(
+        self, drawn: Drawn, *, whole: Drawn, edges: Tensor, fraction: float, watch: Watch
+    ) -> tuple[Tensor, Tensor, int]:
+        """The part of the loss that some rays of the whole step have, the loss of the colour of each, and the number of
+        samples it took.
+        """
+        count, components, device = len(whole.origins), self.components, drawn.origins.device
+        jitter = torch.rand(count, generator=self.generator, device=device)[self.ranks.own].contiguous()
+        background = self.parts.behind(count, self.generator)[self.ranks.own].contiguous()
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
             self._march(edges),
@@ -215,18 +225,19 @@ class Fitting:
         )
         losses = colour_losses(*self.parts.compared(seen.rgb, seen.transmittance, drawn, behind=background))
         if self.error_map is not None:
-            self.error_map.learn(drawn.numbers, losses.detach())
-        loss = (losses * drawn.weights if len(drawn.weights) else losses).mean()
+            self.error_map.learn(whole.numbers, self.ranks.joined(losses.detach(), count))
+        loss = (losses * drawn.weights if len(drawn.weights) else losses).sum() / count
         if components.distortion:
-            loss = loss + components.distortion * (seen.distortion.sum() / max(1, count))
+            loss = loss + components.distortion * (seen.distortion.sum() / count)
         if components.entropy:
-            loss = loss + components.entropy * opacity_entropy(seen.transmittance)
-        if len(drawn.distances):
-            loss = loss + components.points * fading(fraction) * point_depth_loss(seen.off_target, drawn.trust)
+            loss = loss + components.entropy * (opacity_entropy(seen.transmittance).sum() / count)
+        if len(whole.distances):
+            off_target = (drawn.trust * seen.off_target).sum() / len(whole.distances)
+            loss = loss + components.points * fading(fraction) * off_target
         if self.parts.sky is not None:
             opacity = (1.0 - seen.transmittance) * self.parts.sky[drawn.numbers]
-            loss = loss + SKY_WEIGHT * opacity.sum() / max(1, count)
-        watch.rows("rendered colour", seen.rgb, torch.arange(count, device=device))
+            loss = loss + SKY_WEIGHT * opacity.sum() / count
+        watch.rows("rendered colour", seen.rgb, torch.arange(len(drawn.origins), device=device))
         watch.values("loss", loss)
         return loss, losses.detach(), int(seen.samples)
 
@@ -298,6 +309,16 @@ class Fitting:
         occupied = self.occupancy.above(threshold)
         return occupied if self.covered is None else occupied & self.covered
 
+    def _add_up_gradients(self, drawn: Drawn, samples: int) -> int:
+        """Add up the gradients and the samples of all ranks, and return the number of samples."""
+        if self.ranks.count == 1:
+            return samples
+        samples = self.ranks.total(samples)
+        if samples > 0:
+            learned = [*self.optimiser.weights(), *(p for p in self.parts.parameters() if p.requires_grad)]
+            self.ranks.add_up_gradients(learned, rays=(drawn.origins, drawn.directions), sink=self.optimiser.sink)
+        return samples
+
     def settle(self) -> None:
         """Read the loss of the last step if a GPU still had to compute it.
 
@@ -323,7 +344,9 @@ class Fitting:
             total = total + gradient.sum()  # which is non-finite if any term is
         if self.optimiser.sink is not None:
             watch.values("gradient of rows", self.optimiser.sink)
-        self._take_loss(self._losses.exchange(torch.stack([loss.detach(), total])))
+        numbers = torch.stack([loss.detach(), total])
+        self.ranks.add_up(numbers)
+        self._take_loss(self._losses.exchange(numbers))
         if self.loss is None or watch is not UNWATCHED:
             self.settle()
         assert self.loss is not None

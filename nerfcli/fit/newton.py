@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor, nn
 
+from nerfcli.fit.ranks import ALONE, Alone
+
 # Of what rays say of curvature, what is left a step later: a photo has few rays in one step.
 MEMORY = 0.95
 # A loss of less than this, as of a level of 255, says nothing of a slope.
@@ -31,18 +33,22 @@ class NewtonSteps(nn.Module):
         self.register_buffer("curvature", torch.zeros(count, 6, 6, dtype=torch.float64))
         self.register_buffer("weight", torch.zeros((), dtype=torch.float64))
 
-    def learn(self, gradients: Tensor, losses: Tensor, photos: Tensor) -> Tensor:
+    def learn(self, gradients: Tensor, losses: Tensor, photos: Tensor, ranks: Alone = ALONE) -> Tensor:
         """Take in what some rays say; gives the sum (P, 6) of their gradients.
 
         Args:
             gradients: (R, 6) of each ray's own loss.
             losses: (R,).
             photos: (R,) whose rays they are.
+            ranks: each has rays of its own.
         """
         of_ray = gradients[:, :, None] * gradients[:, None, :] / (2.0 * losses + _LEAST_LOSS)[:, None, None]
-        self.curvature.lerp_(torch.zeros_like(self.curvature).index_add_(0, photos, of_ray), 1.0 - MEMORY)
+        curvature = torch.zeros_like(self.curvature).index_add_(0, photos, of_ray)
+        slope = torch.zeros_like(self._picture_px).index_add_(0, photos, gradients)
+        ranks.add_up(curvature, slope)
+        self.curvature.lerp_(curvature, 1.0 - MEMORY)
         self.weight.lerp_(torch.ones_like(self.weight), 1.0 - MEMORY)
-        return torch.zeros_like(self._picture_px).index_add_(0, photos, gradients)
+        return slope
 
     def change(self, slope: Tensor, so_far: Tensor, *, damping: float, holding: float) -> Tensor:
         """(P, 6) what to add to the numbers for the least loss, were it quadratic and the field as it is.

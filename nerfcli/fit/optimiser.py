@@ -30,6 +30,10 @@ class FieldOptimiser:
         """Forget the gradients of the weights; those of the rows went with the step that used them."""
         self._adam.zero_grad()
 
+    def weights(self) -> list[Tensor]:
+        """Return all parameters but the rows."""
+        return list(self._weights.values())
+
     def gradients(self) -> dict[str, Tensor]:
         """By name, those through which everything comes that could be non-finite: the rows' only without weights."""
         if not self._weights and self.sink is not None:

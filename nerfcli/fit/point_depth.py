@@ -139,16 +139,3 @@ def fading(fraction: float) -> float:
     between.
     """
     return max(0.0, 1.0 - fraction / LAST_SHARE)
-
-
-def point_depth_loss(off_target: Tensor, trust: Tensor) -> Tensor:
-    """Mean over the rays of points of how far from them light ends, each as far as it is trusted.
-
-    Args:
-        off_target: (K,) see `reference.off_target`.
-        trust: (K,) in (0, 1].
-
-    Returns:
-        Scalar in [0, 1]. Differentiable in `off_target`.
-    """
-    return (trust * off_target).mean()

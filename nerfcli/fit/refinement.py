@@ -18,6 +18,7 @@ from nerfcli.cameras.rigid import from_parts, transform_from_twist, vector_from_
 from nerfcli.fit.delayed import Delayed, on_device_of
 from nerfcli.fit.gauge import relative_motions, without_mean
 from nerfcli.fit.newton import NewtonSteps
+from nerfcli.fit.ranks import ALONE, Alone
 from nerfcli.fit.whitening import WhitenedAdam, whitening
 from nerfcli.photos.pool import Drawn, Pool
 
@@ -105,7 +106,9 @@ class PoseRefinement(nn.Module):
         cam_from_world = torch.from_numpy(self.poses()[:, :3, :3]).transpose(-1, -2)[photos]
         return (cam_from_world @ torch.stack([by_origin, torque], dim=-1)).transpose(-1, -2).flatten(-2)
 
-    def step(self, gradients: Tensor, losses: Tensor, photos: Tensor, fraction: float, *, rate: float) -> None:
+    def step(
+        self, gradients: Tensor, losses: Tensor, photos: Tensor, fraction: float, *, rate: float, ranks: Alone = ALONE
+    ) -> None:
         """A step against gradients (R, 6) of losses (R,) of rays; afterwards the mean similarity of all moves is taken
         out.
 
@@ -114,11 +117,12 @@ class PoseRefinement(nn.Module):
             photos: (R,) whose rays they are.
             fraction: of the budget.
             rate: in [0, 1], of the step that would be the whole way.
+            ranks: each has rays of its own.
         """
         so_far = self.motions.numpy()
         so_far = np.concatenate([so_far[:, :3, 3], vector_from_rotation(so_far[:, :3, :3])], axis=1)
         twists = rate * self.newton.change(
-            self.newton.learn(gradients, losses, photos),
+            self.newton.learn(gradients, losses, photos, ranks),
             torch.from_numpy(so_far),
             damping=_between(fraction, DAMPING_SHARES, DAMPINGS),
             holding=_between(fraction, HOLDING_SHARES, HOLDINGS) if fraction > HOLDING_SHARES[0] else 0.0,
@@ -247,15 +251,16 @@ class Refinement(nn.Module):
         return drawn._replace(origins=origins, directions=directions)
 
     @torch.no_grad()
-    def step(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float) -> None:
-        """One step against the gradients of the mean loss of `drawn`, which `refined` gave; on a GPU, against those of
-        the step before.
+    def step(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float, ranks: Alone = ALONE) -> None:
+        """One step against the gradients of the mean loss of the rays of all ranks, of which `drawn`, which `refined`
+        gave, are those of this one; on a GPU, against those of the step before.
 
         Args:
             drawn: rays that have gradients.
             losses: (R,) of each.
             fraction: of the budget, for `rate_at`.
             factor: of the rate.
+            ranks: each has rays of its own.
         """
         by_origin, by_direction, rate = drawn.origins.grad, drawn.directions.grad, factor * rate_at(fraction)
         if rate == 0.0 or by_origin is None or by_direction is None:
@@ -272,9 +277,11 @@ class Refinement(nn.Module):
         by_lens = None
         if self.lenses is not None:
             by_lens = self.lenses.gradient(numbers, photos, turns=turns, by_direction=by_direction)
+            ranks.add_up(by_lens)
         if self.poses is not None:
             by_pose = self.poses.gradients(directions, photos, by_origin=by_origin, by_direction=by_direction)
-            self.poses.step(len(by_pose) * by_pose, losses, photos, fraction, rate=rate)
+            of_each = ranks.total(len(by_pose)) * by_pose
+            self.poses.step(of_each, losses, photos, fraction, rate=rate, ranks=ranks)
         if self.lenses is not None and by_lens is not None:
             self.lenses.step(by_lens, LENS_RATE * rate)
 

@@ -94,6 +94,17 @@ class Drawn(NamedTuple):
     trust: Tensor
     weights: Tensor
 
+    def every(self, first: int, step: int) -> "Drawn":
+        """Return the pixels `first`, `first + step`, ...; those whose surface is known are the last ones again."""
+        if step == 1:
+            return self
+        begins = {"distances": len(self.numbers) - len(self.distances), "trust": len(self.numbers) - len(self.trust)}
+        parts = {
+            name: tensor[(first - begins.get(name, 0)) % step :: step].contiguous()
+            for name, tensor in self._asdict().items()
+        }
+        return Drawn(**parts)
+
 
 class Pool(Protocol):
     """Source of training pixels: photos with poses (P, 4, 4), training frame, and cameras."""

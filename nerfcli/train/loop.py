@@ -3,7 +3,8 @@
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,9 +12,11 @@ import torch
 
 from nerfcli import kernels
 from nerfcli.atomic import cannot_write
+from nerfcli.errors import LOST_RANK, UserError
 from nerfcli.field.checkpoint import load_tensors
 from nerfcli.field.cost import field_bytes
 from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.ranks import ALONE, Alone
 from nerfcli.interrupts import deferred_interrupts
 from nerfcli.runs.config import RunConfig, read_config, write_config
 from nerfcli.runs.files import FIELD, LOG, STATE
@@ -21,6 +24,7 @@ from nerfcli.runs.log import LogEntry, append_log, cut_log
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
+from nerfcli.train.following import END, SETTLE, TIMED_STEPS, WAIT, describe_efficiency, start_others
 from nerfcli.train.live import LiveTraining
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
@@ -49,6 +53,7 @@ def train(
     *,
     resume: bool,
     memory_bytes: int | None = None,
+    ranks: Alone = ALONE,
     notify: Callable[[str], None],
     on_progress: Callable[[Progress], None],
 ) -> None:
@@ -63,12 +68,13 @@ def train(
         resume: go on from the run's last checkpoint to the budget or step count of `settings`, which count from 0.
         memory_bytes: that may be resident; photos that do not fit stand in files, and the result is the same. On a GPU,
             that may be used there, and all has to fit.
+        ranks: of which this is the first; the others follow, see `following`.
         notify: takes lines for the user.
         on_progress: called after every step.
 
     Raises:
-        UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume, or a folder
-            that cannot be written.
+        UserError: too little memory, unreadable photos, numbers that became non-finite, nothing to resume, a folder
+            that cannot be written, or another rank that has ended; a checkpoint has then been written.
         KeyboardInterrupt: passed on after a checkpoint has been written.
     """
     torch.set_num_threads(settings.threads)
@@ -79,7 +85,7 @@ def train(
     rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
     settings = replace(settings, log2_rows=rows or settings.chosen_log2_rows)
     prepared = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
-    fitting = prepared.fitting()
+    fitting = prepared.fitting(ranks)
     size = ", ".join(f"{name} {value}" for name, value in fitting.field.settings.to_json().items())
     notify(f"field: {size}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     if saved is not None:
@@ -93,9 +99,15 @@ def train(
     _describe(scene, run, settings, prepared, resume=resume)
     checkpoints = Checkpoints(run, fitting, totals, prepared=prepared, scene=scene)
     checkpoints.write_cameras()
+    start_others(fitting, prepared)
     sentinel = Sentinel(fitting, prepared.pool, run=run, notify=notify)
     with deferred_interrupts() as interrupts:
-        live = LiveTraining(run, checkpoints.model, still_wanted=interrupts.raise_if_pending, notify=notify)
+
+        def still_wanted() -> None:
+            interrupts.raise_if_pending()
+            ranks.announce(WAIT)
+
+        live = LiveTraining(run, checkpoints.model, still_wanted=still_wanted, notify=notify)
 
         def after_step(progress: Progress) -> None:
             on_progress(progress)
@@ -104,18 +116,28 @@ def train(
             live.after_step(fraction=progress.share, step=progress.step, seconds=progress.seconds, loss=progress.loss)
 
         try:
-            _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
+            seconds = _run(fitting, totals, sentinel=sentinel, checkpoints=checkpoints, run=run, on_progress=after_step)
         except KeyboardInterrupt:
             if not fitting.in_step:
+                ranks.announce(SETTLE)
                 sentinel.settle()
+                checkpoints.write()
+                ranks.announce(END)
+            live.end()
+            raise
+        except UserError as error:
+            if error.exit_code == LOST_RANK:  # before anything was learned from that step
                 checkpoints.write()
             live.end()
             raise
         checkpoints.write()
+        ranks.announce(END)
         live.end(seconds=_LAST_LOOK_SECONDS)
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
     measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
+    if ranks.count > 1 and seconds:
+        notify(describe_efficiency(fitting, seconds))
 
 
 def _clear(run: Path) -> None:
@@ -151,11 +173,15 @@ def _run(
     checkpoints: Checkpoints,
     run: Path,
     on_progress: Callable[[Progress], None],
-) -> None:
-    """Step until the budget is used up; the clock stands still while waypoints and checkpoints are written."""
+) -> Sequence[float]:
+    """Step until the budget is used up, and return the seconds of the last steps.
+
+    The clock stands still while waypoints and checkpoints are written.
+    """
     settings = fitting.settings
     last_saved = totals.seconds
     loss = 0.0
+    last_steps: deque[float] = deque(maxlen=TIMED_STEPS)
     logged_samples, logged_rays, logged_seconds = totals.samples, totals.rays, totals.seconds
 
     def speeds() -> tuple[float, float]:
@@ -183,8 +209,10 @@ def _run(
     try:
         while (fraction := _share(settings, fitting.step, totals)) < 1.0:
             began = time.perf_counter()
+            fitting.ranks.announce(fraction)
             result = sentinel.advance(fraction)
-            totals.seconds += time.perf_counter() - began
+            last_steps.append(time.perf_counter() - began)
+            totals.seconds += last_steps[-1]
             totals.samples += result.samples
             totals.rays += result.rays
             loss = result.loss
@@ -192,6 +220,7 @@ def _run(
             on_progress(Progress(fraction, fitting.step, totals.seconds, loss, speeds()[0]))
             checkpoint_due = totals.seconds - last_saved >= CHECKPOINT_SECONDS
             if checkpoint_due or (waypoints and fraction >= waypoints[0]):
+                fitting.ranks.announce(SETTLE)
                 sentinel.settle()
                 fraction = _share(settings, fitting.step, totals)
             if waypoints and fraction >= waypoints[0]:
@@ -207,6 +236,7 @@ def _run(
         # An interruption may come before the last steps are in the log, and nothing be left to do when it goes on.
         if totals.seconds > logged_seconds:
             log()
+    return last_steps
 
 
 def _share(settings: TrainSettings, step: int, totals: Totals) -> float:

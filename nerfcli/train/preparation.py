@@ -19,6 +19,7 @@ from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
 from nerfcli.fit.fitting import OCCUPANCY_SIDE, Fitting
 from nerfcli.fit.point_depth import PointDepths, PointRays
+from nerfcli.fit.ranks import ALONE, Alone
 from nerfcli.memory import default_memory_limit
 from nerfcli.multiview.camera_check import CameraCheck, check_cameras
 from nerfcli.multiview.correspondences import Shared
@@ -90,8 +91,8 @@ class Prepared:
     seconds: float
     sky: Tensor | None
 
-    def fitting(self) -> Fitting:
-        """Return the training at its first step."""
+    def fitting(self, ranks: Alone = ALONE) -> Fitting:
+        """Return the training at its first step, for one of some ranks."""
         return Fitting(
             self.pool,
             self.extent.marching,
@@ -103,6 +104,7 @@ class Prepared:
             error_map=ErrorMap(self.pool) if self.settings.components.pixels == "error" else None,
             covered=self.covered(),
             sky=self.sky,
+            ranks=ranks,
         )
 
     def covered(self) -> Tensor | None:
@@ -111,6 +113,33 @@ class Prepared:
             return None
         depths = reduce(PointDepths.joined, self.points.sets) if self.points is not None else None
         return covered_cells(self.pool, OCCUPANCY_SIDE, self.extent.contraction, depths)
+
+
+def load_training_photos(
+    scene: Scene,
+    settings: TrainSettings,
+    *,
+    run: Path,
+    memory_bytes: int | None,
+    notify: Callable[[str], None],
+) -> tuple[int, PhotoStorage, Album]:
+    """Load the training photos; return also by what factor they are reduced, and where further arrays go.
+
+    Args and raises: see `prepare`.
+    """
+    refuse_without_training_photos(scene)
+    first = scene.train_frames[0].camera
+    factor = settings.downscale or automatic_downscale(first.width, first.height)
+    needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
+    device = torch.device(settings.device)
+    if device.type == "cuda":
+        notify(check_device_memory(needs, device, memory_bytes))
+        memory_bytes = default_memory_limit()
+    storage, text = storage_for(needs, memory_bytes, folder=run)
+    notify(text)
+    masks = settings.components.masks
+    album = load_album(scene.train_frames, factor=factor, threads=settings.threads, storage=storage, masks=masks)
+    return factor, storage, album
 
 
 def prepare(
@@ -135,18 +164,8 @@ def prepare(
     Raises:
         UserError: too little memory, no training photo, unreadable photos.
     """
-    refuse_without_training_photos(scene)
-    first = scene.train_frames[0].camera
-    factor = settings.downscale or automatic_downscale(first.width, first.height)
-    needs = needs_of((*scene.train_frames, *scene.test_frames), factor, settings=settings)
+    factor, storage, album = load_training_photos(scene, settings, run=run, memory_bytes=memory_bytes, notify=notify)
     device = torch.device(settings.device)
-    if device.type == "cuda":
-        notify(check_device_memory(needs, device, memory_bytes))
-        memory_bytes = default_memory_limit()
-    storage, text = storage_for(needs, memory_bytes, folder=run)
-    notify(text)
-    masks = settings.components.masks
-    album = load_album(scene.train_frames, factor=factor, threads=settings.threads, storage=storage, masks=masks)
     shared = Shared(scene, album.photos, threads=settings.threads)
     if begun is not None:
         extent = begun.extent

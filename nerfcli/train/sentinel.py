@@ -83,6 +83,8 @@ class Sentinel:
         tensors, description = self._fitting.state()
         if not all(map(is_finite, that_must_be_finite(tensors).values())):
             raise NonFiniteError
+        # From equal sums, processors of two kinds may take steps that differ in the last bit.
+        self._fitting.ranks.copy_from_first(*tensors.values())
         if self._tensors.keys() == tensors.keys():  # into the same memory, which is there already
             for name, tensor in tensors.items():
                 self._tensors[name].copy_(tensor)
@@ -105,6 +107,7 @@ class Sentinel:
             if not deterministic:  # there is no second way to this state
                 before = _copied(*fitting.state())
             result, bad = _watched_step(fitting, self._shares[done])
+            bad = _first_of_ranks(fitting, bad)
             done += 1
         if bad is None:
             assert result is not None
@@ -171,7 +174,8 @@ class Sentinel:
             "cameras": [camera.to_json() for camera in fitting.pool.cameras],
             "state": description,
         }
-        save_tensors(path, {**before, **{f"batch.{name}": value for name, value in batch.items()}}, content)
+        if fitting.ranks.rank == 0:
+            save_tensors(path, {**before, **{f"batch.{name}": value for name, value in batch.items()}}, content)
         return path, text
 
 
@@ -237,6 +241,14 @@ def _watched_step(fitting: Fitting, fraction: float) -> tuple[StepResult | None,
         # Where no number is bad, numbers are so large that their sum is.
         return None, watch.found or BadTensor("sum of the gradients", 1, 1, ())
     return result, watch.found
+
+
+def _first_of_ranks(fitting: Fitting, bad: BadTensor | None) -> BadTensor | None:
+    """The bad tensor of the first rank that has one, with the numbers of its rays among those of all ranks."""
+    ranks = fitting.ranks
+    if bad is not None:
+        bad = replace(bad, rays=tuple(ranks.rank + ranks.count * ray for ray in bad.rays))
+    return next((found for found in ranks.gathered(bad) if found is not None), None)
 
 
 def _copied(tensors: dict[str, Tensor], description: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:

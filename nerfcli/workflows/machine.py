@@ -4,19 +4,22 @@ import os
 import re
 
 from nerfcli.errors import UserError
+from nerfcli.torchrun import place_on_machine
 
 
 def thread_count(threads: int) -> int:
-    """Return the number of CPU threads to use: as given, or for 0 the processors this process may run on."""
+    """Return the number of CPU threads to use: as given, or for 0 the processors this process may run on, which the
+    processes that torchrun has started on this machine divide among them.
+    """
     if threads:
         return threads
-    if hasattr(os, "sched_getaffinity"):  # not on macOS
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    # Not every system has the first.
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, processors // place_on_machine()[1])
 
 
 def device_name(device: str) -> str:
-    """Return the torch device for "auto", "cpu", "cuda" or "cuda:1".
+    """Return the torch device for "auto", "cpu", "cuda" or "cuda:1"; with torchrun, each process has a GPU of its own.
 
     Raises:
         UserError: CUDA or this number of its devices is wanted and not there, or the name is unknown.
@@ -34,5 +37,13 @@ def device_name(device: str) -> str:
         last = torch.cuda.device_count() - 1
         raise UserError(f"--device {device}: there is no such device", f"the last one is cuda:{last}")
     if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    return device
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    number, count = place_on_machine()
+    if device != "cuda" or count == 1:
+        return device
+    if count > torch.cuda.device_count():
+        raise UserError(
+            f"torchrun starts {count} processes on this machine, which has {torch.cuda.device_count()} GPUs",
+            f"use --nproc-per-node {torch.cuda.device_count()}",
+        )
+    return f"cuda:{number}"

@@ -16,6 +16,8 @@ from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import loop
+from nerfcli.train.following import follow
+from nerfcli.train.ranks import Alone, joined_ranks
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.view_worker import viewer_beside
 
@@ -37,6 +39,8 @@ def train_scene(
     progress: Progress = no_progress,
 ) -> Run:
     """Train one scene, keep a run that is already what is wanted, or refuse to touch another one.
+
+    In processes that torchrun has started, all train this scene together; see docs/many-devices.md.
 
     Example:
         >>> import nerfcli
@@ -108,9 +112,15 @@ def _trained(
     for text in describe_rescaling(loaded.rescaled):
         notify(text)
 
+    ranks = joined_ranks(settings.device)
+    if ranks.rank > 0:
+        follow(loaded, run, settings, ranks, memory_bytes=memory_bytes)
+        return Run(run)
+
     def is_kept() -> bool:
         if not _keeps(run, loaded, settings, resume=resume, overwrite=overwrite):
             return False
+        ranks.from_first(None)  # nothing to do for the others, either
         notify(f"{run} is kept: it is complete and has these settings; add --overwrite to train again")
         return True
 
@@ -128,6 +138,7 @@ def _trained(
                 run,
                 settings,
                 memory_bytes=memory_bytes,
+                ranks=ranks,
                 resume=resume,
                 on_begin=start_viewer if view else lambda: None,
                 notify=notify,
@@ -254,6 +265,7 @@ def _fit(
     settings: TrainSettings,
     *,
     memory_bytes: int | None,
+    ranks: Alone,
     resume: bool,
     on_begin: Callable[[], None],
     notify: Notify,
@@ -267,4 +279,13 @@ def _fit(
         progress(state.share, f"step {state.step}  loss {state.loss:.4f}  {speed}")
 
     progress(0.0, "")
-    loop.train(scene, run, settings, resume=resume, memory_bytes=memory_bytes, notify=notify, on_progress=on_progress)
+    loop.train(
+        scene,
+        run,
+        settings,
+        resume=resume,
+        memory_bytes=memory_bytes,
+        ranks=ranks,
+        notify=notify,
+        on_progress=on_progress,
+    )

@@ -1,0 +1,35 @@
+"""How the processes that torchrun has started for one training meet."""
+
+import functools
+from datetime import timedelta
+
+import torch
+import torch.distributed as dist
+
+from nerfcli.fit.ranks import ALONE, Alone, Ranks, lost_ranks_reported
+from nerfcli.torchrun import is_one_of_several
+
+# Photos are loaded and components are selected while others wait; to meet, or for a step, nobody waits long. A process
+# that ends later is noticed at once, by its closed connections: only a machine that falls silent takes so long.
+PREPARATION, STEP = timedelta(hours=12), timedelta(minutes=5)
+
+
+@functools.cache  # they meet once, and stay together as long as they live
+def joined_ranks(device: str) -> Alone:
+    """Join the processes that torchrun has started; `ALONE` where it has started one, or none.
+
+    Args:
+        device: of this process.
+
+    Raises:
+        UserError: another process has ended before.
+    """
+    if not is_one_of_several():
+        return ALONE
+    if device != "cpu":
+        torch.cuda.set_device(device)
+    with lost_ranks_reported():
+        dist.init_process_group("gloo" if device == "cpu" else "cpu:gloo,cuda:nccl", timeout=STEP)
+        preparation = dist.new_group(timeout=PREPARATION)
+    assert isinstance(preparation, dist.ProcessGroup)  # this process is in it
+    return Ranks(dist.get_rank(), dist.get_world_size(), preparation)

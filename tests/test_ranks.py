@@ -1,0 +1,245 @@
+"""Several processes that train one field, with gloo on this machine: the same result as one, and none hangs or writes
+where it should not when another ends."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from commands import error_of, nerfcli
+
+from nerfcli.errors import LOST_RANK, TERMINATED
+from nerfcli.field.checkpoint import load_tensors
+from nerfcli.photos.pool import Drawn
+from nerfcli.runs.components import Components, choose
+from nerfcli.runs.run import Run
+from nerfcli.runs.settings import TrainSettings
+from nerfcli.workflows import machine
+from nerfcli.workflows.train import train_scene
+
+SPHERES = Path(__file__).parents[1] / "sample_scenes" / "spheres"
+# Each with the steps of its budget and the one at which it is stopped. Where cameras move, from a tenth of them on,
+# or rays end by their opacity, a last bit decides about whole samples, also between one thread and two: not for long.
+VARIANTS = {
+    "": (200, 50),
+    "exposure": (200, 50),
+    "background=black": (200, 50),
+    "pixels=error,points,entropy": (100, 24),
+    "cameras=all": (100, 14),
+}
+SMALL = TrainSettings(
+    budget_seconds=None, steps=200, log2_rows=12, first_samples_per_step=2**11, samples_per_step=2**11, threads=1
+)
+TRAININGS = """
+import math, sys
+from dataclasses import replace
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_ranks import SPHERES, SMALL, VARIANTS, settings_with, train_until
+from nerfcli.fit.fitting import Fitting
+from nerfcli.train import sentinel
+
+for number, (components, (steps, last)) in enumerate(VARIANTS.items()):
+    train_until(last, Path({folder!r}) / str(number), settings_with(components, steps))
+
+backward = Fitting._add_up_gradients
+
+def poisoned(self, drawn, samples):
+    if self.ranks.rank == 1 and self.step == 7 and self.rollbacks == 0:
+        self.field.weights[0].grad.fill_(math.nan)
+    return backward(self, drawn, samples)
+
+Fitting._add_up_gradients = poisoned
+sentinel.SNAPSHOT_EVERY = 4
+train_until(12, Path({folder!r}) / "poisoned", SMALL)
+"""
+
+
+def settings_with(components: str, steps: int) -> TrainSettings:
+    included = components.split(",") if components else []
+    return replace(SMALL, steps=steps, components=choose(Components(), included=included, excluded=()))
+
+
+def train_until(step: int, run: Path, settings: TrainSettings) -> None:
+    """Train, and stop as Ctrl-C does."""
+    assert settings.steps is not None
+    stop = step / settings.steps
+
+    def progress(share: float, detail: str) -> None:
+        if share >= stop:
+            raise KeyboardInterrupt
+
+    with suppress(KeyboardInterrupt):
+        train_scene(SPHERES, run, settings, overwrite=True, progress=progress)
+
+
+def of_rank(rank: int, port: int, count: int = 2) -> dict[str, str]:
+    """The environment that torchrun gives to a process."""
+    return {
+        **os.environ,
+        **dict.fromkeys(("RANK", "LOCAL_RANK"), str(rank)),
+        **dict.fromkeys(("WORLD_SIZE", "LOCAL_WORLD_SIZE"), str(count)),
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "TORCHELASTIC_RUN_ID": "test",
+        "OMP_NUM_THREADS": "1",
+    }
+
+
+def two_ranks(program: str, *arguments: str | Path) -> list[subprocess.Popen[str]]:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        port = found.getsockname()[1]
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return [
+        subprocess.Popen(command, env=of_rank(rank, port), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for rank in range(2)
+    ]
+
+
+def ended(processes: Sequence[subprocess.Popen[str]]) -> list[tuple[int, str, list[str]]]:
+    """Exit codes, results and what was said; a process that hangs fails the test."""
+    try:
+        said = [process.communicate(timeout=90) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [(p.returncode, out, error.splitlines()) for p, (out, error) in zip(processes, said, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def by_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("two")
+    done = ended(two_ranks(TRAININGS.format(folder=str(folder), tests=str(Path(__file__).parent))))
+    assert [code for code, _, _ in done] == [0, 0], done
+    return folder
+
+
+@pytest.mark.parametrize("number", range(len(VARIANTS)), ids=[name or "default" for name in VARIANTS])
+def test_two_processes_train_what_one_does(by_two, tmp_path, number):
+    """The same rays in two halves: all that differs is the order of float32 sums. Adam makes whole steps from gradients
+    that are 0 but for it, so that a few numbers may differ by more."""
+    components, (steps, last) = list(VARIANTS.items())[number]
+    train_until(last, tmp_path, settings_with(components, steps))
+    runs = (tmp_path, by_two / str(number))
+    (one, of_one), (two, of_two) = (load_tensors(run / "state.safetensors", "cpu") for run in runs)
+    assert of_two["step"] == of_one["step"] == last
+    assert of_two["totals"]["rays"] == of_one["totals"]["rays"]
+    assert of_two["totals"]["samples"] == pytest.approx(of_one["totals"]["samples"], rel=1e-3)
+    assert torch.equal(one["generator"], two["generator"])
+    learned = [name for name in one if name.startswith(("field.", "parts.")) and "adam" not in name]
+    differences = torch.cat([(one[name].double() - two[name].double()).abs().flatten() for name in learned])
+    assert differences.quantile(0.95) < 1e-5
+    losses = [Run(run).log[-1]["loss"] for run in runs]
+    assert losses[1] == pytest.approx(losses[0], rel=1e-5)
+
+
+def test_a_number_that_is_not_finite_in_one_process_takes_all_of_them_back(by_two):
+    run = by_two / "poisoned"
+    last = Run(run).log[-1]
+    assert (last["step"], last["rollbacks"]) == (12, 1)
+    assert [path.name for path in run.glob("failure-*")] == ["failure-8.safetensors"]
+
+
+def killed(tmp_path: Path, victims: Sequence[int], sent: signal.Signals) -> list[tuple[int, str, list[str]]]:
+    """Two ranks that train, of which some get a signal after some steps."""
+    run = tmp_path / "run"
+    program = "from nerfcli.cli import main; main()"
+    options = ("--steps", "4000", "--model", "default", "--batch", "1024", "--log2-rows", "10", "--threads", "1")
+    processes = two_ranks(program, "train", SPHERES, "-o", run, *options)
+    deadline = time.monotonic() + 60
+    while not (run / "log.jsonl").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for victim in victims:
+        processes[victim].send_signal(sent)
+    return ended(processes)
+
+
+def test_when_a_process_is_killed_the_first_one_saves_and_ends_and_one_alone_can_go_on(tmp_path):
+    (code, out, said), (victim, _, _) = killed(tmp_path, [1], signal.SIGKILL)
+    assert (code, out, victim) == (LOST_RANK, "", -signal.SIGKILL)
+    assert said[-2].startswith("Error: another process of this training has ended")
+    assert "--resume" in said[-1]
+    assert "Traceback" not in "".join(said)
+    run = Run(tmp_path / "run")
+    before, _ = run.saved_progress()
+    total = str(before + 5)
+    options = ("--model", "default", "--batch", "1024", "--log2-rows", "10", "--threads", "1", "--resume")
+    assert nerfcli("train", SPHERES, "-o", run.path, "--steps", total, *options).exit_code == 0
+    assert run.saved_progress()[0] == before + 5
+
+
+@pytest.mark.slow
+def test_when_the_first_process_is_killed_the_other_one_ends_and_writes_nothing(tmp_path):
+    (victim, _, _), (code, out, said) = killed(tmp_path, [0], signal.SIGKILL)
+    assert (victim, code, out) == (-signal.SIGKILL, LOST_RANK, "")
+    assert [line.split(":")[0] for line in said] == ["Error", "Hint"]
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert written <= {".train.lock", "cameras.json", "config.json", "log.jsonl"}
+
+
+@pytest.mark.slow
+def test_sigterm_to_all_processes_leaves_a_checkpoint_and_one_message(tmp_path):
+    (code, _, said), (other, out, nothing) = killed(tmp_path, [0, 1], signal.SIGTERM)
+    assert (code, other, out, nothing) == (TERMINATED, 0, "", [])
+    assert said[-1] == "Ended by SIGTERM; completed work is kept."
+    assert Run(tmp_path / "run").saved_progress()[0] > 0
+
+
+@pytest.mark.slow
+def test_torchrun_trains_by_time_with_selected_components_and_reports_once(tmp_path):
+    run = tmp_path / "run"
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command = [*launcher, "-m", "nerfcli", "train", SPHERES, "-o", run, "--budget", "20s", "--json"]
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {"path": str(run)}
+    (line,) = [line for line in done.stderr.splitlines() if "efficiency" in line]
+    assert line.startswith("2 processes: ")
+    assert Run(run).config.selection is not None
+    again = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False, timeout=200)
+    assert (again.returncode, json.loads(again.stdout)) == (0, {"path": str(run)})
+    assert "is kept" in again.stderr
+
+
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_every_pixel_of_a_step_is_one_rank_s_and_points_stay_last(count):
+    numbers, points = torch.arange(23), 5
+    origins, directions, colours = torch.rand(3, 23, 3)
+    known = numbers[-points:]
+    whole = Drawn(origins, directions, colours, numbers, known / 10, known / 20, torch.rand(23))
+    parts = [whole.every(rank, count) for rank in range(count)]
+    assert sorted(torch.cat([part.numbers for part in parts]).tolist()) == list(range(23))
+    for part in parts:
+        assert torch.equal(part.colours, whole.colours[part.numbers])
+        assert torch.equal(part.weights, whole.weights[part.numbers])
+        known = part.numbers[len(part.numbers) - len(part.distances) :]
+        assert torch.equal(part.distances, known / 10)
+        assert torch.equal(part.trust, known / 20)
+    assert sum(len(part.distances) for part in parts) == points
+
+
+def test_processes_of_a_machine_divide_its_processors(monkeypatch):
+    alone = machine.thread_count(0)
+    for name, value in of_rank(1, 1).items():
+        monkeypatch.setenv(name, value)
+    assert machine.thread_count(0) == max(1, alone // 2)
+    assert machine.thread_count(3) == 3
+
+
+@pytest.mark.parametrize("arguments", [["-"], [SPHERES, "--dry-run"]])
+def test_processes_of_torchrun_refuse_what_they_cannot_do_together(monkeypatch, arguments):
+    for name, value in of_rank(0, 1).items():
+        monkeypatch.setenv(name, value)
+    result = nerfcli("train", *arguments)
+    assert result.exit_code == 2
+    assert error_of(result)[1] == "Hint:  use this command without torchrun"
