@@ -199,14 +199,33 @@ def plan_of(pairing: Pairing, *, threads: int = 1, settings: PoseSettings = Pose
 
 def test_the_estimate_falls_with_threads_and_features():
     pairing = choose_pairs(lettered(100), rule="exhaustive")
-    alone, many = plan_of(pairing), plan_of(pairing, threads=4, settings=PoseSettings(max_features=2048))
+    alone = plan_of(pairing, settings=PoseSettings(max_features=40))
+    many = plan_of(pairing, threads=4, settings=PoseSettings(max_features=20))
     assert alone.pairs == 4950
     assert many.seconds["match"] == pytest.approx(alone.seconds["match"] / 8, abs=0.1)
+
+
+def test_small_photos_are_not_planned_with_as_many_features_as_large_ones():
+    """By the plan's own figure: 0.015 features per pixel that is searched, and never more than are wanted."""
+    photos = lettered(100)
+    pixels = photos[0].width * photos[0].height
+    assert plan_of(choose_pairs(photos, rule="exhaustive")).features == round(0.015 * pixels) < 4096
+    wanted = PoseSettings(max_features=30)
+    assert plan_of(choose_pairs(photos, rule="exhaustive"), settings=wanted).features == 30
 
 
 def test_look_alikes_bound_the_number_of_pairs():
     assert plan_of(Pairing("retrieval", (), 25)).pairs == 2500
     assert plan_of(Pairing("retrieval", (), 90)).pairs == 4950
+
+
+@pytest.mark.parametrize(("photos", "seconds"), [(100, 3.0), (1000, 74.9), (5000, 468.7)])
+def test_looking_for_similar_photos_stays_affordable(photos: int, seconds: float):
+    """Closed form: 0.6 ms a pair with 256 features, a quarter of that with half as many."""
+    plan = make_plan(
+        Photos(Path("x"), tuple(lettered(photos)), {}), Pairing("retrieval", (), 25), PoseSettings(), threads=1
+    )
+    assert plan.seconds["pair"] == pytest.approx(seconds, abs=0.1)
 
 
 def test_the_outlook_measures_and_stretches_what_is_to_come():
@@ -301,6 +320,17 @@ def test_what_is_left_is_right_within_a_half_from_a_quarter_on(planned: tuple[in
             if whole / 4 <= now < 0.97 * whole:
                 assert 1 / 1.5 < left / (whole - now) < 1.5, (stage, done)
         began = now
+
+
+def test_matching_is_planned_by_the_features_that_were_found():
+    """Closed form: a quarter of the features that the plan counts on take a quarter of its time."""
+    now = 0.0
+    seconds = {"extract": 10.0, "match": 100.0, "map": 20.0}
+    outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, seconds, features=4000), clock=lambda: now)
+    outlook.update("extract", 0, 10)
+    now = 10.0
+    assert outlook.update("extract", 10, 10)[1] == pytest.approx(120.0)
+    assert outlook.update("features", 1000, 4096) == (pytest.approx(10.0 / 55.0), pytest.approx(45.0))
 
 
 def test_another_attempt_is_measured_from_its_own_start():

@@ -75,7 +75,7 @@ def test_a_smaller_component_gets_a_second_chance_of_its_own(
     views, right = apart
     found, told = choose(replace(misled, models=[right.models[0], misled.models[1]]), 2)
     assert told[0] == "component 1 is checked first, as the others are numbered after it"
-    assert "mapping the photos of component 2 again, for at most 12 min" in told[1]
+    assert "mapping the photos of component 2 again, for at most 16 min" in told[1]
     assert found.examined.verdict.accepted
     assert found.examined.model is not None
     assert sorted(found.examined.model.reg_image_ids()) == SECOND

@@ -144,7 +144,7 @@ def test_a_contradicted_model_is_mapped_again_from_its_sound_part(solved: Solved
     assert chance.examined.verdict.accepted
     assert chance.examined.model is not None
     assert [attempt["models"] for attempt in chance.mapped.attempts] == [[10], [10]]
-    assert told[0].endswith("mapping again, for at most 25 min")
+    assert told[0].endswith("mapping again, for at most 33 min")
     assert told[-1] == "from the largest consistent part: 10 of 10 photos registered, accepted"
     truth = synthetic.true_model(solved.views)
     for image_id in range(2, 11):
@@ -176,8 +176,54 @@ def test_a_second_chance_is_bounded_in_time(solved: Solved, tmp_path: Path):
     told: list[str] = []
     chance = second_chance(wrong, first, lambda *progress: None, told.append, checks=Checks)
     assert sum(note.startswith("skipped, would take too long") for note in told) == 4
+    assert "skipped, would take too long (0 s, with 0 s left): from scratch, with other initial pairs" in told
     assert chance.examined.model is not None
     assert chance.examined.model.num_reg_images() == 7
+
+
+def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Of 200 s, the first two take 150: mapping from scratch, 100 s as the first time, does not fit; its part does."""
+    wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=100.0)
+    first = examine(wrong.models, wrong.job, lambda *told: None)
+    now = [0.0]
+
+    def late(*arguments) -> None:
+        now[0] += 75.0
+
+    monkeypatch.setattr(chances.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(chances, "_regrown", late)
+    monkeypatch.setattr(chances, "_all_at_once", late)
+    told: list[str] = []
+    chance = second_chance(wrong, first, lambda *progress: None, told.append, checks=Checks)
+    assert "next: from the largest consistent part (about 30 s)" in told
+    assert "skipped, would take too long (2 min, with 50 s left): from scratch, with other initial pairs" in told
+    assert chance.mapped.attempts[-1]["what"] == "only the largest consistent part of the first model"
+
+
+def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Eight of ten are placed; what goes on from them is tried, what begins again is not."""
+    shutil.copytree(solved.job.database.parent, tmp_path / "again")
+    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
+    real = ladder.map_photos
+
+    def without_two(*arguments, **options) -> list[pycolmap.Reconstruction]:
+        models = real(*arguments, **options)
+        for photo in {9, 10} & set(models[0].reg_image_ids()):
+            models[0].deregister_frame(models[0].image(photo).frame_id)
+        return models
+
+    monkeypatch.setattr(ladder, "map_photos", without_two)
+    monkeypatch.setattr(ladder, "_MANY_PHOTOS", 10)
+    told: list[str] = []
+    climbed = climb(job, lambda *progress: None, told.append)
+    assert [attempt["what"] for attempt in climbed.attempts][:2] == ["default thresholds", "lower angles"]
+    assert not any("start from" in attempt["what"] for attempt in climbed.attempts)
+    # By the plan, 10 photos take 0.38 + 10 * 0.0025 s each.
+    assert "not trying other starts, which take about 4 s each: most photos are registered" in told
 
 
 def test_groups_hold_together_against_what_speaks_against_them():

@@ -18,6 +18,7 @@ _STAGES = {
     "read": "photos read",
     "extract": "photos, extracting features",
     "enlarge": "photos, extracting finer features",
+    "features": "features per photo",
     "pair": "photos, finding similar ones",
     "match": "pairs compared",
     "map": "photos registered",

@@ -4,6 +4,7 @@ Every attempt is written down with its result. The first ones ask the same match
 for more matches and more features.
 """
 
+import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -19,7 +20,7 @@ from nerfcli.poses.engine.mapped import Mapped
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
-from nerfcli.poses.input.plan import extraction_seconds, matching_seconds
+from nerfcli.poses.input.plan import duration, extraction_seconds, mapping_seconds, matching_seconds
 from nerfcli.poses.input.settings import FULL_SIZE
 from nerfcli.poses.judge.parallax import best_turn
 from nerfcli.poses.model.intrinsics import field_of_view_deg
@@ -33,6 +34,8 @@ from nerfcli.poses.model.two_views import read_verified_pairs
 _GOOD_SHARE = 0.9
 # Below this, it is worth several times the work that was done so far.
 _FEW_SHARE = 0.75
+# From here on mapping from scratch takes four minutes and more: a few photos are not worth it.
+_MANY_PHOTOS = 250
 # Below this, what is believed of the lens beforehand is doubted.
 _LITTLE_SHARE = 0.5
 # Beyond this, comparing every pair, or searching full-size photos, takes longer than taking better photos.
@@ -155,9 +158,10 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     EXIF, the next one starts without it. If its lens came out wide or it leaves out many photos, the next
     one starts from a fisheye, where pairs of photos say that it was one. If photos that match some other one well are
     still left out, the next ones start from a pair with a smaller baseline, from the strongest pair that was left out,
-    and with low angles. Then all pairs are compared that were not, and more features are sought in the photos' full
-    size. Last, single photos are placed by the points that they show (see `localise`). Where the camera only turned,
-    nothing more is tried. If the first attempt is not the last, `tell` is told each attempt and its result.
+    and with low angles; of many photos, only if a quarter is left out. Then all pairs are compared that were not, and
+    more features are sought in the photos' full size. Last, single photos are placed by the points that they show (see
+    `localise`). Where the camera only turned, nothing more is tried. If the first attempt is not the last, `tell` is
+    told each attempt and its result.
     """
     ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, MapperOptions())
@@ -168,15 +172,15 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
         return replace(ladder.best, attempts=ladder.rungs)
     job = _without_exif(ladder, job, report, share=ladder.share(featured))
     job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
-    _other_starts(ladder, job)
+    _other_starts(ladder, job, tell)
     compared = set(job.pairs)
-    rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
-    if rest and len(rest) <= _MOST_PAIRS and ladder.share(featured) < _GOOD_SHARE:
+    if 0 < math.comb(len(job.files), 2) - len(compared) <= _MOST_PAIRS and ladder.share(featured) < _GOOD_SHARE:
+        rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
         job = replace(job, pairs=(*job.pairs, *rest))
         match(job, rest, report)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)
     if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE:
-        _with_more_features(ladder, job, report, missing=1 - ladder.share(featured))
+        _with_more_features(ladder, job, report, tell, missing=1 - ladder.share(featured))
     ladder.find_left_out("remaining photos one by one, from the 3D points they see")
     if len(ladder.rungs) > 1:
         ladder.tell_results()
@@ -192,7 +196,7 @@ def _only_turns(job: Job) -> bool:
     return turn is not None and turn.explains_all
 
 
-def _with_more_features(ladder: _Ladder, job: Job, report: Report, *, missing: float) -> None:
+def _with_more_features(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, missing: float) -> None:
     """Search larger pictures for more features, for at most as long as the missing share of the photos is worth."""
     longest = max(max(group.width, group.height) for group in job.groups)
     more = replace(job, rung="full-size", max_features=_MORE_FEATURES, pairs=all_pairs(len(job.files)))
@@ -209,7 +213,7 @@ def _with_more_features(ladder: _Ladder, job: Job, report: Report, *, missing: f
     start_matching(more, more.pairs)
     match(more, more.pairs, report)
     ladder.attempt(what, more, MapperOptions())
-    _other_starts(ladder, more)
+    _other_starts(ladder, more, tell)
 
 
 def _search_seconds(job: Job) -> float:
@@ -219,9 +223,15 @@ def _search_seconds(job: Job) -> float:
     return features + matching_seconds(len(job.pairs), max_features=job.max_features)
 
 
-def _other_starts(ladder: _Ladder, job: Job) -> None:
+def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
     """Other ways to begin, until nearly all photos are placed that matches hold together."""
     candidates = len(connected_groups(job.image_ids, [(one, other) for _, one, other in _strong_pairs(job)])[0])
+    if len(job.files) >= _MANY_PHOTOS and _FEW_SHARE <= ladder.share(candidates) < _GOOD_SHARE:
+        ladder.tell_results()
+        takes = duration(mapping_seconds(len(job.files)))
+        tell(f"not trying other starts, which take about {takes} each: most photos are registered")
+        ladder.go_on("lower angles", LOW_ANGLES)
+        return
     steps: list[Callable[[], None]] = [
         lambda: ladder.attempt("start from a smaller baseline", job, SMALLER_BASELINE),
         lambda: _from_left_out(ladder, job),

@@ -18,13 +18,9 @@ import pycolmap
 
 from nerfcli.poses.engine.features import feature_keys
 from nerfcli.poses.input.job import Job, Report
-from nerfcli.poses.input.pairs import in_blocks
+from nerfcli.poses.input.pairs import in_blocks, looked_at_features
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# Features per photo. Half as many in large captures: four times faster, and 96 % instead of 98 %.
-_FEATURES = 256
-_FEATURES_IN_LARGE = 128
-_LARGE = 500
 # Nearest and second nearest, squared: 0.8 of the distance, as in pycolmap.
 _RATIO = 0.64
 # So many other photos at a time: some tens of megabytes.
@@ -103,7 +99,7 @@ def _clear_matches(distances: np.ndarray) -> np.ndarray:
 
 def _coarsest(job: Job) -> list[np.ndarray]:
     """Per photo the descriptors of its features of the largest scale."""
-    most = _FEATURES if len(job.files) <= _LARGE else _FEATURES_IN_LARGE
+    most = looked_at_features(len(job.files))
     found: list[np.ndarray] = []
     with closing(pycolmap.Database.open(str(job.database))) as database:
         for image_id in job.image_ids:

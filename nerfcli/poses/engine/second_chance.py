@@ -19,7 +19,7 @@ from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_
 from nerfcli.poses.engine.mapping import MapperOptions, map_globally, map_photos, photo_numbers
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import capture_order
-from nerfcli.poses.input.plan import duration
+from nerfcli.poses.input.plan import at_once_seconds, duration, mapping_seconds
 from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict
 from nerfcli.poses.judge.checks import Checks
@@ -35,8 +35,8 @@ _LEAST_CORE = 0.3
 # In an ordered capture, photos so near in the order are taken to be neighbours in space.
 _NEAR_IN_ORDER = 10
 _ALL_AT_ONCE = "all photos at once (global mapper)"
-# A hypothesis is not started when those before it took this many times as long as the first mapping.
-_MOST_TIME = 1.5
+# All hypotheses together may take so many times as long as the first mapping.
+_MOST_TIME = 2.0
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,9 @@ def second_chance(
     pairs = first.verdict.measures["pairs"]
     against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
     which = "" if component == 1 else f" the photos of component {component}"
-    tell(f"{against}: mapping{which} again, for at most {duration(_MOST_TIME * mapped.seconds)}")
+    scratch = mapped.seconds
+    most = _MOST_TIME * scratch
+    tell(f"{against}: mapping{which} again, for at most {duration(most)}")
     if component > 1:
         mapped = replace(mapped, job=_job_of(mapped.models[0], mapped.job))
     names = "second-chance" if component == 1 else f"component-{component}-second-chance"
@@ -84,22 +86,27 @@ def second_chance(
     def grown_from_all() -> Mapped | None:
         return _regrown(mapped, _core(at_once[0].models[0], mapped.job), report) if at_once else None
 
-    hypotheses: list[tuple[str, Callable[[], Mapped | None]]] = [
-        ("from the largest consistent part", lambda: _regrown(mapped, core, report)),
-        (_ALL_AT_ONCE, lambda: _all_at_once(mapped, core)),
-        ("from the largest consistent part of that", grown_from_all),
-        ("from scratch, with other initial pairs", lambda: _from_nothing(mapped, core, report)),
+    rest = 1 - core.model.num_reg_images() / mapped.models[0].num_reg_images()
+    photos = len(mapped.job.files)
+    all_at_once = scratch * at_once_seconds(photos) / mapping_seconds(photos)
+    # What each takes is guessed from what it has to place anew.
+    hypotheses: list[tuple[str, float, Callable[[], Mapped | None]]] = [
+        ("from the largest consistent part", rest * scratch, lambda: _regrown(mapped, core, report)),
+        (_ALL_AT_ONCE, all_at_once, lambda: _all_at_once(mapped, core)),
+        ("from the largest consistent part of that", rest * scratch, grown_from_all),
+        ("from scratch, with other initial pairs", scratch, lambda: _from_nothing(mapped, core, report)),
         (
             "only the largest consistent part of the first model",
+            0.0,
             lambda: replace(mapped, models=[core.model, *mapped.models[1:]]),
         ),
     ]
-    for number, (what, make) in enumerate(hypotheses):
-        last = number == len(hypotheses) - 1
-        if not last and time.perf_counter() - start > _MOST_TIME * mapped.seconds:
-            tell(f"skipped, would take too long: {what}")
+    for number, (what, takes, make) in enumerate(hypotheses):
+        left = max(most - (time.perf_counter() - start), 0.0)
+        if number < len(hypotheses) - 1 and takes >= left:
+            tell(f"skipped, would take too long ({duration(takes)}, with {duration(left)} left): {what}")
             continue
-        tell(f"next: {what}")
+        tell(f"next: {what}" + (f" (about {duration(takes)})" if takes else ""))
         runner = checks()
         found = runner.run(what, partial(_kept, mapped.job, f"{names}-{number}", make), otherwise=None)
         if found is None or not found.models:

@@ -20,6 +20,7 @@ from nerfcli.poses.input.settings import Limits
 _STAGES = {
     "extract": "finding features",
     "enlarge": "extracting finer features",
+    "features": "counting features",
     "pair": "choosing pairs",
     "match": "matching photos",
     "map": "placing photos",

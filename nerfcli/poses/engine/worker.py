@@ -24,7 +24,7 @@ from nerfcli.child import take_stdout
 from nerfcli.finite import finite
 from nerfcli.poses.engine.chosen import choose_component
 from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images
-from nerfcli.poses.engine.features import extract, match, start_matching
+from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
 from nerfcli.poses.engine.mapping import describe_cameras, model_keys, photo_numbers, with_colours, write_model
@@ -155,6 +155,8 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
         return mapped
     with _timed(seconds, "extract"):
         extract(job, report)
+    counts = feature_counts(job)
+    report("features", round(sum(counts) / len(counts)), job.max_features)
     with _timed(seconds, "match"):
         matched = with_neighbours(job, report)
         start_matching(matched, matched.pairs)

@@ -101,6 +101,16 @@ def all_pairs(count: int) -> tuple[tuple[int, int], ...]:
     return in_blocks(combinations(range(count), 2))
 
 
+def looked_at_features(photos: int) -> int:
+    """Return how many features of each photo are compared to find look-alikes; the time grows with their square.
+
+    Measured: the 20 most alike of each photo of fox hold 98 % of the pairs with 100 verified matches with 256 of them,
+    and 96 % with 128. Of 300 frames of a walk through a town, 97, 100, 96 and 93 % of the pairs that close loops are
+    found with 256, 128, 64 and 32, at 0.56, 0.13, 0.04 and 0.01 ms a pair.
+    """
+    return 256 if photos <= 500 else 128 if photos <= 2000 else 64
+
+
 def in_blocks(pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
     """The pairs in an order in which few photos are in use at a time, since the matcher keeps what it used last."""
     block = 16

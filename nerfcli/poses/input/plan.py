@@ -1,11 +1,12 @@
 """Plan of structure from motion with an estimate of its time, reported before it starts."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from nerfcli.poses.input.pairs import Pairing
+from nerfcli.poses.input.pairs import Pairing, looked_at_features
 from nerfcli.poses.input.photos import Photos
 from nerfcli.poses.input.settings import PoseSettings
 
@@ -16,8 +17,13 @@ _SECONDS_PER_MEGAPIXEL = 0.4
 _SECONDS_PER_PAIR = 0.045
 _FEATURES_PER_PAIR = 4096
 _SECONDS_PER_LOOK = 0.0006
+_FEATURES_PER_LOOK = 256
+# Of a picture as it is searched, about.
+_FEATURES_PER_PIXEL = 0.015
 # Of the mapper: the first for few photos; the second for each other photo, since all are adjusted again and again.
 _MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.38, 0.0025
+# Of the global mapper.
+_AT_ONCE_SECONDS_PER_PHOTO = 0.5
 _CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
 # How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
 _GROWTH = {"map": 1.3}
@@ -27,7 +33,9 @@ _TELLING = 0.05
 
 @dataclass(frozen=True)
 class Plan:
-    """photos: how many. rule and pairs: see `Pairing`; pairs is the most that may come of it. seconds: per stage."""
+    """photos: how many. rule and pairs: see `Pairing`; pairs is the most that may come of it. seconds: per stage, where
+    a photo has `features`.
+    """
 
     photos: int
     max_image_size: int
@@ -35,6 +43,7 @@ class Plan:
     rule: str
     pairs: int
     seconds: dict[str, float]
+    features: int = _FEATURES_PER_PAIR
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -57,11 +66,13 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
     all_pairs = count * (count - 1) // 2
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     sizes = [(photo.width, photo.height) for photo in photos.photos]
+    searched = sum(_searched_pixels(sizes, max_image_size=settings.max_image_size))
+    features = min(settings.max_features, round(_FEATURES_PER_PIXEL * searched / max(count, 1)))
     seconds = {
         "extract": extraction_seconds(sizes, max_image_size=settings.max_image_size) / threads,
-        "pair": all_pairs * _SECONDS_PER_LOOK / threads if pairing.neighbours else 0.0,
-        "match": matching_seconds(pairs, max_features=settings.max_features) / threads,
-        "map": count * (_MAP_SECONDS_PER_PHOTO + count * _MAP_SECONDS_PER_TWO),
+        "pair": looking_seconds(count) / threads if pairing.neighbours else 0.0,
+        "match": matching_seconds(pairs, max_features=features) / threads,
+        "map": mapping_seconds(count),
         "check": _CHECK_SECONDS + count * _CHECK_SECONDS_PER_PHOTO,
     }
     return Plan(
@@ -71,18 +82,37 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
         rule=pairing.rule,
         pairs=pairs,
         seconds={stage: round(value, 1) for stage, value in seconds.items() if value > 0},
+        features=features,
     )
 
 
 def extraction_seconds(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> float:
     """CPU seconds to find features in photos of these sizes (width, height)."""
-    scaled = (width * height * min(1.0, max_image_size / max(width, height)) ** 2 for width, height in sizes)
-    return sum(scaled) / 1e6 * _SECONDS_PER_MEGAPIXEL
+    return sum(_searched_pixels(sizes, max_image_size=max_image_size)) / 1e6 * _SECONDS_PER_MEGAPIXEL
+
+
+def _searched_pixels(sizes: Iterable[tuple[int, int]], *, max_image_size: int) -> list[float]:
+    return [width * height * min(1.0, max_image_size / max(width, height)) ** 2 for width, height in sizes]
+
+
+def looking_seconds(photos: int) -> float:
+    """CPU seconds to find which of so many photos look alike."""
+    return math.comb(photos, 2) * _SECONDS_PER_LOOK * (looked_at_features(photos) / _FEATURES_PER_LOOK) ** 2
 
 
 def matching_seconds(pairs: int, *, max_features: int) -> float:
-    """CPU seconds to match so many pairs of photos."""
+    """CPU seconds to match so many pairs of photos with so many features each."""
     return pairs * _SECONDS_PER_PAIR * max_features / _FEATURES_PER_PAIR
+
+
+def mapping_seconds(photos: int) -> float:
+    """CPU seconds to place so many photos one after the other."""
+    return photos * (_MAP_SECONDS_PER_PHOTO + photos * _MAP_SECONDS_PER_TWO)
+
+
+def at_once_seconds(photos: int) -> float:
+    """CPU seconds to place so many photos with the global mapper."""
+    return photos * _AT_ONCE_SECONDS_PER_PHOTO
 
 
 class Outlook:
@@ -91,8 +121,9 @@ class Outlook:
     The plan's seconds are stretched by how long the stage at hand has taken so far, after its first twentieth; those of
     later stages by the least that any stage was. The machine slows all of them, whereas what makes one of them slow is
     its own (matches of shiny things, poses of a dense walk). Work that an earlier call has done counts for nothing.
-    Which photos are enlarged to find more features in them is known only after the first search; where that adds work,
-    the share that is done stands still until it is true again.
+    Which photos are enlarged to find more features in them is known only after the first search, and how many features
+    the matcher compares after the second; where that adds work, the share that is done stands still until it is true
+    again.
 
     Args:
         plan: for the stages that have not begun.
@@ -110,10 +141,15 @@ class Outlook:
         self._latest = (0.0, 0.0)  # of the stage at hand: its seconds, and what the plan has for that work
         self._seconds = dict(plan.seconds)
         self._share = 0.0
+        self._at = ("", 0, 0)
 
     def update(self, stage: str, done: int, total: int) -> tuple[float, float]:
         """Return (fraction of all work that is done, remaining seconds)."""
         now = self._clock()
+        if stage == "features":
+            self._plan_matching(done)
+            stage, done, total = self._at
+        self._at = (stage, done, total)
         if stage == "enlarge":
             self._plan_enlarging(total)
         ratio = (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
@@ -150,6 +186,11 @@ class Outlook:
         order = list(self._seconds)
         new, old = (order.index(name) if name in order else len(order) for name in (stage, self._stage))
         return bool(self._stage) and (new < old or (new == old and ratio < self._ratio))
+
+    def _plan_matching(self, features: int) -> None:
+        """Plan for so many features per photo, which are known by now."""
+        share = features / max(self._plan.features, 1)
+        self._seconds = {name: s * (share if name == "match" else 1.0) for name, s in self._seconds.items()}
 
     def _plan_enlarging(self, photos: int) -> None:
         """Put the second search for features after the first."""
