@@ -10,7 +10,7 @@ from conftest import write_run
 from fog import fog, foggy_cells
 
 from nerfcli import scene as scenes
-from nerfcli.errors import BAD_INPUT
+from nerfcli.errors import BAD_INPUT, OUT_OF_MEMORY
 from nerfcli.export.members import deviation
 from nerfcli.field.hash_field import RANDOM_LEVELS, HashField, HashFieldSettings
 from nerfcli.fit.extent import object_frame
@@ -164,6 +164,15 @@ def test_an_interrupted_member_is_resumed_by_the_same_command(capture, monkeypat
     assert (run / "members" / "1" / "field.safetensors").read_bytes() == first
     members = members_of(Run(run))
     assert [member.log[-1]["step"] for member in members] == [40, 40]
+
+
+def test_members_keep_to_the_memory_of_the_run(capture):
+    """The run is complete and kept before, so that only a member can be refused."""
+    run = capture.with_name("r")
+    assert nerfcli("train", capture, *QUICK, "-o", run).exit_code == 0
+    result = nerfcli("train", capture, *QUICK, "-o", run, "--members", "2", "--memory", "1MB")
+    assert result.exit_code == OUT_OF_MEMORY
+    assert not (run / "members" / "1" / "field.safetensors").exists()
 
 
 def test_members_of_another_training_are_refused(ensemble):

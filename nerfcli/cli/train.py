@@ -272,6 +272,7 @@ def train(
                 vary=vary,
                 device=photo_settings().device,
                 threads=photo_settings().threads,
+                memory_bytes=limit or default_memory_limit(photo_settings().device),
                 resume=resume,
                 overwrite=overwrite,
                 notify=console.note,

@@ -60,6 +60,7 @@ def train_members(
     vary: str,
     device: str,
     threads: int,
+    memory_bytes: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
     notify: Notify = silent,
@@ -75,7 +76,7 @@ def train_members(
         count: of the members.
         vary: one of `VARIED`, see `member_settings`.
         device, threads: as for `TrainSettings`.
-        resume, overwrite, notify, warn: see `train_again`.
+        memory_bytes, resume, overwrite, notify, warn: see `train_again`.
         progress: takes the share of all members that is done and a few words.
 
     Raises:
@@ -93,7 +94,14 @@ def train_members(
             progress((before + share) / count, f"member {before + 1} of {count}  {words}")
 
         train_again(
-            run, {path: settings}, resume=resume, overwrite=overwrite, notify=notify, warn=warn, progress=of_all
+            run,
+            {path: settings},
+            memory_bytes=memory_bytes,
+            resume=resume,
+            overwrite=overwrite,
+            notify=notify,
+            warn=warn,
+            progress=of_all,
         )
         members.append(Run(path))
     return members

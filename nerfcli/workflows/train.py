@@ -160,6 +160,7 @@ def train_again(
     run: Run,
     others: Mapping[Path, TrainSettings],
     *,
+    memory_bytes: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
     notify: Notify = silent,
@@ -175,7 +176,7 @@ def train_again(
         others: the folders to write, and the settings of each.
         resume: go on from their last checkpoints to the budget or step count of their settings.
         overwrite: replace other runs.
-        notify, warn, progress: see `train_scene`.
+        memory_bytes, notify, warn, progress: see `train_scene`.
 
     Raises:
         UserError: the scene is no longer where it was, or is another one by now.
@@ -197,6 +198,7 @@ def train_again(
                 folder,
                 path,
                 settings,
+                memory_bytes=memory_bytes,
                 resume=interrupted or (resume and Run(path).is_trained),
                 overwrite=overwrite,
                 holdout=config.holdout,
