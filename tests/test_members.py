@@ -196,9 +196,20 @@ def test_a_run_without_members_says_how_to_train_them(finished):
         assert "--members 4" in hint
 
 
-@pytest.mark.parametrize("arguments", [("--members", "2", "--dry-run"), ("--members", "1"), ("--vary", "moon")])
-def test_wrong_options_of_members_are_refused(capture, arguments):
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--members", "2", "--dry-run"),
+        ("--members", "2", "--view"),
+        ("--members", "1"),
+        ("--vary", "moon"),
+        ("--members", "2", "--vary", "prior", "--field", "voxels"),
+        ("--members", "2", "--vary", "field", "--with", "antialias"),
+    ],
+)
+def test_wrong_options_of_members_are_refused_before_anything_is_trained(capture, arguments):
     assert nerfcli("train", capture, *QUICK, *arguments).exit_code == 2
+    assert not capture.with_name("spheres-run").exists()
 
 
 def test_the_deviation_is_that_of_the_members_that_have_a_value():

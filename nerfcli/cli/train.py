@@ -173,7 +173,7 @@ def train(
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
     from nerfcli.torchrun import is_first, is_one_of_several, place_on_machine
-    from nerfcli.workflows.members import VARIED, train_members
+    from nerfcli.workflows.members import VARIED, member_settings, train_members
     from nerfcli.workflows.train import train_scene
     from nerfcli.workflows.train_plan import plan_training
 
@@ -309,5 +309,6 @@ def train(
             console.result(run)
 
     if scene == STDIN or not is_scan(Path(scene)):
-        photo_settings()  # a wrong option is refused before anything is read
+        # A wrong option is refused before anything is read.
+        member_settings(photo_settings(), members or 0, vary=vary)
     for_each_input(scene, work)

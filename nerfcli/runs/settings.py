@@ -107,8 +107,8 @@ class TrainSettings:
             )
         if self.random_start and self.field != HashFieldSettings.kind:
             raise UserError(
-                f"a random start does not work with --field {self.field}: it needs the levels of a hash grid",
-                "use --field hash",
+                f"--vary prior does not work with --field {self.field}: it needs the levels of a hash grid",
+                "use --field hash, or another --vary",
                 2,
             )
         if self.components.stereo and not self.components.points and (self.model != "auto" or "points" in self.fixed):
