@@ -23,7 +23,7 @@ _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|old)-(?P<process>\d+)(
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path with the suffix of `path`; renamed to `path` on success, removed on any exception.
+    """Provide a temporary path with the suffix of `path`; renamed to `path` on success, removed on any exception.
 
     Raises:
         UserError: the folder cannot be made or written, or the disk is full.
@@ -41,7 +41,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder that takes the place of `path` on success and is removed on any exception.
+    """Provide a temporary folder that takes the place of `path` on success and is removed on any exception.
 
     A folder that stands at `path` is replaced only in the last step; asking the user comes before.
 
@@ -104,7 +104,7 @@ def _names(folder: Path) -> list[str]:
 
 
 def _lives(process: int) -> bool:
-    """Whether there is a process with this number on this machine; True where one cannot ask."""
+    """Return whether there is a process with this number on this machine; True where one cannot ask."""
     if sys.platform == "win32":
         return True
     try:
@@ -144,7 +144,7 @@ def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, An
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:
-    """The two-line error for a result that could not be written."""
+    """Return the two-line error for a result that could not be written."""
     reason = error.strerror or str(error)
     return UserError(
         f"cannot write {path}: {reason}",

@@ -57,7 +57,7 @@ def messages(child: subprocess.Popen[bytes]) -> Generator[dict[str, Any], None, 
 
 
 def take_stdout() -> Callable[[dict[str, Any]], None]:
-    """In the child: return a function that sends a message; nothing else writes to stdout from here on.
+    """Return a function, in the child, that sends a message; nothing else writes to stdout from here on.
 
     The process ends at once when its stdin closes, which is what happens when the parent dies, however it dies.
     """

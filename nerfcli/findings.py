@@ -37,22 +37,22 @@ class Finding:
 
 
 def verdict_above(number: float, *, look: float, bad: float) -> str:
-    """The verdict on a number that should be small: look from one value on, bad from another."""
+    """Return the verdict on a number that should be small: look from one value on, bad from another."""
     return BAD if number >= bad else LOOK if number >= look else GOOD
 
 
 def verdict_below(number: float, *, look: float, bad: float) -> str:
-    """The verdict on a number that should be large: look below one value, bad below another."""
+    """Return the verdict on a number that should be large: look below one value, bad below another."""
     return BAD if number < bad else LOOK if number < look else GOOD
 
 
 def worst(verdicts: Iterable[str]) -> str:
-    """The worst of the verdicts; good if there is none."""
+    """Return the worst of the verdicts; good if there is none."""
     return max(verdicts, key=VERDICTS.index, default=GOOD)
 
 
 def as_json(finding: Finding) -> dict[str, object]:
-    """The finding as plain values; a number that is not finite is left out."""
+    """Return the finding as plain values; a number that is not finite is left out."""
     number = finding.number
     return {
         "check": finding.check,
@@ -66,5 +66,5 @@ def as_json(finding: Finding) -> dict[str, object]:
 
 
 def several(count: int, singular: str, plural: str = "") -> str:
-    """A count with its noun: 1 photo, 2 photos."""
+    """Return a count with its noun: 1 photo, 2 photos."""
     return f"{count} {singular if count == 1 else plural or singular + 's'}"

@@ -16,7 +16,7 @@ _NAMES_SHOWN = 3
 
 
 def check_holdout(text: str) -> str:
-    """The rule, with the path of a file made absolute.
+    """Return the rule, with the path of a file made absolute.
 
     Raises:
         ValueError: it is none; the message says what was expected.
@@ -35,7 +35,7 @@ def check_holdout(text: str) -> str:
 
 
 def names_held_out(rule: str, names: Iterable[str], *, others: Iterable[str] = ()) -> frozenset[str]:
-    """The names that a rule of `check_holdout` holds out.
+    """Return the names that a rule of `check_holdout` holds out.
 
     Args:
         rule: see the module.

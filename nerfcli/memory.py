@@ -41,7 +41,7 @@ def resident_bytes(pid: int) -> int:
 
 
 def _resident_by_ps(pid: int) -> int:
-    """As `ps` tells it, on systems without /proc."""
+    """Ask `ps`, on systems without /proc."""
     try:
         text = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
     except OSError:

@@ -105,7 +105,7 @@ def is_scene(path: Path) -> bool:
 
 
 def model_folder(path: Path) -> Path | None:
-    """The folder of the COLMAP model in a scene's folder; None where there is none."""
+    """Return the folder of the COLMAP model in a scene's folder; None where there is none."""
     return next((path / name for name in _MODEL_FOLDERS if is_model(path / name)), None)
 
 
@@ -192,7 +192,7 @@ def save(
 
 
 def default_split(names: Iterable[str]) -> frozenset[str]:
-    """The held-out names: sorted, every 8th, from the first on."""
+    """Return the held-out names: sorted, every 8th, from the first on."""
     return frozenset(sorted(names)[::HELD_OUT_EVERY])
 
 
@@ -243,7 +243,7 @@ def _load(path: Path) -> Scene:
 
 
 def _scene(root: Path, capture: Capture) -> Scene:
-    """The scene of a capture in a foreign format, with its own split where it fixes one."""
+    """Return the scene of a capture in a foreign format, with its own split where it fixes one."""
     splits = {frame.split for frame in capture.frames}
     frames = capture.frames
     if "test" in splits or "val" in splits:
@@ -271,7 +271,7 @@ def _scene(root: Path, capture: Capture) -> Scene:
 
 
 def _load_own(root: Path) -> Scene:
-    """The scene that `save` described."""
+    """Load the scene that `save` described."""
     described = read_description(root)
     images = described.image_folder
     if not images.is_dir():
@@ -310,8 +310,8 @@ def _measure_upright(path: Path) -> tuple[int, int, int]:
 
 
 def _image_folder(root: Path, model_dir: Path, model: ColmapModel) -> Path:
-    """Where the photos of a COLMAP project are: the folder beside the model, or beside the folders that it stands in,
-    that holds most of the names; these may begin with the name of such a folder themselves."""
+    """Return where the photos of a COLMAP project are: the folder beside the model, or beside the folders that it
+    stands in, that holds most of the names; these may begin with the name of such a folder themselves."""
     homes = list(dict.fromkeys([root, model_dir, *model_dir.resolve().parents[:3]]))
     folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]
     if not folders:
@@ -324,7 +324,7 @@ def _image_folder(root: Path, model_dir: Path, model: ColmapModel) -> Path:
 
 
 def _relative(path: Path, start: Path) -> str:
-    """A path as seen from a folder, with forward slashes; absolute where there is none (another drive)."""
+    """Return a path as seen from a folder, with forward slashes; absolute where there is none (another drive)."""
     try:
         return Path(os.path.relpath(path.resolve(), start.resolve())).as_posix()
     except ValueError:

@@ -63,7 +63,7 @@ class ResultRow:
 
 
 def rows_of(measured: Sequence[MeasuredTraining], variants: Sequence[Variant]) -> list[ResultRow]:
-    """A row for each variant that was trained at least once, in the order of the variants."""
+    """Return a row for each variant that was trained at least once, in the order of the variants."""
     reference = {entry.seed: entry.psnr for entry in measured if entry.variant == CHOSEN}
     rows = []
     for variant in variants:
@@ -148,7 +148,7 @@ def refuse_foreign(folder: Path) -> None:
 
 
 def table_of(rows: Sequence[ResultRow]) -> list[tuple[str, ...]]:
-    """The cells of a table for people, as `COLUMNS` names them."""
+    """Return the cells of a table for people, as `COLUMNS` names them."""
 
     def difference(row: ResultRow) -> str:
         if row.difference_db is None:

@@ -51,7 +51,7 @@ def distance_to_float64(model: Model, photo: HeldOutPhoto, *, seed: int, count: 
 
 
 def smaller(photo: HeldOutPhoto, factor: float) -> HeldOutPhoto:
-    """The photo with its sides divided by a factor; as it is where that is 1 or less."""
+    """Return the photo with its sides divided by a factor; as it is where that is 1 or less."""
     if factor <= 1.0:
         return photo
     used = None if photo.used is None else downscale(photo.used.astype(np.uint8) * 255, factor) == 255

@@ -28,7 +28,7 @@ def describe_machine(device: str, threads: int) -> dict[str, Any]:
 
 
 def processor_name() -> str:
-    """The CPU's model."""
+    """Return the CPU's model."""
     if _CPU_INFO.exists():
         for line in _CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines():
             if line.startswith("model name"):

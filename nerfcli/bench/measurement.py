@@ -49,7 +49,7 @@ class BenchOptions:
 
 
 def open_bench(subject: BenchedRun, folder: Path, wanted: BenchOptions) -> Records:
-    """The records of this bench in a folder, new or to go on with.
+    """Return the records of this bench in a folder, new or to go on with.
 
     Raises:
         UserError: the folder holds something else.
@@ -151,11 +151,11 @@ def _render(subject: BenchedRun, model: Model, session: Session, *, ends: float)
 
 
 def _title(path: Path) -> str:
-    """The folder's name, with that of its parent where it says little."""
+    """Return the folder's name, with that of its parent where it says little."""
     return f"{path.parent.name}/{path.name}" if path.name in ("run", "scene") else path.name
 
 
 def _ways_to_render(subject: BenchedRun) -> list[RenderSetting]:
-    """All that make a difference on this device: the number of CPU threads is none to a GPU."""
+    """Return all that make a difference on this device: the number of CPU threads is none to a GPU."""
     base = subject.base
     return [way for way in render_settings(base.threads) if base.device == "cpu" or way.threads == base.threads]

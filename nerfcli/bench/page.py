@@ -22,7 +22,7 @@ from nerfcli.pages.tables import table
 
 
 def bench_page(content: Mapping[str, Any], pictures: Mapping[str, str], folder: Path) -> str:
-    """The page's text.
+    """Return the page's text.
 
     Args:
         content: what `summary.summarised` gave.

@@ -23,12 +23,12 @@ class TimeSpread:
 
     @staticmethod
     def of(values: Sequence[float]) -> "TimeSpread":
-        """Of at least one value."""
+        """Summarise at least one value."""
         low, median, high = np.percentile(values, (25, 50, 75))
         return TimeSpread(float(low), float(median), float(high), len(values))
 
     def clearly_below(self, other: "TimeSpread") -> bool:
-        """Whether even the slower repeats were faster than the other's faster ones."""
+        """Return whether even the slower repeats were faster than the other's faster ones."""
         return self.high * SAME_TIME < other.low
 
 
@@ -85,13 +85,13 @@ def least_difference(values: Sequence[float]) -> float | None:
 
 
 def near_best(points: Sequence[SettingResult]) -> SettingResult:
-    """The fastest of those whose error, in dB, is within `NEAR_BEST_DB` of the smallest; at least one point."""
+    """Return the fastest of those whose error, in dB, is within `NEAR_BEST_DB` of the smallest; at least one point."""
     smallest = min(point.error for point in points)
     near = [point for point in points if point.error <= smallest + NEAR_BEST_DB]
     return min(near, key=lambda point: (point.seconds.median, point.error))
 
 
 def at_most(points: Sequence[SettingResult], seconds: float) -> SettingResult | None:
-    """The one with the smallest error among those whose median takes at most some time; None where none does."""
+    """Return the one with the smallest error among those whose median takes at most some time; None where none does."""
     fast = [point for point in points if point.seconds.median <= seconds * SAME_TIME]
     return min(fast, key=lambda point: (point.error, point.seconds.median), default=None)

@@ -20,7 +20,7 @@ class Records:
     folder: Path
 
     def append(self, kind: str, **content: Any) -> None:
-        """One measurement, whole.
+        """Append one measurement, whole.
 
         Raises:
             UserError: it cannot be written.
@@ -33,11 +33,11 @@ class Records:
             raise cannot_write(self.folder / MEASURED, error) from error
 
     def of_kind(self, kind: str) -> Iterator[dict[str, Any]]:
-        """The measurements of one kind, in order."""
+        """Return the measurements of one kind, in order."""
         return (entry for entry in self.all() if entry["kind"] == kind)
 
     def last(self, kind: str) -> dict[str, Any] | None:
-        """The latest of a kind; None where there is none."""
+        """Return the latest of a kind; None where there is none."""
         return next(reversed(list(self.of_kind(kind))), None)
 
     def all(self) -> list[dict[str, Any]]:
@@ -93,7 +93,7 @@ def emptied(folder: Path) -> None:
 
 
 def _end_with_whole_line(path: Path) -> None:
-    """What comes next must not continue a line that a kill cut short."""
+    """End a line that a kill cut short, so that the next record begins a new one."""
     if path.exists() and (data := path.read_bytes()) and not data.endswith(b"\n"):
         with path.open("ab") as file:
             file.write(b"\n")

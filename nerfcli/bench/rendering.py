@@ -93,7 +93,7 @@ def measure_rendering(
 def _planned(
     model: Model, photos: Sequence[HeldOutPhoto], settings: Sequence[RenderSetting], *, session: Session, seconds: float
 ) -> dict[str, Any]:
-    """How many photos, settings and rounds fit, and in which size: by the time of one default picture."""
+    """Return how many photos, settings and rounds fit, and in which size: by the time of one default picture."""
     session.say("rendering a first picture")
     _render(model, photos[0], settings[0])
     began = time.perf_counter()
@@ -131,7 +131,7 @@ def _cost(setting: RenderSetting) -> float:
 
 
 def _converged(model: Model, photos: Sequence[HeldOutPhoto], *, session: Session) -> tuple[np.ndarray, ...]:
-    """The photos' views as the field says them: steps `FINER` times as fine, next to nothing left out."""
+    """Return the photos' views as the field says them: steps `FINER` times as fine, next to nothing left out."""
     pictures, measured = [], {entry["photo"] for entry in session.records.of_kind("converged")}
     for photo in photos:
         path = session.folder / WORK / f"{slug(photo.frame.name)}.npy"
@@ -213,7 +213,7 @@ def _used(picture: RenderedPicture, photo: HeldOutPhoto) -> np.ndarray:
 
 
 def _stored_in(model: Model, precision: str) -> Model:
-    """The model as it comes back from a file of numbers of a precision."""
+    """Return the model as it comes back from a file of numbers of a precision."""
     field = deepcopy(model.field)
     with torch.no_grad():
         for parameter in field.parameters():

@@ -56,7 +56,7 @@ def discard(folder: Path) -> None:
 
 
 def _embedded(content: dict[str, Any], folder: Path) -> dict[str, str]:
-    """The pictures that the points name, as data."""
+    """Return the pictures that the points name, as data."""
     parts = [content[part] for part in ("rendering", "training") if content[part]]
     names = {name for part in parts for point in part["points"] for name in point["pictures"].values()}
     names |= {part["truth"] for part in parts if "truth" in part}

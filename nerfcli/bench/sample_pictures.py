@@ -17,18 +17,20 @@ _COLOURS = "viridis"
 
 
 def slug(name: str) -> str:
-    """A file name for a setting's name."""
+    """Return a file name for a setting's name."""
     return hashlib.sha256(name.encode()).hexdigest()[:12]
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """A small JPEG of (H, W, 3) uint8."""
+    """Write a small JPEG of (H, W, 3) uint8."""
     with atomic_path(path) as partial:
         partial.write_bytes(jpeg_bytes(picture, longest_px=LONGEST_PX))
 
 
 def write_difference(path: Path, one: np.ndarray, other: np.ndarray, *, most: float) -> None:
-    """A small JPEG of the largest difference of a channel of pictures (H, W, 3) in [0, 1]; `most` has the last colour.
+    """Write a small JPEG of the largest difference of a channel of pictures (H, W, 3) in [0, 1].
+
+    `most` has the last colour.
 
     Differences are averaged over the area of a small pixel, not taken between small pictures.
     """

@@ -18,7 +18,7 @@ SAME_QUADRATURE = 0.02
 
 
 def summarised(records: Records, plan: dict[str, Any]) -> dict[str, Any]:
-    """All numbers of a bench as plain values, complete or not.
+    """Return all numbers of a bench as plain values, complete or not.
 
     Args:
         records: the measurements.
@@ -116,8 +116,8 @@ def _training(records: Records) -> dict[str, Any] | None:
 
 
 def longer_and_better(points: Sequence[dict[str, Any]]) -> list[str]:
-    """The trainings that differ from shorter ones in their length alone, and are better than all of these. That more
-    steps help is known beforehand: it takes no significance to believe it."""
+    """Return the trainings that differ from shorter ones in their length alone, and are better than all of these. That
+    more steps help is known beforehand: it takes no significance to believe it."""
     same = [point for point in points if point["group"] in ("default", "time", "run")]
     same.sort(key=lambda point: point["seconds"]["median"])
     best, longer = -math.inf, []
@@ -183,7 +183,7 @@ def _training_advice(training: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _default_unless_better(chosen: SettingResult, default: SettingResult, noise: float) -> SettingResult:
-    """The default where the chosen one takes as long and is not better by more than chance."""
+    """Return the default where the chosen one takes as long and is not better by more than chance."""
     same_time = not chosen.seconds.clearly_below(default.seconds) and not default.seconds.clearly_below(chosen.seconds)
     return default if same_time and default.error - chosen.error <= noise else chosen
 
@@ -191,7 +191,7 @@ def _default_unless_better(chosen: SettingResult, default: SettingResult, noise:
 def _advice(
     part: str, question: str, chosen: SettingResult | None, by_name: dict[str, dict[str, Any]], against: SettingResult
 ) -> dict[str, Any]:
-    """One recommendation; its "point" is None where no setting is fast enough."""
+    """Return one recommendation; its "point" is None where no setting is fast enough."""
     if chosen is None:
         return {"part": part, "question": question, "point": None}
     point = by_name[chosen.name]

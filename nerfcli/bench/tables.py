@@ -32,7 +32,7 @@ _PARETO = "in it"
 
 
 def rendering_rows(rendering: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """A row for each rendering setting, the fastest first."""
+    """Return a row for each rendering setting, the fastest first."""
     return [
         (
             point["name"],
@@ -49,7 +49,7 @@ def rendering_rows(rendering: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def training_rows(training: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """A row for each training, the shortest first, then by PSNR."""
+    """Return a row for each training, the shortest first, then by PSNR."""
     order = sorted(training["points"], key=lambda point: (round(point["seconds"]["median"]), -point["psnr"]))
     return [
         (
@@ -82,7 +82,7 @@ def sentences(content: Mapping[str, Any]) -> list[str]:
 
 
 def write_csv(content: Mapping[str, Any], path: Path) -> None:
-    """All points of both parts, a row each, numbers as they are.
+    """Write all points of both parts, a row each, numbers as they are.
 
     Raises:
         UserError: it cannot be written.
@@ -124,7 +124,7 @@ def command_of(advice: Mapping[str, Any]) -> str:
 
 
 def _advice_in_words(advice: Mapping[str, Any]) -> str:
-    """One sentence, with what to type."""
+    """Return one sentence, with what to type."""
     head = f"{advice['part'].capitalize()}, {advice['question']}: "
     if advice["point"] is None:
         return f"{head}none of the measured settings is fast enough."

@@ -46,7 +46,7 @@ class BenchedRun:
         return self.test_frames[len(self.test_frames) // 2].name
 
     def held_out(self, model: Model) -> list[HeldOutPhoto]:
-        """The held-out photos as `model` is compared with them.
+        """Return the held-out photos as `model` is compared with them.
 
         Raises:
             UserError: a photo cannot be read.
@@ -57,7 +57,7 @@ class BenchedRun:
 
 
 def find_subject(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
-    """The run or scene at a path.
+    """Find the run or scene at a path.
 
     Raises:
         UserError: it is neither, or nothing was held out.
@@ -105,7 +105,7 @@ def _run_at(path: Path, *, device: str, threads: int, seed: int) -> BenchedRun:
 
 
 def _trained(run: Run) -> dict[str, Any]:
-    """What the log says of the training, as records have it; nothing without a log."""
+    """Return what the log says of the training, as records have it; nothing without a log."""
     summary = {} if run.summary is None else run.summary.to_json()
     return {name: value for name, value in summary.items() if name != "rays_per_second"}
 

@@ -82,7 +82,7 @@ def _overhead(session: Session) -> float:
 def _train(
     trainings: Trainings, setting: TrainSetting, unit_seconds: float, title: str, session: Session
 ) -> dict[str, Any]:
-    """The worker's last word: {"result"} or {"error"}."""
+    """Return the worker's last word: {"result"} or {"error"}."""
     prefix = slug(f"training {setting.name}")
     (session.folder / FOLDER).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=session.folder, prefix=".training-") as folder:

@@ -126,7 +126,7 @@ def _train_and_measure(job: dict[str, Any], send: Callable[[dict[str, Any]], Non
 
 
 def _has_compiled(settings: TrainSettings) -> bool:
-    """Whether the CPU kernels have code for a field of this size."""
+    """Return whether the CPU kernels have code for a field of this size."""
     return kernels.has_compiled() and (settings.levels, settings.width) == (TrainSettings.levels, TrainSettings.width)
 
 

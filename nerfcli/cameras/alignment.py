@@ -31,7 +31,7 @@ class Alignment:
 
 
 def align(x: np.ndarray, y: np.ndarray) -> Similarity:
-    """The similarity b_from_a that minimises sum |y - (s R x + t)|^2.
+    """Return the similarity b_from_a that minimises sum |y - (s R x + t)|^2.
 
     With points on a line R is one of many, and with two points s is the ratio of their distances.
 

@@ -59,7 +59,7 @@ class Calibrated:
 
 
 def calibrated(calibration: Calibration, pictures: Sequence[Picture]) -> tuple[Calibrated, ...]:
-    """The camera of each photo, turned and rescaled to its upright picture.
+    """Return the camera of each photo, turned and rescaled to its upright picture.
 
     An image of the file has the photo's name, folders left aside. A photo that is not listed gets the one camera
     of its size, upright or as stored, or else the one camera of its shape.
@@ -106,7 +106,7 @@ def _of_picture(calibration: Calibration, picture: Picture, numbers: Mapping[str
 
 
 def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
-    """Whether a camera has the shape of a picture, lying or upright."""
+    """Return whether a camera has the shape of a picture, lying or upright."""
     camera = calibration.cameras[number]
     shapes = [(picture.width, picture.height)]
     if not calibration.upright and picture.orientation >= 5:
@@ -115,7 +115,7 @@ def _fits(calibration: Calibration, number: int, picture: Picture) -> bool:
 
 
 def _is_shape(camera: Camera, width: int, height: int) -> bool:
-    """Whether a picture of this size can be the camera's picture resized, to rounding."""
+    """Return whether a picture of this size can be the camera's picture resized, to rounding."""
     try:
         camera.resized(width, height)
     except UserError:

@@ -70,7 +70,7 @@ class Camera:
 
     @staticmethod
     def pinhole(width: int, height: int, focal_px: float) -> "Camera":
-        """An ideal camera with square pixels and the principal point in the middle."""
+        """Return an ideal camera with square pixels and the principal point in the middle."""
         return Camera("PINHOLE", width, height, (focal_px, focal_px, width / 2, height / 2))
 
     @property
@@ -103,7 +103,7 @@ class Camera:
         return self._opening_deg(across), self._opening_deg(down)
 
     def bearings(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The directions in which pixels see, through the true lens model.
+        """Return the directions in which pixels see, through the true lens model.
 
         Args:
             pixels: (N, 2) positions x, y in pixels.
@@ -191,7 +191,8 @@ class Camera:
         return np.stack([by_x, by_y], axis=-1) * valid[:, None, None], valid
 
     def pixel_footprint(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The solid angle that a pixel covers, as large as at its centre: 1 / |a x b| with the rows of d pixel / d d.
+        """Return the solid angle that a pixel covers, as large as at its centre: 1 / |a x b| with the rows of d pixel /
+        d d.
 
         A cone of the same solid angle has the radius sqrt(footprint / pi) at distance 1.
 
@@ -213,7 +214,7 @@ class Camera:
         return self.bearings(np.stack([x.ravel(), y.ravel()], axis=-1))
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The camera of the same picture resampled to another size.
+        """Return the camera of the same picture resampled to another size.
 
         Raises:
             UserError: the new size is no resizing of the old one: its aspect differs by more than rounding to pixels.
@@ -247,7 +248,7 @@ class Camera:
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> "Camera":
-        """The camera that `to_json` described.
+        """Return the camera that `to_json` described.
 
         Raises:
             UserError: a key is missing or holds something else than the camera needs.
@@ -274,13 +275,13 @@ class Camera:
 
 @lru_cache(maxsize=256)
 def parameter_names(model: str) -> tuple[str, ...]:
-    """The names of a model's parameters in COLMAP's order, such as ("f", "cx", "cy", "k")."""
+    """Return the names of a model's parameters in COLMAP's order, such as ("f", "cx", "cy", "k")."""
     camera = pycolmap.Camera.create_from_model_name(1, model, 1.0, 2, 2)
     return tuple(name.strip() for name in camera.params_info.split(","))
 
 
 def _complaint(model: str, values: dict[str, float]) -> str:
-    """What is expected of parameters that make no camera; empty where they make one."""
+    """Return what is expected of parameters that make no camera; empty where they make one."""
     focal = [values[name] for name in ("f", "fx", "fy", "w", "h") if name in values]
     if not (np.abs(list(values.values())) < LARGEST_PARAMETER).all() or min(focal) <= 0:
         return "focal lengths must be positive and all parameters finite"

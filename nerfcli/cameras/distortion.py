@@ -110,7 +110,7 @@ class Distortion:
         return np.stack(columns, axis=1) if columns else np.zeros((2, 0, plane.shape[1]))
 
     def invert(self, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The points (2, N) within `reach` that F moves to the targets, and whether there is one, (N,) bool.
+        """Return the points (2, N) within `reach` that F moves to the targets, and whether there is one, (N,) bool.
 
         Where there is none, the point is some point within reach. Exact to rounding.
         """
@@ -123,12 +123,12 @@ class Distortion:
         return (plane, found) if radial_only else self._invert_all(targets, plane)
 
     def _factor(self, square: np.ndarray) -> np.ndarray:
-        """A / B."""
+        """Return a / B."""
         factor = polynomial.polyval(square, (1.0, *self.radial))
         return factor / polynomial.polyval(square, (1.0, *self.divisor)) if self.divisor else factor
 
     def _factor_slope(self, square: np.ndarray) -> np.ndarray:
-        """The derivative of A / B by s."""
+        """Return the derivative of A / B by s."""
         slope = polynomial.polyval(square, polynomial.polyder((1.0, *self.radial)))
         if not self.divisor:
             return slope
@@ -154,7 +154,7 @@ class Distortion:
         return np.interp(goals, heights[finite], knots[finite]), ~(goals >= heights[-1]), float(end)
 
     def _polished(self, radii: np.ndarray, goals: np.ndarray, end: float) -> np.ndarray:
-        """The radii in [0, end] with g = goals, from approximate ones; (N,).
+        """Return the radii in [0, end] with g = goals, from approximate ones; (N,).
 
         Newton's method, which falls back on halving wherever it would leave the interval that holds the root: g grows
         in it, so that the root is the only one.
@@ -178,7 +178,7 @@ class Distortion:
         return polished
 
     def _invert_all(self, targets: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same as `invert` for all terms together, from the solution of the radial ones.
+        """Return the same as `invert` for all terms together, from the solution of the radial ones.
 
         Three steps of Newton's method bring the weak tangential and prism terms of real lenses to rounding. What is
         left then, near the reach or with strong terms, goes on by guarded steps from the start.
@@ -194,7 +194,7 @@ class Distortion:
         return plane, found
 
     def _meets(self, targets: np.ndarray, plane: np.ndarray) -> np.ndarray:
-        """Whether points lie within reach and F moves them to their targets; (N,) bool, False at NaN."""
+        """Return whether points lie within reach and F moves them to their targets; (N,) bool, False at NaN."""
         off = self.apply(plane) - targets
         close = _radius(off) <= 1e-13 * (1 + _radius(targets))
         # Next to a pole F magnifies the rounding of the point itself: there, no step may be left that would count.
@@ -242,14 +242,14 @@ class Distortion:
 
 
 def _in_rho(coefficients: tuple[float, ...]) -> np.ndarray:
-    """The polynomial 1 + c_1 rho^2 + c_2 rho^4 + ... in rho."""
+    """Return the polynomial 1 + c_1 rho^2 + c_2 rho^4 + ... in rho."""
     spread = np.zeros(2 * len(coefficients) + 1)
     spread[0], spread[2::2] = 1.0, coefficients
     return spread
 
 
 def _first_root(coefficients: np.ndarray) -> float:
-    """The smallest positive real root of a polynomial that is 1 at 0; infinite where there is none."""
+    """Return the smallest positive real root of a polynomial that is 1 at 0; infinite where there is none."""
     trimmed = polynomial.polytrim(coefficients, NEGLIGIBLE * np.abs(coefficients).max())
     roots = polynomial.polyroots(trimmed)
     real = roots.real[(np.abs(roots.imag) <= 1e-8 * np.abs(roots)) & (roots.real > 0)]

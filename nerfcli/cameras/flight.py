@@ -108,7 +108,7 @@ def _rotation_curve(rotations: Rotation, turns: np.ndarray, times: np.ndarray) -
 
 
 def _piece(t: np.ndarray, pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """The piece that each t falls into, (n,), and how far along it is, (n, 1) in [0, 1]."""
+    """Return the piece that each t falls into, (n,), and how far along it is, (n, 1) in [0, 1]."""
     piece = np.clip(np.floor(t).astype(int), 0, pieces - 1)
     return piece, (t - piece)[:, None]
 
@@ -131,7 +131,7 @@ def _cut(velocities: np.ndarray, most: np.ndarray) -> np.ndarray:
 
 
 def _without_repeats(poses: np.ndarray) -> np.ndarray:
-    """The poses without those that repeat the one before: a curve needs time between them."""
+    """Return the poses without those that repeat the one before: a curve needs time between them."""
     kept = [poses[0]]
     for pose in poses[1:]:
         if np.abs(pose - kept[-1]).max() > 1e-9:

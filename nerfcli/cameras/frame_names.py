@@ -8,7 +8,7 @@ from nerfcli.errors import UserError
 
 
 def frames_named(frames: Sequence[Frame], names: Sequence[str]) -> tuple[Frame, ...]:
-    """The frames with these names, in the order of the names; one may come twice.
+    """Return the frames with these names, in the order of the names; one may come twice.
 
     A name is the frame's whole name, or its last parts where only one frame ends so: photo.jpg for images/photo.jpg,
     or photo for images/photo.jpg.

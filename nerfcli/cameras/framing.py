@@ -28,7 +28,8 @@ class Window:
 
 
 def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
-    """The camera of the picture at another size; with one of the two given, the other follows the picture's shape.
+    """Return the camera of the picture at another size; with one of the two given, the other follows the picture's
+    shape.
 
     Where the shape differs, the scaled picture covers the new one and is cut off evenly on two sides: scale
     s = max(W / w, H / h), and the principal point moves by (s w - W) / 2 and (s h - H) / 2.
@@ -51,7 +52,7 @@ def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
 
 
 def cropped(camera: Camera, window: Window) -> Camera:
-    """The camera of a part of the picture.
+    """Return the camera of a part of the picture.
 
     Raises:
         UserError: the part is empty or reaches out of the picture, or the picture is equirectangular.
@@ -72,7 +73,7 @@ def cropped(camera: Camera, window: Window) -> Camera:
 
 
 def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
-    """A camera of another lens for the picture's size, its axis through the middle.
+    """Return a camera of another lens for the picture's size, its axis through the middle.
 
     pinhole: focal length (w / 2) / tan(fov / 2), or the camera's own. fisheye: equidistant, radius = focal length *
     angle, focal length w / fov with fov in radians, 180 degrees if not given. equirectangular: the whole sphere, at the
@@ -111,7 +112,7 @@ def with_lens(camera: Camera, lens: str, fov_deg: float | None) -> Camera:
 
 
 def equirectangular(width: int, height: int) -> Camera:
-    """The camera of a picture of all directions.
+    """Return the camera of a picture of all directions.
 
     Raises:
         UserError: it is not twice as wide as high, so that it would be stretched.
@@ -126,7 +127,7 @@ def equirectangular(width: int, height: int) -> Camera:
 
 
 def _shifted(camera: Camera, x: float, y: float) -> Camera:
-    """The camera with its principal point moved, for a picture that was cut off at its left or upper edge."""
+    """Return the camera with its principal point moved, for a picture that was cut off at its left or upper edge."""
     values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
     values["cx"] += x
     values["cy"] += y

@@ -32,7 +32,7 @@ def views_of(frames: Sequence[Frame]) -> np.ndarray:
 
 
 def focus_point(frames: Sequence[Frame], *, depth_hint: float | None = None) -> np.ndarray:
-    """The point that the cameras look at, (3,): the one nearest to their optical axes.
+    """Return the point that the cameras look at, (3,): the one nearest to their optical axes.
 
     It minimises the sum of its distances to the axes (not of their squares, so that a few cameras that look elsewhere
     do not move it), by iteratively reweighted least squares. There is no such point where the axes are parallel, or
@@ -120,7 +120,7 @@ def horizontal_axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mean_direction(directions: np.ndarray) -> np.ndarray:
-    """The normalised mean (3,) of unit vectors (N, 3), without those that are more than 60 degrees off it.
+    """Return the normalised mean (3,) of unit vectors (N, 3), without those that are more than 60 degrees off it.
 
     They are the photos taken with the camera on its side. Where the vectors cancel out it is the first of them.
     """

@@ -125,7 +125,7 @@ class Lens:
 
 
 def lens_of(model: str, values: dict[str, float]) -> Lens:
-    """The lens of one of COLMAP's models.
+    """Return the lens of one of COLMAP's models.
 
     Args:
         model: one of `DISTORTIONS`.
@@ -150,7 +150,7 @@ def lens_of(model: str, values: dict[str, float]) -> Lens:
 
 
 def _projection(model: str, values: dict[str, float]) -> tuple[Projection, list[dict[str, float]]]:
-    """A model's projection, and of each of its parameters the share that each of the model's has in it."""
+    """Return a model's projection, and of each of its parameters the share that each of the model's has in it."""
     if model == "EQUIRECTANGULAR":
         return Equirectangular(), []
     if model == "FOV":
@@ -163,7 +163,7 @@ def _projection(model: str, values: dict[str, float]) -> tuple[Projection, list[
 
 
 def _where_seen(directions: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The directions, with the optical axis in place of those that are not seen."""
+    """Return the directions, with the optical axis in place of those that are not seen."""
     return np.where(seen, directions, np.array([[0.0], [0.0], [1.0]]))
 
 

@@ -25,7 +25,7 @@ def changeable(camera: Camera) -> tuple[str, ...]:
 
 
 def changed(camera: Camera, names: Sequence[str], values: np.ndarray) -> Camera:
-    """The camera with a change.
+    """Return the camera with a change.
 
     focal length exp(values[focal]) times as long;  k + values[k] for a radial term k
 

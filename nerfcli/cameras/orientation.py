@@ -63,8 +63,8 @@ def fit_to_picture(
 
 
 def turn_to_upright(camera: Camera, *, path: Path, measure: Measure) -> tuple[int, tuple[int, int]]:
-    """The EXIF orientation by which a camera's picture is to be turned upright, 1 if it is so already, and the size of
-    the picture on disk that the camera is for, which may be a resized one of the camera's.
+    """Return the EXIF orientation by which a camera's picture is to be turned upright, 1 if it is so already, and the
+    size of the picture on disk that the camera is for, which may be a resized one of the camera's.
 
     Raises:
         UserError: the EXIF orientation mirrors the picture.
@@ -123,13 +123,13 @@ def turned_pixels(pixels: np.ndarray, sizes: np.ndarray, *, orientation: int) ->
 
 
 def turn_back(orientation: int) -> int:
-    """The EXIF orientation that undoes another one."""
+    """Return the EXIF orientation that undoes another one."""
     return {6: 8, 8: 6}.get(orientation, orientation)
 
 
 def rescaling(calibrated: Camera, fitted: Camera) -> tuple[Size, Size] | None:
-    """The size that a calibration was for and that of the picture that it was fitted to, both upright; None where they
-    are the same."""
+    """Return the size that a calibration was for and that of the picture that it was fitted to, both upright; None
+    where they are the same."""
     size, other = (fitted.width, fitted.height), (calibrated.width, calibrated.height)
     if size in (other, other[::-1]):
         return None
@@ -152,5 +152,5 @@ def describe_rescaling(rescaled: Mapping[tuple[Size, Size], int]) -> list[str]:
 
 
 def _shape_error(camera: Camera, size: tuple[int, int]) -> float:
-    """How many pixels a size is off the camera's aspect."""
+    """Return how many pixels a size is off the camera's aspect."""
     return abs(camera.height * size[0] / camera.width - size[1])

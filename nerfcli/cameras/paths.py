@@ -33,7 +33,7 @@ _INSIDE = 0.8
 def orbit(
     frames: Sequence[Frame], *, count: int, depth_hint: float | None = None, up: np.ndarray | None = None
 ) -> tuple[Frame, ...]:
-    """A closed path around the focus point, looking at it.
+    """Return a closed path around the focus point, looking at it.
 
     Where the cameras surround the focus: once around, at their mean elevation, on an ellipse fitted to their distances.
     Where they stand on one side: a small ellipse within the angles from which they look at the focus.
@@ -70,7 +70,7 @@ def orbit(
 def ellipse(
     frames: Sequence[Frame], *, count: int, depth_hint: float | None = None, up: np.ndarray | None = None
 ) -> tuple[Frame, ...]:
-    """A closed level ellipse about the focus point, at the cameras' mean height, looking at the focus.
+    """Return a closed level ellipse about the focus point, at the cameras' mean height, looking at the focus.
 
     Its axes are the principal axes of the cameras on the ground, and each reaches as far to both sides of the focus as
     nine of ten cameras do. Unlike `orbit` it goes once around wherever the cameras stand: behind the scene too.
@@ -114,7 +114,8 @@ def ellipse(
 def spiral(
     frames: Sequence[Frame], *, count: int, turns: int = 2, depth_hint: float | None = None
 ) -> tuple[Frame, ...]:
-    """A closed spiral about the mean camera, in the box that the cameras fill, looking at a point as deep as the focus.
+    """Return a closed spiral about the mean camera, in the box that the cameras fill, looking at a point as deep as the
+    focus.
 
     For cameras that surround the scene, where the mean camera would stand amid it, the quarter of them
     nearest to the middle one is used.
@@ -155,7 +156,8 @@ def spiral(
 
 
 def interpolate(frames: Sequence[Frame], *, count: int) -> tuple[Frame, ...]:
-    """A smooth flight through the frames in their order, from the first to the last, at constant speed: see `fly`.
+    """Return a smooth flight through the frames in their order, from the first to the last, at constant speed: see
+    `fly`.
 
     Raises:
         ValueError: no frame, or count below 1.
@@ -202,7 +204,9 @@ def _ellipse(azimuth: np.ndarray, distances: np.ndarray) -> Callable[[np.ndarray
 
 
 def _sway(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """A small ellipse in azimuth and elevation about the focus, at the mean distance, within the cameras' angles."""
+    """Return a small ellipse in azimuth and elevation about the focus, at the mean distance, within the cameras'
+    angles.
+    """
     towards = mean_direction(offsets / distances[:, None])
     # Azimuth and elevation are about `up`, unless the cameras look down so steeply that it is no axis.
     pole = up if abs(towards @ up) < 0.9 else np.cross(towards, horizontal_axes(towards)[0])

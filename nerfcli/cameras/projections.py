@@ -271,7 +271,7 @@ class Equirectangular:
 
 
 def _unit(plane: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The unit directions along (plane, z), and whether their length is a number."""
+    """Return the unit directions along (plane, z), and whether their length is a number."""
     length = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + z * z)
     return np.stack([*(plane / length), z / length]), np.asarray(np.isfinite(length))
 

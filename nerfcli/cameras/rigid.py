@@ -17,7 +17,7 @@ SERIES_BELOW = 0.25
 
 
 def inverse(b_from_a: np.ndarray) -> np.ndarray:
-    """The inverse `a_from_b` of rigid transforms (..., 4, 4), by transposing the rotation: no linear solve."""
+    """Return the inverse `a_from_b` of rigid transforms (..., 4, 4), by transposing the rotation: no linear solve."""
     b_from_a = np.asarray(b_from_a, dtype=np.float64)
     rotation = np.swapaxes(b_from_a[..., :3, :3], -1, -2)
     a_from_b = np.zeros_like(b_from_a)
@@ -44,7 +44,7 @@ def apply(b_from_a: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def from_parts(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """The transform (..., 4, 4) with the given rotation (..., 3, 3) and translation (..., 3)."""
+    """Return the transform (..., 4, 4) with the given rotation (..., 3, 3) and translation (..., 3)."""
     rotation, translation = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
     b_from_a = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
     b_from_a[..., :3, :3] = rotation
@@ -122,7 +122,7 @@ def transform_from_twist(twist: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """The rotation (..., 3, 3) nearest in the Frobenius norm to a matrix that rounding has bent a little."""
+    """Return the rotation (..., 3, 3) nearest in the Frobenius norm to a matrix that rounding has bent a little."""
     u, _, vt = np.linalg.svd(matrix)
     sign = np.sign(np.linalg.det(u @ vt))
     return (u * np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)[..., None, :]) @ vt
@@ -159,7 +159,7 @@ class Similarity:
 
     @staticmethod
     def identity() -> "Similarity":
-        """The similarity that changes nothing."""
+        """Return the similarity that changes nothing."""
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
@@ -172,7 +172,7 @@ class Similarity:
         return from_parts(self.rotation @ world_from_cam[..., :3, :3], self.apply(world_from_cam[..., :3, 3]))
 
     def inverse(self) -> "Similarity":
-        """The map back: a = rotation.T @ (b - translation) / scale."""
+        """Return the map back: a = rotation.T @ (b - translation) / scale."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
@@ -181,7 +181,7 @@ class Similarity:
         return Similarity(self.scale * inner.scale, self.rotation @ inner.rotation, self.apply(inner.translation))
 
     def matrix(self) -> np.ndarray:
-        """The homogeneous matrix (4, 4); its upper left block is scale * rotation, so it is not rigid."""
+        """Return the homogeneous matrix (4, 4); its upper left block is scale * rotation, so it is not rigid."""
         return from_parts(self.scale * self.rotation, self.translation)
 
     def to_json(self) -> dict[str, Any]:
@@ -194,7 +194,7 @@ class Similarity:
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> "Similarity":
-        """The similarity that `to_json` described.
+        """Return the similarity that `to_json` described.
 
         Raises:
             UserError: a key is missing, a shape or number is wrong, or the rotation is none.

@@ -18,7 +18,8 @@ ORIGINS = ("centre-of-cameras", "focus")
 
 
 def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
-    """The same capture in another world frame: poses and points are mapped, depths along the cameras' axes scaled.
+    """Return the same capture in another world frame: poses and points are mapped, depths along the cameras' axes
+    scaled.
 
     Pictures, observations and cameras stay as they are, since a similarity changes no angle. The unit stays what it is
     under rotation and translation, and becomes "arbitrary" where lengths change.
@@ -37,7 +38,7 @@ def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
 
 
 def turned_up(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = None) -> Similarity:
-    """The smallest rotation about the origin that turns what is up along an axis of the new frame.
+    """Return the smallest rotation about the origin that turns what is up along an axis of the new frame.
 
     Args:
         frames: tell which way is up, by `up_direction`.
@@ -60,7 +61,7 @@ def turned_up(frames: Sequence[Frame], axis: str, *, up: np.ndarray | None = Non
 
 
 def moved_to_origin(frames: Sequence[Frame], origin: str, *, depth_hint: float | None = None) -> Similarity:
-    """The translation that brings a place of the old frame to the origin of the new one.
+    """Return the translation that brings a place of the old frame to the origin of the new one.
 
     Args:
         frames: the capture's cameras.
@@ -80,7 +81,7 @@ def moved_to_origin(frames: Sequence[Frame], origin: str, *, depth_hint: float |
 
 
 def point_of(text: str, hint: str) -> np.ndarray:
-    """The point (3,) that "x,y,z" names.
+    """Return the point (3,) that "x,y,z" names.
 
     Raises:
         UserError: something else; `hint` tells what was expected.
@@ -95,7 +96,7 @@ def point_of(text: str, hint: str) -> np.ndarray:
 
 
 def smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) by the smallest angle that turns unit vector a into unit vector b; exact at any angle.
+    """Return the rotation (3, 3) by the smallest angle that turns unit vector a into unit vector b; exact at any angle.
 
     Two half turns, about a and about the bisector w, make it: (2 w w^T - 1)(2 a a^T - 1). Where a and b are nearly
     opposite, w is lost to rounding; there the rotation goes by way of a vector between them.

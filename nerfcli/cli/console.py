@@ -38,16 +38,16 @@ class Console:
         self.json_lines = json_lines
 
     def result(self, path: Path, content: dict[str, Any] | None = None) -> None:
-        """One result on stdout: its path, or with --json a line with the path and more."""
+        """Print one result on stdout: its path, or with --json a line with the path and more."""
         line = json.dumps({"path": str(path), **(content or {})}) if self.json_lines else str(path)
         print(line, flush=True)  # noqa: T201 - the one place that writes results
 
     def address(self, url: str) -> None:
-        """The address of a page as a result on stdout."""
+        """Print the address of a page as a result on stdout."""
         print(json.dumps({"url": url}) if self.json_lines else url, flush=True)  # noqa: T201 - a result, as above
 
     def fact(self, content: dict[str, Any]) -> None:
-        """One result that is no file: a line of JSON on stdout."""
+        """Print one result that is no file: a line of JSON on stdout."""
         print(json.dumps(content), flush=True)  # noqa: T201 - a result, as above
 
     def fact_table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str]) -> None:
@@ -56,16 +56,16 @@ class Console:
         _print_table(columns, rows, styles=styles, width=width, file=sys.stdout)
 
     def note(self, text: str) -> None:
-        """A line for the user to know."""
+        """Print a line for the user."""
         if not self.quiet:
             _stderr(text)
 
     def warn(self, text: str) -> None:
-        """A line for the user to mind."""
+        """Print a warning for the user."""
         _stderr(f"Warning: {text}")
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[str]], *, styles: Mapping[str, str]) -> None:
-        """A table for the user to read; a cell that is a key of `styles` is coloured so."""
+        """Print a table for the user; a cell that is a key of `styles` is coloured so."""
         if self.quiet:
             return
         width = None if sys.stderr.isatty() else PLAIN_TABLE_WIDTH
@@ -73,7 +73,7 @@ class Console:
 
     @contextmanager
     def progress(self, title: str) -> Iterator[Callable[[float, str], None]]:
-        """A bar on a terminal, a plain line now and then elsewhere, from the first update on.
+        """Show a bar on a terminal, a plain line now and then elsewhere, from the first update on.
 
         Yields:
             update(share in [0, 1], detail): to be called as often as one likes.

@@ -302,8 +302,8 @@ def _pixel_centre(text: str | None, option: str) -> float | None:
 
 
 def _named_for(path: Path) -> Path:
-    """The place that a result among many is named after: a file without its suffix, or its folder where its name is one
-    that all captures of its format have."""
+    """Return the place that a result among many is named after: a file without its suffix, or its folder where its name
+    is one that all captures of its format have."""
     if not path.is_file():
         return path
     return path.parent if path.stem in COMMON_STEMS else path.with_suffix("")

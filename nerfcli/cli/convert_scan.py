@@ -29,7 +29,7 @@ OF_BOTH = ("source", "target", "to", "detect", "overwrite", "json", "quiet")
 
 
 def scan_work(values: dict[str, Any], defaults: dict[str, Any], console: Console) -> Callable[[Path, bool], bool]:
-    """What does the command for an input that is a scan, and returns False for any other.
+    """Return a function that does the command for a scan, and returns False for any other input.
 
     Args:
         values: of all parameters of the command, by name.

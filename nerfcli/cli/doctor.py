@@ -100,7 +100,7 @@ def doctor(
 
 
 def _examine_run(path: Path, folder: Path, console: Console, *, count: int, threads: int, overwrite: bool) -> None:
-    """The same for a run: what its photos have seen."""
+    """Examine a run: what its photos have seen."""
     from nerfcli.workflows.next_views import examine_run
 
     with console.progress(f"doctor {path.name}") as update:
@@ -123,7 +123,7 @@ def _examine_run(path: Path, folder: Path, console: Console, *, count: int, thre
 
 
 def _examine_scan(path: Path, page: Path, console: Console, *, overwrite: bool, require: str | None) -> None:
-    """The same for a scan by transmission."""
+    """Examine a scan by transmission."""
     from nerfcli.workflows.scans import examine_scan_input, scan_diagnosis_record
 
     with console.progress(f"doctor {path.name}") as update:

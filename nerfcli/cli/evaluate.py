@@ -179,7 +179,7 @@ def evaluate(
 
 
 def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
-    """The requirements of --require.
+    """Return the requirements of --require.
 
     Raises:
         typer.BadParameter: they cannot be read.

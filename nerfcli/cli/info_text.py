@@ -60,7 +60,7 @@ def _what(facts: dict[str, Any]) -> Iterator[str]:
 
 
 def _maps(facts: dict[str, Any]) -> Iterator[str]:
-    """The range of each map; lengths with their unit."""
+    """Yield the range of each map; lengths with their unit."""
     meaning = facts.get("meaning") or {}
     unit = {"metre": " m", "arbitrary": " units"}.get(meaning.get("unit", ""), "")
     for name, of_map in facts.get("maps", {}).items():
@@ -137,8 +137,8 @@ def _number(value: Any) -> str:
 
 
 def cost_lines(costs: dict[str, dict[str, Any]]) -> list[str]:
-    """A table: a line per kind. Operations are multiplications and additions, forward; bytes are those of rows and of
-    layers' values."""
+    """Return a table: a line per kind. Operations are multiplications and additions, forward; bytes are those of rows
+    and of layers' values."""
     rows: list[tuple[str, ...]] = [HEADINGS]
     for kind, cost in costs.items():
         held, sample, picture = cost["bytes"], cost["per_sample"], cost["per_picture"]

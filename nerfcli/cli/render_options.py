@@ -57,7 +57,7 @@ DepthScale = Annotated[
 
 
 def depth_formats(text: str, *, outputs: tuple[str, ...], convention: str) -> tuple[str, ...]:
-    """The formats in a comma-separated list.
+    """Return the formats in a comma-separated list.
 
     Raises:
         typer.BadParameter: an unknown one, or one that cannot hold what is asked for.
@@ -105,7 +105,7 @@ def finite(value: float | None, option: str) -> None:
 
 
 def tolerance_of(text: str) -> float:
-    """A number or a fraction above 0 and at most 1.
+    """Return a number or a fraction above 0 and at most 1.
 
     Raises:
         typer.BadParameter: anything else.

@@ -82,7 +82,7 @@ def slices_of(texts: list[str]) -> tuple[tuple[str, float], ...]:
 
 
 def is_of_scan(run: str, *, outputs: str | None, slices: list[str] | None) -> bool:
-    """Whether the options of render, or the only run it gets, are those of a scan."""
+    """Return whether the options of render, or the only run it gets, are those of a scan."""
     from nerfcli.tomography.result import OUTPUTS, is_reconstruction
 
     if slices or (outputs is not None and set(outputs.split(",")) & set(OUTPUTS)):

@@ -23,7 +23,7 @@ _DIRECTIONS = {"r": (1, 0, 0), "l": (-1, 0, 0), "d": (0, 1, 0), "u": (0, -1, 0),
 
 
 def opencv_from_axes(axes: str) -> np.ndarray:
-    """The rotation (4, 4) whose columns say where the axes of a camera point in OpenCV's.
+    """Return the rotation (4, 4) whose columns say where the axes of a camera point in OpenCV's.
 
     Args:
         axes: a name ("opencv", "opengl", "llff", "pytorch3d", "ros") or three letters such as "rub".
@@ -44,7 +44,7 @@ def opencv_from_axes(axes: str) -> np.ndarray:
 
 
 def all_axes() -> Iterator[str]:
-    """The 24 right-handed camera axes: names where they have one, else letters; the named ones first."""
+    """Yield the 24 right-handed camera axes: names where they have one, else letters; the named ones first."""
     yield from NAMED_AXES
     for pairs in permutations(("rl", "du", "fb")):
         for letters in product(*pairs):
@@ -72,7 +72,7 @@ class Convention:
 
 
 def reinterpreted(capture: Capture, meant: Convention, *, parsed_axes: str) -> Capture:
-    """The capture that a file describes if its numbers are meant in another convention than its format's.
+    """Return the capture that a file describes if its numbers are meant in another convention than its format's.
 
     Args:
         capture: as it was parsed, by the format's own convention.
@@ -103,7 +103,9 @@ def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Cap
 
 
 def reinterpreted_poses(world_from_cam: np.ndarray, meant: Convention, *, parsed_axes: str) -> np.ndarray:
-    """The poses (frames, 4, 4), OpenCV axes, that a file holds if it is meant in another convention than parsed."""
+    """Return the poses (frames, 4, 4), OpenCV axes, that a file holds if it is meant in another convention than
+    parsed.
+    """
     in_file = world_from_cam @ opencv_from_axes(parsed_axes)
     if meant.inverted:
         in_file = rigid.inverse(in_file)
@@ -128,7 +130,7 @@ def for_picture(camera: Camera, intrinsics_scale: float) -> Camera:
 
 
 def shifted(camera: Camera, shift_px: float) -> Camera:
-    """The camera with its principal point moved by the same number of pixels in x and y."""
+    """Return the camera with its principal point moved by the same number of pixels in x and y."""
     if shift_px == 0 or camera.is_spherical:
         return camera
     return _changed(camera, ("cx", "cy"), lambda value: value + shift_px)

@@ -17,7 +17,7 @@ _CAMERAS_FILES = ("cameras.bin", "cameras.txt")
 
 
 def read_intrinsics(path: Path) -> Camera:
-    """The camera in a file, see `read_calibration`.
+    """Read the camera in a file, see `read_calibration`.
 
     Raises:
         UserError: no camera, several different ones, or a damaged file.
@@ -31,8 +31,8 @@ def read_intrinsics(path: Path) -> Camera:
 
 
 def read_calibration(path: Path, *, images: Path | None = None) -> Calibration:
-    """The cameras in a file: as JSON {"model", "width", "height", "params"}, COLMAP's cameras.txt or cameras.bin, or of
-    any capture, a file or a folder.
+    """Read the cameras in a file: as JSON {"model", "width", "height", "params"}, COLMAP's cameras.txt or cameras.bin,
+    or of any capture, a file or a folder.
 
     Args:
         path: the file or folder.
@@ -73,12 +73,12 @@ def _no_cameras(path: Path) -> UserError:
 
 
 def _alone(folder: Path) -> Path | None:
-    """The cameras file of a folder that holds nothing else of a model."""
+    """Return the cameras file of a folder that holds nothing else of a model."""
     return next((folder / name for name in _CAMERAS_FILES if (folder / name).is_file()), None)
 
 
 def _is_own(model_dir: Path) -> bool:
-    """Whether a model is that of a scene as nerfcli poses writes it."""
+    """Return whether a model is that of a scene as nerfcli poses writes it."""
     return (model_dir.resolve().parent.parent / SCENE_FILE).is_file() and model_dir.resolve().match(MODEL_FOLDER)
 
 

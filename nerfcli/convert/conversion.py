@@ -158,7 +158,7 @@ def convert(capture: Capture, target: Path, *, source_format: str, wanted: Targe
 
 
 def _pixels(form: Format, wanted: TargetOptions, capture: Capture) -> str:
-    """The pixels that the cameras of the written file shall refer to."""
+    """Return the pixels that the cameras of the written file shall refer to."""
     if form.name == "nerfcli" and wanted.pixels == STORED:
         raise UserError("the nerfcli format always uses upright photos", "remove --pixels", exit_code=2)
     return wanted.pixels or form.pixels or capture.pixels
@@ -177,7 +177,7 @@ def _orientation_notes(turned: Turned) -> tuple[str, ...]:
 
 
 def _convention(form: Format, wanted: TargetOptions) -> Convention:
-    """The convention of the file to be written.
+    """Return the convention of the file to be written.
 
     Raises:
         UserError: one that the format does not leave open.
@@ -225,7 +225,9 @@ def _does_not_hold(path: Path, verification: Verification) -> UserError:
 
 
 def _loss_px(capture: Capture, left: Capture) -> float:
-    """How far apart a capture and what is left of it show the same points, at most, within the first one's pictures."""
+    """Return how far apart a capture and what is left of it show the same points, at most, within the first one's
+    pictures.
+    """
     if all(one.camera == other.camera for one, other in zip(capture.frames, left.frames, strict=True)):
         return 0.0
     probes = probes_of(capture)
@@ -233,7 +235,7 @@ def _loss_px(capture: Capture, left: Capture) -> float:
 
 
 def _files(form: Format, path: Path) -> list[Path]:
-    """All files that a format may write at `path`."""
+    """Return all files that a format may write at `path`."""
     folder = path.parent if form.default_name else path
     return [folder / name.replace("*", path.stem) for name in form.files]
 

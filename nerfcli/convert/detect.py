@@ -153,7 +153,7 @@ def _evidence(capture: Capture, progress: Callable[[float, str], None]) -> Evide
 
 
 def _different_axes(declared: str) -> Iterable[str]:
-    """All camera axes, the declared ones first and under the name that they have there."""
+    """Return all camera axes, the declared ones first and under the name that they have there."""
     yield declared
     own = opencv_from_axes(declared)
     yield from (axes for axes in all_axes() if not np.array_equal(opencv_from_axes(axes), own))
@@ -165,7 +165,7 @@ def _axes_and_scale(
     conventions: list[Convention],
     declared: Convention,
 ) -> tuple[Convention, Question]:
-    """The best convention, its scale included, and the question for axes and direction at that scale."""
+    """Return the best convention, its scale included, and the question for axes and direction at that scale."""
     tried = []
     for scale in SCALES:
         directions = evidence.directions(Intrinsics(scale))
@@ -232,7 +232,7 @@ def _same(name: str, convention: Convention, declared: Convention) -> bool:
 def _interval(
     best: np.ndarray, second: np.ndarray, groups: np.ndarray, statistic: Callable[[np.ndarray], float]
 ) -> tuple[float, float]:
-    """The 99 % interval of how much smaller the statistic of `best` is, when the photos are drawn again.
+    """Return the 99 % interval of how much smaller the statistic of `best` is, when the photos are drawn again.
 
     Where there are few photos, the items themselves are drawn.
     """

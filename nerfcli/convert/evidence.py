@@ -54,11 +54,11 @@ class ObservationEvidence:
         self.name = f"{len(rows)} observations of points in {len(np.unique(self.groups))} photos"
 
     def directions(self, intrinsics: Intrinsics) -> tuple[np.ndarray, ...]:
-        """What the pixels see: unit directions (M, 3), their validity and their pixels per radian."""
+        """Return what the pixels see: unit directions (M, 3), their validity and their pixels per radian."""
         return _directions(self._cameras, self.groups, self._pixels, intrinsics)
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
-        """The error of each observation, (M,)."""
+        """Return the error of each observation, (M,)."""
         seen, valid, focal_px = directions
         cam_from_world = rigid.inverse(world_from_cam)[self.groups]
         towards = np.einsum("mij,mj->mi", cam_from_world[:, :3, :3], self._points) + cam_from_world[:, :3, 3]
@@ -88,13 +88,13 @@ class MatchEvidence:
         self.name = f"{len(self.groups)} SIFT matches in {len(pairs)} pairs of photos"
 
     def directions(self, intrinsics: Intrinsics) -> tuple[np.ndarray, ...]:
-        """What both pixels of the matches see: unit directions (M, 3) twice, validity, pixels per radian."""
+        """Return what both pixels of the matches see: unit directions (M, 3) twice, validity, pixels per radian."""
         first, valid1, focal1 = _directions(self._cameras, self._first, self._first_pixels, intrinsics)
         second, valid2, focal2 = _directions(self._cameras, self._second, self._second_pixels, intrinsics)
         return first, second, valid1 & valid2, (focal1 + focal2) / 2
 
     def errors_px(self, directions: tuple[np.ndarray, ...], world_from_cam: np.ndarray) -> np.ndarray:
-        """The error of each match, (M,)."""
+        """Return the error of each match, (M,)."""
         first, second, valid, focal_px = directions
         second_from_first = rigid.inverse(world_from_cam[self._second]) @ world_from_cam[self._first]
         rotation, t = second_from_first[:, :3, :3], second_from_first[:, :3, 3]

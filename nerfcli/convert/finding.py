@@ -34,32 +34,32 @@ def by_suffix(suffix: str, *names: str) -> Callable[[Path], Path | None]:
 
 
 def find_scene(path: Path) -> Path | None:
-    """The folder of a nerfcli scene."""
+    """Find the folder of a nerfcli scene."""
     folder = path.parent if path.name == SCENE_FILE else path
     return folder if (folder / SCENE_FILE).is_file() else None
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of a COLMAP model, or the one that a file of it is in."""
+    """Find the folder of a COLMAP model, or the one that a file of it is in."""
     if path.is_file():
         return path.parent if path.name in MODEL_FILES and is_model(path.parent) else None
     return next((path / name for name in _MODEL_FOLDERS if is_model(path / name)), None)
 
 
 def find_blender(path: Path) -> Path | None:
-    """A folder with a file of the Blender scenes."""
+    """Find a folder with a file of the Blender scenes."""
     return path if any((path / f"transforms_{split}.json").is_file() for split in ("train", "test", "val")) else None
 
 
 def find_llff(path: Path) -> Path | None:
-    """The folder of a poses_bounds.npy."""
+    """Find the folder of a poses_bounds.npy."""
     if path.is_file():
         return path.parent if path.name == "poses_bounds.npy" else None
     return path if (path / "poses_bounds.npy").is_file() else None
 
 
 def find_json(path: Path, *, opening: str, name: str) -> Path | None:
-    """A JSON file that begins with a bracket or a brace, or the one with this name in a folder."""
+    """Find a JSON file that begins with a bracket or a brace, or the one with this name in a folder."""
     if not path.is_file():
         return path / name if (path / name).is_file() else None
     if path.suffix.lower() != ".json":
@@ -69,7 +69,7 @@ def find_json(path: Path, *, opening: str, name: str) -> Path | None:
 
 
 def find_camera_path(path: Path) -> Path | None:
-    """A JSON file that has the key camera_path and no frames, or the file camera_path.json of a folder."""
+    """Find a JSON file that has the key camera_path and no frames, or the file camera_path.json of a folder."""
     found = find_json(path, opening="{", name="camera_path.json")
     if found is None or path.is_dir():
         return found
@@ -80,7 +80,7 @@ def find_camera_path(path: Path) -> Path | None:
 
 
 def find_lines(path: Path, *, columns: int) -> Path | None:
-    """A text file whose first line that is no comment has so many words."""
+    """Find a text file whose first line that is no comment has so many words."""
     if not path.is_file() or path.suffix.lower() != ".txt":
         return None
     with path.open(encoding="utf-8-sig", errors="replace") as stream:

@@ -104,7 +104,7 @@ class Format:
 
 
 def recognise(path: Path) -> tuple[Format, Path]:
-    """The format of the capture in a file or folder, and the file or folder in it that is to be parsed.
+    """Return the format of the capture in a file or folder, and the file or folder in it that is to be parsed.
 
     Raises:
         UserError: nothing there, or nothing that is known; what was looked for is listed.
@@ -122,7 +122,7 @@ def recognise(path: Path) -> tuple[Format, Path]:
 
 
 def format_named(name: str) -> Format:
-    """The format of that name.
+    """Return the format of that name.
 
     Raises:
         UserError: there is none.
@@ -143,7 +143,9 @@ def recording(form: Format, provenance: Mapping[str, Any]) -> Format:
 
 
 def with_photos(capture: Capture, folder: Path) -> Capture:
-    """The capture with its photos looked up in another folder: under their names there, or under their file names."""
+    """Return the capture with its photos looked up in another folder: under their names there, or under their file
+    names.
+    """
     frames = []
     for frame in capture.frames:
         candidates = (folder / frame.name, folder / Path(frame.name).name)
@@ -166,7 +168,9 @@ def _parse_scene(path: Path, given: Given) -> Capture:
 
 
 def _parse_model(path: Path, given: Given) -> Capture:
-    """A COLMAP model, with the photos where its names lead to one: below images/ beside it, or below its project."""
+    """Read a COLMAP model, with the photos where its names lead to one: below images/ beside it, or below its
+    project.
+    """
     capture = parse_colmap(path)
     homes = (path, *path.resolve().parents[:3])
     folders = [home / name for home in homes for name in IMAGE_FOLDERS if (home / name).is_dir()]

@@ -60,7 +60,7 @@ def _photo(frame: Frame) -> tuple[Camera, Features]:
 
 
 def _stored_or_shown(camera: Camera, path: Path) -> tuple[np.ndarray, Camera]:
-    """The grey photo, as stored or turned upright by its EXIF orientation, and the camera for its size."""
+    """Return the grey photo, as stored or turned upright by its EXIF orientation, and the camera for its size."""
     data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     error = UserError(f"{path} is not a readable picture", "replace it, or remove it from the folder")
     for flag in (cv2.IMREAD_IGNORE_ORIENTATION, 0):

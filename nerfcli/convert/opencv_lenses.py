@@ -34,7 +34,9 @@ class FileLens:
 
 
 def project(lens: FileLens, points_cam: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) of points (N, 3) in OpenCV camera axes; meaningless for points that the lens does not see."""
+    """Return pixels (N, 2) of points (N, 3) in OpenCV camera axes; meaningless for points that the lens does not
+    see.
+    """
     if not len(points_cam):
         return np.zeros((0, 2))
     points = np.ascontiguousarray(points_cam, dtype=np.float64)[:, None]
@@ -59,7 +61,7 @@ def _matrix_and_terms(lens: FileLens) -> tuple[np.ndarray, tuple[float, ...]]:
 
 
 def _fisheye_pixels(lens: FileLens, points: np.ndarray) -> np.ndarray:
-    """The equidistant fisheye, theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8), which may see behind itself.
+    """Return the equidistant fisheye, theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8), which may see behind itself.
 
     cv2.fisheye.projectPoints has the same formula, but divides by z and so ends at 90 degrees.
     """

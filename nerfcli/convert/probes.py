@@ -36,7 +36,8 @@ class Probes:
 
 
 def probes_of(capture: Capture) -> Probes:
-    """The capture's points that lie in front of its cameras and inside their pictures, and synthetic ones besides.
+    """Return the capture's points that lie in front of its cameras and inside their pictures, and synthetic ones
+    besides.
 
     All pairs of a view and a point are tried, or `MOST_PAIRS` random ones, equally many for each view. The choice is
     the same at every call.
@@ -57,7 +58,7 @@ def probes_of(capture: Capture) -> Probes:
 
 
 def distinct(items: Sequence[Hashable]) -> tuple[list, np.ndarray]:
-    """The different items in the order of their first appearance, and which of them each item is."""
+    """Return the different items in the order of their first appearance, and which of them each item is."""
     places: dict[Hashable, int] = {}
     index = np.array([places.setdefault(item, len(places)) for item in items], dtype=np.int64)
     return list(places), index
@@ -102,7 +103,7 @@ def _synthetic(capture: Capture, rng: np.random.Generator) -> tuple[np.ndarray, 
 
 
 def _seen(capture: Capture, frame_index: np.ndarray, point_index: np.ndarray, points: np.ndarray) -> Probes:
-    """The pairs whose point appears inside the picture of its view."""
+    """Return the pairs whose point appears inside the picture of its view."""
     tried = Probes(frame_index, point_index, points, np.zeros((len(points), 2)), np.zeros(len(points)))
     pixels, kept, distances = projected(capture, tried)
     sizes = np.array([(frame.camera.width, frame.camera.height) for frame in capture.frames])

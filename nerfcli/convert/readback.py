@@ -79,7 +79,7 @@ class Meant:
 
 
 def read_colmap(path: Path, meant: Meant) -> ReadBack:
-    """A COLMAP model, by pycolmap."""
+    """Read a COLMAP model, by pycolmap."""
     model = pycolmap.Reconstruction(str(path))
     lenses = {
         camera_id: FileLens(camera.model.name, camera.width, camera.height, tuple(camera.params))
@@ -102,7 +102,7 @@ def read_colmap(path: Path, meant: Meant) -> ReadBack:
 
 
 def read_scene(path: Path, meant: Meant) -> ReadBack:
-    """A scene of nerfcli: its model by pycolmap, scene.json by the json module."""
+    """Read a scene of nerfcli: its model by pycolmap, scene.json by the json module."""
     content = json.loads((path / "scene.json").read_text(encoding="utf-8"))
     back = read_colmap(path / content["model"], meant)
     names = back.labels or ()
@@ -166,7 +166,7 @@ def read_llff(path: Path, meant: Meant) -> ReadBack:
 
 
 def read_tum(path: Path, meant: Meant) -> ReadBack:
-    """A TUM trajectory: time, position, quaternion with its real part last, by NumPy and SciPy."""
+    """Read a TUM trajectory: time, position, quaternion with its real part last, by NumPy and SciPy."""
     rows = np.loadtxt(path, ndmin=2)
     matrices = np.concatenate([Rotation.from_quat(rows[:, 4:8]).as_matrix(), rows[:, 1:4, None]], axis=2)
     rotations, centres = _views_from_world_from_cam(matrices, meant.axes)
@@ -174,7 +174,7 @@ def read_tum(path: Path, meant: Meant) -> ReadBack:
 
 
 def read_kitti(path: Path, meant: Meant) -> ReadBack:
-    """A KITTI odometry file: 3 x 4 numbers a line, by NumPy."""
+    """Read a KITTI odometry file: 3 x 4 numbers a line, by NumPy."""
     rotations, centres = _views_from_world_from_cam(np.loadtxt(path, ndmin=2).reshape(-1, 3, 4), meant.axes)
     return ReadBack(None, rotations, centres, None, None)
 
@@ -197,7 +197,7 @@ def read_opensfm(path: Path, meant: Meant) -> ReadBack:
 
 
 def read_npz(path: Path, meant: Meant) -> ReadBack:
-    """The arrays of an .npz file, by NumPy."""
+    """Read the arrays of an .npz file, by NumPy."""
     with np.load(path) as arrays:
         rotations, centres = _views_from_world_from_cam(arrays["world_from_cam"], meant.axes)
         lenses = []
@@ -227,7 +227,7 @@ def read_npz(path: Path, meant: Meant) -> ReadBack:
 
 
 def _features_of_arrays(arrays: Any, shift: float) -> Callable[[int], tuple[np.ndarray, np.ndarray]] | None:
-    """The features of each view of an .npz file."""
+    """Return the features of each view of an .npz file."""
     if "observation_pixels" not in arrays:
         return None
     frames, pixels, points = (arrays[f"observation_{name}"] for name in ("frames", "pixels", "points"))
@@ -238,8 +238,8 @@ def _features_of_arrays(arrays: Any, shift: float) -> Callable[[int], tuple[np.n
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """The vertices (N, 3) of a binary PLY file whose first three properties are doubles, and the colours (N, 3) that
-    follow as bytes, if they do."""
+    """Read the vertices (N, 3) of a binary PLY file whose first three properties are doubles, and the colours (N, 3)
+    that follow as bytes, if they do."""
     header, _, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii").splitlines()
     count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
@@ -251,7 +251,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _opensfm_lens(record: dict[str, Any]) -> FileLens:
-    """A lens from numbers in units of the picture's longer side, measured from its middle."""
+    """Return a lens from numbers in units of the picture's longer side, measured from its middle."""
     kind, width, height = record["projection_type"], record["width"], record["height"]
     if kind in ("spherical", "equirectangular"):
         return FileLens("EQUIRECTANGULAR", width, height, (width, height))
@@ -314,7 +314,9 @@ def _views_from_world_from_cam(matrices: Any, axes: str) -> tuple[np.ndarray, np
 
 
 def _pointing(poses: np.ndarray, axes: str, along: str, against: str) -> np.ndarray:
-    """Where in the world (views, 3) a direction of the camera points, of which the axes have it or its opposite."""
+    """Return where in the world (views, 3) a direction of the camera points, of which the axes have it or its
+    opposite.
+    """
     if along in axes:
         return poses[:, :3, axes.index(along)]
     return -poses[:, :3, axes.index(against)]

@@ -35,7 +35,7 @@ _PARTS = {
 
 
 def reduced(capture: Capture, format_name: str) -> Capture:
-    """The capture with the cameras, names and other parts that a format can hold."""
+    """Return the capture with the cameras, names and other parts that a format can hold."""
     return _with_parts(_with_words(capture, format_name), _PARTS.get(format_name, ()))
 
 
@@ -55,7 +55,7 @@ def _with_parts(capture: Capture, held: Collection[str]) -> Capture:
 
 
 def _with_words(capture: Capture, format_name: str) -> Capture:
-    """The capture with the cameras and names that a format has words for."""
+    """Return the capture with the cameras and names that a format has words for."""
     if format_name == "nerfcli":
         return named_for_scene(capture)
     if format_name == "colmap-text":
@@ -72,7 +72,7 @@ def _with_cameras(capture: Capture, change: Callable[[Camera], Camera]) -> Captu
 
 
 def _with_one_angle(capture: Capture) -> Capture:
-    """Every split's views with the angle that most of them have: its file holds one."""
+    """Return every split's views with the angle that most of them have: its file holds one."""
     angles: dict[str, Counter[float]] = {}
     for frame in capture.frames:
         angle = 2 * math.atan(frame.camera.width / 2 / frame.camera.params[0])
@@ -87,7 +87,7 @@ def _with_one_angle(capture: Capture) -> Capture:
 
 
 def _pinhole(camera: Camera) -> Camera:
-    """The horizontal focal length alone; the principal point is the picture's middle."""
+    """Return the horizontal focal length alone; the principal point is the picture's middle."""
     if camera.is_spherical:
         return camera
     return Camera.pinhole(camera.width, camera.height, camera.params[0])
@@ -118,7 +118,7 @@ def _to_opensfm(camera: Camera) -> Camera:
 
 
 def _without(camera: Camera, lost: Collection[str]) -> Camera:
-    """The camera with some terms 0."""
+    """Return the camera with some terms 0."""
     values = zip(parameter_names(camera.model), camera.params, strict=True)
     params = tuple(0.0 if name in lost else value for name, value in values)
     return Camera(camera.model, camera.width, camera.height, params)

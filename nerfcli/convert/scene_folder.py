@@ -26,7 +26,7 @@ def losses_scene(capture: Capture) -> tuple[str, ...]:
 
 
 def named_for_scene(capture: Capture) -> Capture:
-    """The capture with the names that its photos get in a scene, and the split that a scene has."""
+    """Return the capture with the names that its photos get in a scene, and the split that a scene has."""
     _, names = _named(capture)
     split = _split(dict(zip(names, (frame.split for frame in capture.frames), strict=True)))
     frames = tuple(
@@ -73,7 +73,7 @@ def write_scene(capture: Capture, folder: Path, *, provenance: Mapping[str, Any]
 
 
 def _split(splits: dict[str, str | None]) -> dict[str, str | None]:
-    """The split of each name: the capture's own where it holds some out, else every 8th name's."""
+    """Return the split of each name: the capture's own where it holds some out, else every 8th name's."""
     if "test" in splits.values() or "val" in splits.values():
         return splits
     held_out = scene.default_split(splits)
@@ -81,7 +81,7 @@ def _split(splits: dict[str, str | None]) -> dict[str, str | None]:
 
 
 def _named(capture: Capture) -> tuple[Path, list[str]]:
-    """The folder that photos are in or below, and the name of each as seen from there.
+    """Return the folder that photos are in or below, and the name of each as seen from there.
 
     It is the folder from which the frames' own names lead to the photos, where there is one.
 

@@ -54,7 +54,7 @@ def measure(path: Path) -> tuple[int, int, int]:
 
 
 def measure_upright(path: Path) -> tuple[int, int, int]:
-    """The same for cameras of upright photos: nothing is left to turn."""
+    """Measure the same for cameras of upright photos: nothing is left to turn."""
     return (*image_size(path), 1)
 
 
@@ -64,7 +64,7 @@ def measure_of(capture: Capture) -> Measure:
 
 
 def in_pixels(capture: Capture, pixels: str) -> Turned:
-    """The capture with cameras, poses and observations for stored or upright pixels, at the cameras' own size.
+    """Return the capture with cameras, poses and observations for stored or upright pixels, at the cameras' own size.
 
     Frames without a photo on disk are left as they are, and reported.
 
@@ -97,7 +97,7 @@ def in_pixels(capture: Capture, pixels: str) -> Turned:
 
 
 def upright(frame: Frame, measure: Measure) -> Frame:
-    """The frame of the photo on disk as it is shown, of one whose photo may be of another size or lie."""
+    """Return the frame of the photo on disk as it is shown, of one whose photo may be of another size or lie."""
     assert frame.image is not None
     camera, pose = fit_to_picture(frame.camera, frame.world_from_cam, path=frame.image, measure=measure)
     return replace(frame, camera=camera, world_from_cam=pose)
@@ -121,7 +121,7 @@ def other_sizes(capture: Capture) -> dict[tuple[Size, Size], int]:
 
 
 def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | None:
-    """The observations of a capture after the pictures of its frames were turned by orientations (frames,)."""
+    """Return the observations of a capture after the pictures of its frames were turned by orientations (frames,)."""
     seen = capture.observations
     if seen is None:
         return None
@@ -134,7 +134,7 @@ def _turned_observations(capture: Capture, turns: np.ndarray) -> Observations | 
 
 
 def _turn(frame: Frame, pixels: str) -> int:
-    """The EXIF orientation that turns the pixels of a frame's camera into the wanted ones."""
+    """Return the EXIF orientation that turns the pixels of a frame's camera into the wanted ones."""
     assert frame.image is not None
     width, height, written = measure(frame.image)
     orientation, size = turn_to_upright(frame.camera, path=frame.image, measure=lambda _: (width, height, written))
@@ -148,13 +148,13 @@ def _turn(frame: Frame, pixels: str) -> int:
 
 
 def _fits(mask: Path, camera: Camera, before: Camera, pixels: str) -> bool:
-    """Whether a mask serves after a camera was turned: it lies as the turned picture does, or it lies as the one before
-    where its shape shows that, since nerfcli then turns it (`media.masks.read_mask`)."""
+    """Return whether a mask serves after a camera was turned: it lies as the turned picture does, or it lies as the one
+    before where its shape shows that, since nerfcli then turns it (`media.masks.read_mask`)."""
     return _lies_as(mask, camera, before) or (pixels == UPRIGHT and _lies_as(mask, before, camera))
 
 
 def _lies_as(mask: Path, camera: Camera, before: Camera) -> bool:
-    """Whether a mask has the shape of a camera's picture and not that of the one before it was turned."""
+    """Return whether a mask has the shape of a camera's picture and not that of the one before it was turned."""
     if not mask.is_file():
         return False
     width, height = image_size(mask)

@@ -162,7 +162,7 @@ def _order(capture: Capture, back: ReadBack, listed: np.ndarray) -> np.ndarray:
 
 
 def _projected(capture: Capture, probes: Probes, back: ReadBack, order: np.ndarray) -> np.ndarray:
-    """Where the read-back views see the points, (M, 2); by the capture's lenses where the file has none."""
+    """Return where the read-back views see the points, (M, 2); by the capture's lenses where the file has none."""
     points = probes.points
     if back.points is not None and len(back.points):
         listed = probes.point_index >= 0
@@ -186,13 +186,15 @@ def _projected(capture: Capture, probes: Probes, back: ReadBack, order: np.ndarr
 
 
 def _size(capture: Capture) -> float:
-    """The extent of cameras and points, in scene units."""
+    """Return the extent of cameras and points, in scene units."""
     places = np.concatenate([poses_of(capture)[:, :3, 3], capture.points])
     return float(np.linalg.norm(np.ptp(places, axis=0))) or 1.0
 
 
 def _rounding_px(capture: Capture, probes: Probes) -> float:
-    """How far rounding alone may move a projection: by that of coordinates, seen from where the point is nearest."""
+    """Return how far rounding alone may move a projection: by that of coordinates, seen from where the point is
+    nearest.
+    """
     if not len(probes.points):
         return 0.0
     focal_px = np.array([frame.camera.focal_px for frame in capture.frames])[probes.frame_index]

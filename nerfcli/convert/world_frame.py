@@ -40,7 +40,7 @@ class WorldFrame:
 
 
 def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Similarity, ScaleEstimate | None]:
-    """The capture in another world frame: first its origin, then up, then the scale about the new origin.
+    """Return the capture in another world frame: first its origin, then up, then the scale about the new origin.
 
     Returns:
         The capture, the similarity new_from_old, and the estimate of the scale where lengths became metres.
@@ -64,7 +64,7 @@ def in_world_frame(capture: Capture, wanted: WorldFrame) -> tuple[Capture, Simil
 
 
 def _source(estimate: ScaleEstimate) -> str:
-    """How the metre is known, for people."""
+    """Return how the metre is known, for people."""
     relative = None if estimate.standard_error is None else estimate.standard_error / estimate.metres_per_unit
     return estimate.source if relative is None else f"{estimate.source}, ± {100 * relative:.2g} %"
 

@@ -36,7 +36,7 @@ class Brightness:
 
 
 def measure(rgb: np.ndarray, used: np.ndarray) -> Brightness:
-    """The exposure of a photo (H, W, 3) uint8 where `used` (H, W) is True."""
+    """Return the exposure of a photo (H, W, 3) uint8 where `used` (H, W) is True."""
     pixels = rgb[used]
     if not len(pixels):
         return Brightness(float("nan"), 0.0, 0.0)

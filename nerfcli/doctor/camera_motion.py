@@ -37,7 +37,7 @@ class TwoViews:
 
 
 def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> TwoViews | None:
-    """The motion between two photos from matches (N, 2) without outliers; None where they fix none.
+    """Estimate the motion between two photos from matches (N, 2) without outliers; None where they fix none.
 
     Where a homography H explains the matches, K^-1 H K = R + t n^T / d, whose singular values are 1 about in the middle
     and differ by |t| / d between the largest and the smallest; the focal length is the one, between 0.7 and 1.45 times
@@ -64,7 +64,7 @@ def estimate(x: np.ndarray, y: np.ndarray, focals_px: tuple[float, float]) -> Tw
 
 
 def _of_homography(homography: np.ndarray, focals_px: tuple[float, float]) -> tuple[float, float]:
-    """The angle of the rotation in degrees, and |t| / d, of a homography between pixels from the centres."""
+    """Return the angle of the rotation in degrees, and |t| / d, of a homography between pixels from the centres."""
     found = []
     for trial in _FOCAL_TRIALS:
         first, second = (np.diag([focal * trial, focal * trial, 1.0]) for focal in focals_px)

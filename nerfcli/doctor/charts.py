@@ -13,7 +13,7 @@ _LEAST_RANGE = 1.0
 
 
 def bars(names: Sequence[str], values: np.ndarray, *, marked: np.ndarray, unit: str) -> str:
-    """A bar per photo up or down from 0, as SVG; marked ones are coloured, NaN is left out."""
+    """Return a bar per photo up or down from 0, as SVG; marked ones are coloured, NaN is left out."""
     measured = values[~np.isnan(values)]
     low = min(-_LEAST_RANGE / 2, float(measured.min(initial=0.0)) * 1.1)
     high = max(_LEAST_RANGE / 2, float(measured.max(initial=0.0)) * 1.1)

@@ -26,7 +26,7 @@ _FEWEST_PARTNERS = 2
 
 
 def choose_pairs(photos: Sequence[PhotoFacts]) -> list[tuple[int, int]]:
-    """The pairs (i, j), i < j, of photos to compare: all of a small capture, about 11 a photo of a large one."""
+    """Return the pairs (i, j), i < j, of photos to compare: all of a small capture, about 11 a photo of a large one."""
     count = len(photos)
     if count <= EXHAUSTIVE_UP_TO:
         return list(combinations(range(count), 2))
@@ -46,7 +46,7 @@ def pair_count(count: int) -> int:
 
 
 def apart(count: int, pairs: Sequence[Pair]) -> set[int]:
-    """The photos that are not in the largest set that matches hold together."""
+    """Return the photos that are not in the largest set that matches hold together."""
     parts = connected_groups(range(count), [(pair.first, pair.second) for pair in pairs if pair.linked])
     return {photo for part in parts[1:] for photo in part}
 

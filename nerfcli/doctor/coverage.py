@@ -197,7 +197,7 @@ def gps(photos: Sequence[PhotoFacts]) -> Finding | None:
 
 
 def _depths(scene: Scene) -> np.ndarray:
-    """The median distance along the axis of what each camera sees, (frames,)."""
+    """Return the median distance along the axis of what each camera sees, (frames,)."""
     frames = scene.frames
     if scene.depth_bounds is not None:
         # Half of the inverse depths lie nearer.

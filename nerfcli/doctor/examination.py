@@ -114,7 +114,7 @@ def compare_all(
 
 
 def _second_look(photos: Sequence[PhotoFacts], pairs: list[Pair], focals_px: Sequence[float]) -> list[Pair]:
-    """The pairs with those of a few photos that hang on nothing compared once more, by all of their features."""
+    """Return the pairs with those of a few photos that hang on nothing compared once more, by all of their features."""
     apart = connectivity.apart(len(photos), pairs)
     if not 0 < len(apart) <= max(_FEW_APART, len(photos) // 10):
         return pairs
@@ -223,7 +223,7 @@ def _known_focals(subject: ExaminedCapture, photos: Sequence[PhotoFacts], calibr
 
 
 def content(diagnosis: Diagnosis) -> dict[str, object]:
-    """The diagnosis as plain values, for JSON."""
+    """Return the diagnosis as plain values, for JSON."""
     photos = []
     for index, photo in enumerate(diagnosis.photos):
         lack, lighter = float(diagnosis.lack[index]), float(diagnosis.lighter[index])

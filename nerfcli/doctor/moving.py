@@ -47,7 +47,7 @@ class Patch:
 
 
 def moving_patches(x: np.ndarray, y: np.ndarray, agree: np.ndarray, *, within_px: float) -> tuple[Patch, ...]:
-    """The patches of matches (N, 2) that moved by themselves, where `agree` (N,) follow the camera."""
+    """Return the patches of matches (N, 2) that moved by themselves, where `agree` (N,) follow the camera."""
     fundamental, _ = cv2.findFundamentalMat(x[agree], y[agree], cv2.FM_8POINT)
     if fundamental is None or fundamental.shape != (3, 3):
         return ()

@@ -42,7 +42,7 @@ def refuse_foreign(path: Path, capture: Path) -> None:
 
 
 def page_html(diagnosis: Diagnosis) -> str:
-    """The page's text."""
+    """Return the page's text."""
     photos, verdict = diagnosis.photos, diagnosis.verdict
     number = {photo.name: index for index, photo in enumerate(photos)}
     order = sorted(diagnosis.findings, key=lambda finding: -VERDICTS.index(finding.verdict))
@@ -81,7 +81,7 @@ def _title(capture: Path) -> str:
 
 
 def _thumbnail_rule(index: int, photo: PhotoFacts, count: int) -> str:
-    """A CSS rule with the picture in it, so that a photo that is shown twice is stored once."""
+    """Return a CSS rule with the picture in it, so that a photo that is shown twice is stored once."""
     data = photo.thumbnail
     if count > _SMALL_THUMBNAILS_FROM:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

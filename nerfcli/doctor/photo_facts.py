@@ -148,7 +148,7 @@ def _shrunk(image: np.ndarray, longer_side_px: int) -> np.ndarray:
 
 
 def _opaque(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The picture (H, W, 3) on white, and where it is opaque (H, W)."""
+    """Return the picture (H, W, 3) on white, and where it is opaque (H, W)."""
     if image.shape[2] == 3:
         return image, np.ones(image.shape[:2], dtype=bool)
     alpha = image[..., 3:].astype(np.float32) / 255

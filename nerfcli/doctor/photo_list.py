@@ -30,7 +30,7 @@ class ExaminedCapture:
 
 
 def find_subject(path: Path) -> ExaminedCapture:
-    """The photos of a folder, or those of a scene.
+    """Find the photos of a folder, or those of a scene.
 
     A folder that holds photos and the poses of a scene is a scene.
 

@@ -43,13 +43,13 @@ class Sharpness:
 
 
 def octaves(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The fine and the coarse octave of a grey picture (H, W) in levels of 255, float32."""
+    """Return the fine and the coarse octave of a grey picture (H, W) in levels of 255, float32."""
     fine, middle, coarse = (cv2.GaussianBlur(grey, (0, 0), sigma) for sigma in _SMOOTHINGS)
     return fine - middle, middle - coarse
 
 
 def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
-    """The sharpness of a photo, and the same around each of its pixels.
+    """Return the sharpness of a photo, and the same around each of its pixels.
 
     Args:
         grey: (H, W) float32 in levels of 255, of `LONGER_SIDE_PX` at most.
@@ -76,7 +76,8 @@ def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
 
 
 def _direction_ratio(fine: np.ndarray, coarse: np.ndarray, textured: np.ndarray) -> float:
-    """How much more the fine octave has kept of the coarse one's gradients in its best direction than in its worst.
+    """Return how much more the fine octave has kept of the coarse one's gradients in its best direction than in its
+    worst.
 
     The square root of the ratio of the generalised eigenvalues of the two octaves' summed structure tensors: what the
     photo shows has its directions in both octaves alike, smear only in the fine one.

@@ -64,7 +64,7 @@ class Shape:
         return asdict(self)
 
     def in_words(self) -> str:
-        """A sentence for people."""
+        """Return a sentence for people."""
         compared = (
             f"{self.field_psnr:.2f} dB for the field, {self.psnr:.2f} dB for billboards (a model without geometry)"
         )
@@ -108,14 +108,14 @@ class Billboards:
         return np.where(weights > 0, total / np.maximum(weights, 1e-300), self._mean)
 
     def _nearest(self, frame: Frame) -> list[int]:
-        """The training views that look at the same, the most similar ones first, without `frame` itself."""
+        """Return the training views that look at the same, the most similar ones first, without `frame` itself."""
         away = np.linalg.norm(self._centres - frame.centre, axis=1) / self._scale
         turned = np.arccos(np.clip(self._axes @ frame.world_from_cam[:3, 2], -1.0, 1.0))
         order = np.argsort(away + turned, kind="stable").tolist()
         return [index for index in order if self._frames[index].name != frame.name]
 
     def _fit(self, index: int) -> float:
-        """The distance at which a photo looks most like its neighbours, where enough of their rays hit it."""
+        """Fit the distance at which a photo looks most like its neighbours, where enough of their rays hit it."""
         others = self._nearest(self._frames[index])[:FITTED_PHOTOS]
         distances = self._scale * DISTANCES
         errors, hits = np.zeros(len(distances)), np.zeros(len(distances))
@@ -133,8 +133,8 @@ class Billboards:
     def _seen(
         self, index: int, origin: np.ndarray, directions: np.ndarray, distance: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What rays see of a photo that hangs around its camera: colours (N, 3), which rays hit it, and the angles
-        between them and the camera's lines of sight, in radians."""
+        """Return what rays see of a photo that hangs around its camera: colours (N, 3), which rays hit it, and the
+        angles between them and the camera's lines of sight, in radians."""
         frame = self._frames[index]
         # |from_camera + t * direction| = distance, from inside and on the far side.
         from_camera = origin - frame.centre

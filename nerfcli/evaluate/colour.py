@@ -9,7 +9,7 @@ ROUNDS = 5
 
 
 def colour_aligned(picture: np.ndarray, photo: np.ndarray, *, used: np.ndarray) -> np.ndarray:
-    """The picture with its colours warped onto the photo's, by least squares over the pixels that count.
+    """Return the picture with its colours warped onto the photo's, by least squares over the pixels that count.
 
     Each channel becomes a quadratic polynomial of the three: products of two, the channels, and a constant, ten
     coefficients. Pixels that are saturated in the channel at hand, in the picture, in its last correction, or in the

@@ -42,7 +42,7 @@ class RefinedPose:
     error_after: float
 
     def to_json(self) -> dict[str, Any]:
-        """All but the frame, whose pose is spelled out."""
+        """Return all but the frame, whose pose is spelled out."""
         return {
             "rotation_deg": self.rotation_deg,
             "translation": self.translation,
@@ -51,7 +51,7 @@ class RefinedPose:
 
 
 def halves(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels that count of the left half of a picture and of the rest, both (H, W) bool."""
+    """Return the pixels that count of the left half of a picture and of the rest, both (H, W) bool."""
     left = np.zeros_like(used)
     left[:, : used.shape[1] // 2] = True
     return used & left, used & ~left
@@ -67,7 +67,8 @@ def align_pose(
     background: Background,
     log_gains: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> RefinedPose | None:
-    """The pose at which the model comes closest to a photo, from the photo's own pose on; the model is not changed.
+    """Return the pose at which the model comes closest to a photo, from the photo's own pose on; the model is not
+    changed.
 
     Levenberg-Marquardt on the squared error of 2048 random pixels, with derivatives by differences of renders. The six
     unknowns are counted in pixels: turns by one over the focal length, and moves that shift what is as far away as the

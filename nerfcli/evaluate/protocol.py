@@ -203,7 +203,7 @@ def compare(photo: HeldOutPhoto, picture: RenderedPicture) -> Compared:
 
 
 def as_exposed(rgb: np.ndarray, log_gains: tuple[float, ...]) -> np.ndarray:
-    """A picture as a photo with these gains shows it, clipped."""
+    """Return a picture as a photo with these gains shows it, clipped."""
     if not any(log_gains):
         return rgb
     return exposed(torch.from_numpy(rgb), torch.tensor(log_gains)).clamp(0.0, 1.0).numpy()
@@ -274,7 +274,7 @@ def _pose_aligned(
 
 
 def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The means of the views between training views and of those beyond them."""
+    """Return the means of the views between training views and of those beyond them."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for image in images:
         if "view" in image:

@@ -51,7 +51,7 @@ def parse_requirements(text: str) -> tuple[Requirement, ...]:
 
 
 def known_numbers(metrics: Mapping[str, Any], config: RunConfig) -> dict[str, float | None]:
-    """The numbers of a run that requirements are about, from metrics.json and config.json."""
+    """Return the numbers of a run that requirements are about, from metrics.json and config.json."""
     history = config.history or {}
     placed, photos = history.get("registered"), history.get("total")
     return {

@@ -42,7 +42,7 @@ def spread(all_metrics: Sequence[Mapping[str, Any]], names: Sequence[str]) -> di
 
 
 def _first_difference(metrics: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """The first part of two protocols in which they differ."""
+    """Return the first part of two protocols in which they differ."""
     pairs = zip(metrics["protocol"].split(", "), other["protocol"].split(", "), strict=False)
     one, two = next(((a, b) for a, b in pairs if a != b), (metrics["protocol"], other["protocol"]))
     return f"{one!r} instead of {two!r}"

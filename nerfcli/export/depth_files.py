@@ -93,7 +93,7 @@ def write_maps(
 
 
 def read_map(folder: Path, name: str, meaning: DepthMeta) -> np.ndarray:
-    """The floats (height, width) that `write_maps` wrote, NaN where invalid, from whichever format is there.
+    """Read the floats (height, width) that `write_maps` wrote, NaN where invalid, from whichever format is there.
 
     Args:
         folder: of the export.
@@ -170,7 +170,7 @@ def write_levels(folder: Path, names: Sequence[str], *, settings: ExportSettings
 
 
 def _floats_of(folder: Path, name: str, output: str) -> Path:
-    """The file that holds the floats of a map; the TIFF's path where there is none."""
+    """Return the file that holds the floats of a map; the TIFF's path where there is none."""
     paths = [map_path(folder, output, name, file_format) for file_format in FLOAT_FORMATS]
     return next((path for path in paths if path.exists()), paths[0])
 
@@ -183,7 +183,7 @@ def _map_of(picture: RenderedPicture, output: str) -> np.ndarray:
 
 
 def _meta_of_layers(metas: Mapping[str, DepthMeta]) -> DepthMeta:
-    """The meaning of the first map, with what the others in the same file are."""
+    """Return the meaning of the first map, with what the others in the same file are."""
     first, *others = metas.values()
     layers = {meta.quantity: {"convention": meta.convention, "opacity_floor": meta.opacity_floor} for meta in others}
     return replace(first, layers={**layers, "opacity": {"convention": "1 - transmittance"}})

@@ -69,7 +69,7 @@ class Order:
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def results(self, folder: Path) -> list[Path]:
-        """The paths to show: the videos if there are any, else the folders of the outputs."""
+        """Return the paths to show: the videos if there are any, else the folders of the outputs."""
         video = self.settings.video
         if video is None:
             return [folder / output for output in (*self.settings.outputs, *self.settings.folders_of_formats)]
@@ -144,7 +144,7 @@ class Order:
 
 
 def _made(folder: Path) -> dict[str, Any] | None:
-    """What a finished folder says of itself; None where there is none.
+    """Return what a finished folder says of itself; None where there is none.
 
     Raises:
         UserError: that is damaged.

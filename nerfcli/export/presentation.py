@@ -26,7 +26,7 @@ _KEPT_BYTES = 2**28
 
 
 def write_previews(folder: Path, order: Order, meta: DepthMeta, *, threads: int = 1) -> dict[str, tuple[float, float]]:
-    """A coloured PNG beside each file that is measured; all of an output on one range, or depth on the range given.
+    """Write a coloured PNG beside each measured file; all of an output on one range, or depth on the range given.
 
     Args:
         folder: holds the complete files of every frame.
@@ -82,7 +82,7 @@ def write_videos(
     ranges: dict[str, tuple[float, float]],
     notify: Callable[[str], None],
 ) -> None:
-    """The videos that were ordered, from the pictures in the folder; one picture at a time is in memory.
+    """Write the videos that were ordered, from the pictures in the folder; one picture at a time is in memory.
 
     Args:
         folder: holds every picture and preview.
@@ -115,7 +115,7 @@ def write_videos(
 
 
 def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[float, float]:
-    """The range of colours of a clip: the 1st to the 99th percentile; from 0 for what is not a distance.
+    """Return the range of colours of a clip: the 1st to the 99th percentile; from 0 for what is not a distance.
 
     (0, 1) where no pixel has a value.
     """
@@ -140,7 +140,7 @@ def playing_order(count: int, direction: str) -> list[int]:
 def _comment(
     order: Order, meta: DepthMeta, outputs: Sequence[str], ranges: dict[str, tuple[float, float]]
 ) -> dict[str, Any]:
-    """What a video's container says about it."""
+    """Return what a video's container says about it."""
     description: dict[str, Any] = {"nerfcli": __version__, "outputs": list(outputs), **order.provenance}
     if any(output in MEASURED for output in outputs):
         description |= meta.to_json()
@@ -154,6 +154,6 @@ def _picture(folder: Path, output: str, name: str) -> Path:
 
 
 def _texts(meta: DepthMeta) -> dict[str, str]:
-    """The meaning for programs under one key, and its parts for people."""
+    """Return the meaning for programs under one key, and its parts for people."""
     parts = {name: str(value) for name, value in asdict(meta).items() if not isinstance(value, dict) and value}
     return parts | {KEY: meta.to_text()}

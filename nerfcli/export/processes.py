@@ -130,7 +130,7 @@ class _Failure:
 
 
 def _serve(connection: Any, model: Model, order: Order, unfinished: Unfinished, threads: int) -> None:
-    """The life of a process: render the frames whose numbers come, until the other end closes."""
+    """Render the frames whose numbers come, until the other end closes."""
     torch.set_num_threads(threads)
     signal.signal(signal.SIGTERM, _leave)
     if hasattr(signal, "pthread_sigmask"):
@@ -174,7 +174,7 @@ def _tell_death(worker: _Worker, order: Order, notify: Callable[[str], None], *,
 
 @contextmanager
 def _interrupts_kept() -> Iterator[None]:
-    """A process that is started here never hears Ctrl-C, and SIGTERM once it can answer: we end it.
+    """Start processes that ignore Ctrl-C, and SIGTERM until they can answer: we end them.
 
     Starting takes seconds, as the new process reads the model only when it has come up. What comes to us meanwhile is
     kept for afterwards: a process that is left amid its model complains.

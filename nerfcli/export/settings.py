@@ -132,7 +132,7 @@ class ExportSettings:
 
 
 def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
-    """The meaning of the depth files that `request` makes."""
+    """Return the meaning of the depth files that `request` makes."""
     return DepthMeta(
         convention=request.convention,
         axis=request.axis,
@@ -152,7 +152,7 @@ def meaning_of(meta: DepthMeta, request: DepthRequest, output: str) -> DepthMeta
 
 
 def floor_of(request: DepthRequest, output: str) -> float:
-    """The opacity below which a pixel has no value in an output that is measured."""
+    """Return the opacity below which a pixel has no value in an output that is measured."""
     match output:
         case "depth" | "depth_deviation":
             return effective_floor(request)

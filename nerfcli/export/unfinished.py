@@ -57,7 +57,7 @@ class Unfinished:
         return json.loads(self._path(name).read_text(encoding="utf-8"))["facts"]
 
     def files(self, name: str) -> dict[str, str]:
-        """The files of a frame, relative to the folder, with digests of what is in them."""
+        """Return the files of a frame, relative to the folder, with digests of what is in them."""
         return json.loads(self._path(name).read_text(encoding="utf-8"))["files"]
 
     @property
@@ -117,7 +117,7 @@ def _has_digest(path: Path, digest: str) -> bool:
 
 
 def unfinished_of(order: Order, folder: Path) -> Unfinished:
-    """The unfinished folder of an order that shall become `folder`; it is made if need be.
+    """Return the unfinished folder of an order that shall become `folder`; it is made if need be.
 
     Raises:
         UserError: it cannot be made.

@@ -44,7 +44,7 @@ def load_tensors(path: Path, device: str) -> tuple[dict[str, Tensor], dict[str, 
 
 
 def read_checkpoint(path: Path) -> bytes:
-    """All of a file at once: a training may put another one in its place meanwhile.
+    """Read all of a file at once: a training may put another one in its place meanwhile.
 
     Raises:
         UserError: the file is missing or cannot be read.
@@ -99,7 +99,7 @@ def refuse_non_finite(tensors: dict[str, Tensor], path: Path) -> None:
 
 
 def _digest(tensors: dict[str, Tensor], description: str) -> str:
-    """Of names, types, shapes and bytes of all tensors (on the CPU), and of the description."""
+    """Hash names, types, shapes and bytes of all tensors (on the CPU), and of the description."""
     digest = hashlib.blake2b(description.encode(), digest_size=16)
     for name in sorted(tensors):
         tensor = tensors[name]

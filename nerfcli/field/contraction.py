@@ -7,7 +7,7 @@ LARGEST_RADIUS = 1e6
 
 
 def uncontract(points: Tensor) -> Tensor:
-    """The inverse of `kernels.contract`.
+    """Return the inverse of `kernels.contract`.
 
     x = y for |y| <= 1, else y / |y| / (2 - |y|)
 
@@ -23,7 +23,7 @@ def uncontract(points: Tensor) -> Tensor:
 
 
 def uncontract_from_cube(points: Tensor) -> Tensor:
-    """The inverse of `kernels.contract_to_cube`.
+    """Return the inverse of `kernels.contract_to_cube`.
 
     x = y for m <= 1, else y / m / (2 - m),  m = the largest of |y_1|, |y_2|, |y_3|
 
@@ -38,7 +38,7 @@ def uncontract_from_cube(points: Tensor) -> Tensor:
 
 
 def training_points(coordinates: Tensor, contraction: str) -> Tensor:
-    """The inverse of `kernels.grid_coordinates`: unit cube to training frame."""
+    """Return the inverse of `kernels.grid_coordinates`: unit cube to training frame."""
     if contraction == "none":
         return (coordinates - 0.5) * 2.0
     back = {"l2": uncontract, "linf": uncontract_from_cube}[contraction]

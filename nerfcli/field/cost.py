@@ -74,7 +74,7 @@ class Work:
 
 
 def work(settings: FieldSettings) -> Work:
-    """The counts of a field of these settings."""
+    """Return the counts of a field of these settings."""
     match settings:
         case HashFieldSettings():
             return _hash_grid(settings)
@@ -137,5 +137,5 @@ def _products(sizes: Sequence[int]) -> int:
 
 
 def _interpolation(levels: int, features: int) -> int:
-    """Of trilinear interpolation: the weight of a corner is two products, then a product and a sum per feature."""
+    """Return the cost of trilinear interpolation: per corner two products, then two operations per feature."""
     return levels * CORNERS * (2 + 2 * features)

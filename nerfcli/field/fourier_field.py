@@ -83,12 +83,12 @@ class FourierField(Field):
         return density_from_log(self.log_density(hidden)[:, 0]), rgb
 
     def _hidden(self, coordinates: Tensor) -> Tensor:
-        """The last hidden layer (N, width)."""
+        """Return the last hidden layer (N, width)."""
         return self.trunk(fourier_features(2.0 * coordinates - 1.0, self.settings.octaves))
 
 
 def _linear(inputs: int, outputs: int) -> nn.Linear:
-    """A layer that keeps the variance of rectified inputs, without bias at first.
+    """Return a layer that keeps the variance of rectified inputs, without bias at first.
 
     Source: He et al. 2015, arXiv:1502.01852, eq. 10.
     """

@@ -12,7 +12,7 @@ KINDS = (HashFieldSettings.kind, VoxelFieldSettings.kind, FourierFieldSettings.k
 
 
 def fresh_field(settings: FieldSettings) -> Field:
-    """A field that has learned nothing, from torch's random numbers."""
+    """Return a field that has learned nothing, from torch's random numbers."""
     match settings:
         case HashFieldSettings():
             return HashField(settings)

@@ -28,7 +28,7 @@ OCTAVES = (4, 12)
 def chosen_size(
     kind: str, *, hash_grid: HashFieldSettings, footprint: float, memory_bytes: int | None
 ) -> FieldSettings:
-    """The field of a kind that fits a capture.
+    """Return the field of a kind that fits a capture.
 
     What is finer than a pixel, no photo shows: a dense grid has no cells smaller than a pixel's footprint, the finest
     octave of Fourier features has no shorter period than two footprints, and a large hash grid's finest level, where
@@ -84,7 +84,7 @@ def cells_of_footprint(footprint: float, contraction: str) -> float:
 
 
 def largest_within(sizes: Sequence[int], settings: Callable[[int], FieldSettings], memory_bytes: int) -> FieldSettings:
-    """The last of increasing sizes whose numbers fit into the memory, give or take `SLACK`.
+    """Return the last of increasing sizes whose numbers fit into the memory, give or take `SLACK`.
 
     Raises:
         UserError: not even the first one does.

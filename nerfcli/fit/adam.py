@@ -38,7 +38,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, rate: float) -> None:
-        """One step at a learning rate."""
+        """Take one step at a learning rate."""
         learned = [
             (parameter, parameter.grad, state)
             for parameter, state in zip(self._parameters, self._state, strict=True)

@@ -78,22 +78,22 @@ class Appearance(nn.Module):
         self.sky = sky
 
     def groups(self) -> list[dict[str, Any]]:
-        """What is to be optimised, with its learning rate as a multiple of the field's."""
+        """Return what is to be optimised, with its learning rate as a multiple of the field's."""
         rates = ((self.background, BACKGROUND_RATE), (self.exposure, EXPOSURE_RATE))
         learned = [(list(part.parameters()), rate) for part, rate in rates if part is not None]
         return [{"params": tensors, "multiple": rate} for tensors, rate in learned if tensors[0].requires_grad]
 
     def share_of_detail(self, fraction: float) -> float:
-        """The share of the budget whose detail the field may have: cameras find their places in a coarse field, while
-        a fine one learns to show each photo as it is, in its wrong place."""
+        """Return the share of the budget whose detail the field may have: cameras find their places in a coarse field,
+        while a fine one learns to show each photo as it is, in its wrong place."""
         return fraction if self.cameras is None else DETAIL_SLOPE * fraction - DETAIL_DELAY
 
     def gradients(self) -> dict[str, Tensor]:
-        """By name, those that there are."""
+        """Return the gradients that there are, by name."""
         return {name: tensor.grad for name, tensor in self.named_parameters() if tensor.grad is not None}
 
     def refined(self, drawn: Drawn) -> Drawn:
-        """The same pixels, with the rays of the cameras as they are now."""
+        """Return the same pixels, with the rays of the cameras as they are now."""
         return drawn if self.cameras is None else self.cameras.refined(drawn)
 
     def with_learning_rays(self, drawn: Drawn, fraction: float) -> Drawn:
@@ -106,7 +106,7 @@ class Appearance(nn.Module):
         )
 
     def step_cameras(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float, ranks: Alone) -> None:
-        """One step of the cameras against the gradients of rays of `with_learning_rays`.
+        """Take one step of the cameras against the gradients of rays of `with_learning_rays`.
 
         Args:
             drawn: those rays.
@@ -137,7 +137,7 @@ class Appearance(nn.Module):
     def compared(
         self, rendered: Tensor, transmittance: Tensor, drawn: Drawn, *, behind: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """What the field and these parts say of pixels, and what the photos say, both (R, 3) sRGB.
+        """Return what the field and these parts say of pixels, and what the photos say, both (R, 3) sRGB.
 
         Args:
             rendered: (R, 3) composited on `behind`.
@@ -161,5 +161,5 @@ class Appearance(nn.Module):
 
 
 def _up_to_white(rendered: Tensor, colours: Tensor) -> Tensor:
-    """What a photo shows of colours (R, 3): no more than white where its own (R, 3 or 4) are white."""
+    """Return what a photo shows of colours (R, 3): no more than white where its own (R, 3 or 4) are white."""
     return torch.where(colours[:, :3] < SATURATED, rendered, rendered.clamp_max(1.0))

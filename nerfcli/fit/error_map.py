@@ -72,7 +72,7 @@ class ErrorMap:
         self.errors.copy_(torch.where(counts > 0, mixed, before))
 
     def _known_errors(self) -> Tensor:
-        """The same everywhere as long as nothing is known, and never 0."""
+        """Return the same everywhere as long as nothing is known, and never 0."""
         return torch.where(self.errors == UNKNOWN, 1.0, self.errors.clamp_min(1e-9))
 
     def _blocks_of(self, numbers: Tensor) -> Tensor:
@@ -83,6 +83,6 @@ class ErrorMap:
 
 
 def _contains(numbers: Tensor, wanted: Tensor) -> Tensor:
-    """Which of some numbers are among others that increase."""
+    """Return which of some numbers are among others that increase."""
     places = torch.searchsorted(numbers, wanted).clamp_max(len(numbers) - 1)
     return numbers[places] == wanted

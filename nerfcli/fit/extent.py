@@ -49,12 +49,12 @@ class Extent:
 
     @staticmethod
     def from_json(content: dict[str, Any]) -> "Extent":
-        """The extent that `to_json` described."""
+        """Return the extent that `to_json` described."""
         similarity = Similarity.from_json(content["training_from_scene"])
         return Extent(content["contraction"], similarity, Marching(**content["marching"]), content.get("reach"))
 
     def before(self, background: str) -> "Extent":
-        """The extent with a kind of background, see `Components`: the field ends where a learned one begins.
+        """Return the extent with a kind of background, see `Components`: the field ends where a learned one begins.
 
         The fog of the start would hide it for good: the field would have to paint what is infinitely far.
         """

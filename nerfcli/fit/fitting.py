@@ -140,7 +140,7 @@ class Fitting:
         self._losses = Delayed()
 
     def advance(self, share: float, watch: Watch = UNWATCHED) -> StepResult:
-        """One optimiser step.
+        """Take one optimiser step.
 
         Args:
             share: how much of the budget is used, in [0, 1]; it drives the learning rate.
@@ -176,7 +176,7 @@ class Fitting:
         return StepResult(loss=value, samples=samples, rays=rays)
 
     def draw(self, fraction: float) -> Drawn:
-        """The pixels of the next step, after looking at what fills space if it is time."""
+        """Return the pixels of the next step, after looking at what fills space if it is time."""
         settings = self.settings
         if self.step % REFRESH_EVERY == 0:
             self._refresh_occupancy()
@@ -188,7 +188,7 @@ class Fitting:
         return self.points.added_to(drawn, self.generator)
 
     def _stride(self, fraction: float) -> int:
-        """How many of the shortest steps along rays are taken as one."""
+        """Return how many of the shortest steps along rays are taken as one."""
         fraction = min(fraction, self.step / DETAILED_STEPS)
         return next(stride for until, stride in STRIDES if fraction <= until)
 
@@ -208,8 +208,8 @@ class Fitting:
     def _loss(
         self, drawn: Drawn, *, whole: Drawn, edges: Tensor, fraction: float, watch: Watch
     ) -> tuple[Tensor, Tensor, int]:
-        """The part of the loss that some rays of the whole step have, the loss of the colour of each, and the number of
-        samples it took.
+        """Return the part of the loss that some rays of the whole step have, the loss of the colour of each, and the
+        number of samples it took.
         """
         count, components, device = len(whole.origins), self.components, drawn.origins.device
         jitter = torch.rand(count, generator=self.generator, device=device)[self.ranks.own].contiguous()
@@ -303,7 +303,7 @@ class Fitting:
         self.occupied = self._open_cells()
 
     def _open_cells(self) -> Tensor:
-        """The cells that rays look into: those that take away more light than the threshold of this step."""
+        """Return the cells that rays look into: those that take away more light than the threshold of this step."""
         closed = min(1.0, max(self.step / self.field.closing_steps, self.furthest / CLOSING_SHARE))
         threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
         occupied = self.occupancy.above(threshold)
@@ -335,7 +335,7 @@ class Fitting:
             self.loss = value
 
     def _finite_loss(self, loss: Tensor, drawn: Drawn, watch: Watch) -> float:
-        """The loss, if it and all gradients are finite; of the step before where the host would have to wait."""
+        """Return the loss, if it and all gradients are finite; of the step before where the host would have to wait."""
         total = loss.detach()
         rays = {"origins of rays": drawn.origins.grad, "directions of rays": drawn.directions.grad}
         of_rays = {name: gradient for name, gradient in rays.items() if gradient is not None}

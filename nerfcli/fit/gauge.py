@@ -16,7 +16,7 @@ _ROUNDS, _MOST_WEIGHT = 10, 100.0
 
 
 def mean_similarity(before: np.ndarray, after: np.ndarray) -> Similarity:
-    """The similarity that is in the mean of the moves of cameras, to first order.
+    """Return the similarity that is in the mean of the moves of cameras, to first order.
 
     With the turn w_i of camera i and the move t_i of its centre c_i, in the world, it is the turn w, the move u and the
     growth s about the mean centre c that

@@ -20,7 +20,7 @@ def colour_losses(rendered: Tensor, measured: Tensor) -> Tensor:
 
 
 def opacity_entropy(transmittance: Tensor) -> Tensor:
-    """How undecided rays are between opaque and clear, in nats.
+    """Return how undecided rays are between opaque and clear, in nats.
 
     -T log T - (1 - T) log(1 - T), with T kept inside [1e-4, 1 - 1e-4], where its gradient is at most 9.3
 

@@ -29,7 +29,7 @@ BOX_MARGIN = 0.1
 
 
 def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
-    """The similarity from the scene's frame, and the steps along rays, where space beyond is contracted.
+    """Return the similarity from the scene's frame, and the steps along rays, where space beyond is contracted.
 
     The unit ball is centred where the cameras look. It reaches to the median camera, or to three quarters of the median
     depth if that is farther: in a room the walls are behind the cameras, and nearly all that the photos show would lie
@@ -50,7 +50,7 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
 
 def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
-    """The same for photos with alpha: an object in the middle, and nothing else.
+    """Return the same for photos with alpha: an object in the middle, and nothing else.
 
     The unit ball is the smallest that reaches out of every camera's view, and the cube around it is all there is.
 
@@ -68,7 +68,7 @@ def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
 
 def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
-    """The same for a scene that ends, without alpha: the cube [-1, 1]^3 is the smallest around its points.
+    """Return the same for a scene that ends, without alpha: the cube [-1, 1]^3 is the smallest around its points.
 
     Raises:
         UserError: the scene has too few points to tell where it ends.
@@ -89,12 +89,12 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
 
 def _focus(scene: Scene, depths: np.ndarray | None) -> np.ndarray:
-    """Where the cameras look, with what `_typical_depths` says."""
+    """Return where the cameras look, with what `_typical_depths` says."""
     return focus_point(scene.frames, depth_hint=None if depths is None else float(np.median(depths[:, 1])))
 
 
 def _distances(scene: Scene, centre: np.ndarray) -> np.ndarray:
-    """Of the cameras from a point."""
+    """Return the distances of the cameras from a point."""
     return np.array([np.linalg.norm(frame.centre - centre) for frame in scene.frames])
 
 

@@ -35,7 +35,7 @@ class FieldOptimiser:
         return list(self._weights.values())
 
     def gradients(self) -> dict[str, Tensor]:
-        """By name, those through which everything comes that could be non-finite: the rows' only without weights."""
+        """Return by name the gradients that anything non-finite reaches: those of rows only without weights."""
         if not self._weights and self.sink is not None:
             return {"rows": self.sink}
         return {name: weight.grad for name, weight in self._weights.items() if weight.grad is not None}
@@ -82,7 +82,7 @@ class PartsOptimiser:
             adam.zero_grad()
 
     def step(self, rate: float) -> None:
-        """One step at multiples of a learning rate."""
+        """Take one step at multiples of a learning rate."""
         for adam, multiple in self._groups:
             adam.step(rate * multiple)
 

@@ -52,7 +52,7 @@ def rate_at(fraction: float) -> float:
 
 
 def _between(fraction: float, shares: tuple[float, float], values: tuple[float, float]) -> float:
-    """The first value up to the first share, the second from the second on, and an exponential in between."""
+    """Return the first value up to the first share, the second from the second on, and an exponential in between."""
     return float(np.exp(np.interp(fraction, shares, np.log(values))))
 
 
@@ -109,8 +109,7 @@ class PoseRefinement(nn.Module):
     def step(
         self, gradients: Tensor, losses: Tensor, photos: Tensor, fraction: float, *, rate: float, ranks: Alone = ALONE
     ) -> None:
-        """A step against gradients (R, 6) of losses (R,) of rays; afterwards the mean similarity of all moves is taken
-        out.
+        """Take a step against gradients (R, 6) of losses (R,) of rays, and remove the mean similarity of all moves.
 
         Args:
             gradients, losses: of each ray by itself.
@@ -160,7 +159,7 @@ class LensRefinement(nn.Module):
         self.adam = WhitenedAdam(np.array([self._whitening(index) for index in range(len(self._cameras))]))
 
     def changed(self, camera: Camera, photo: int) -> Camera:
-        """The camera of a photo as it is now; the picture of `camera` may be of another size."""
+        """Return the camera of a photo as it is now; the picture of `camera` may be of another size."""
         return self._changed(camera, int(self._camera_of[photo]))
 
     def _now(self, index: int) -> Camera:
@@ -193,11 +192,11 @@ class LensRefinement(nn.Module):
         return gradient
 
     def step(self, gradient: Tensor, rate: float) -> None:
-        """One step against a gradient (C, K)."""
+        """Take one step against a gradient (C, K)."""
         self.values += self.adam.change(gradient, rate)
 
     def _by_camera(self, numbers: Tensor, photos: Tensor) -> list[tuple[int, Tensor, np.ndarray]]:
-        """The cameras among the photos (R,) that can change: number, rays (N,) and their pixels (N, 2)."""
+        """Return the cameras among the photos (R,) that can change: number, rays (N,) and their pixels (N, 2)."""
         of = self._camera_of[photos]
         found = []
         for index in of.unique().tolist():
@@ -241,7 +240,7 @@ class Refinement(nn.Module):
 
     @torch.no_grad()
     def refined(self, drawn: Drawn) -> Drawn:
-        """The same pixels, with the rays of the cameras as they are now."""
+        """Return the same pixels, with the rays of the cameras as they are now."""
         photos = self._pool.photo_of(drawn.numbers)
         origins, directions = drawn.origins, drawn.directions
         if self.lenses is not None:
@@ -252,8 +251,9 @@ class Refinement(nn.Module):
 
     @torch.no_grad()
     def step(self, drawn: Drawn, losses: Tensor, fraction: float, *, factor: float, ranks: Alone = ALONE) -> None:
-        """One step against the gradients of the mean loss of the rays of all ranks, of which `drawn`, which `refined`
-        gave, are those of this one; on a GPU, against those of the step before.
+        """Take one step against the gradients of the mean loss of the rays of all ranks.
+
+        On a GPU, against those of the step before. `drawn`, which `refined` gave, are the rays of this rank.
 
         Args:
             drawn: rays that have gradients.

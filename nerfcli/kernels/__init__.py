@@ -138,7 +138,7 @@ def prepare(notify: Callable[[str], None], device: str = "cpu") -> None:
 
 
 def _fast_backend(device: torch.device, dtype: torch.dtype, wanted: str) -> tuple[Backend | None, str | None]:
-    """The compiled backend for these numbers, or why there is none."""
+    """Return the compiled backend for these numbers, or why there is none."""
     if wanted == "triton_cuda" or (wanted == "auto" and device.type == "cuda" and dtype == torch.float32):
         return _triton_backend(device, dtype, wanted)
     if wanted == "numba_cpu" or (wanted == "auto" and device.type == "cpu" and dtype == torch.float32):
@@ -183,7 +183,7 @@ def _warn_of_slow_gpu(reason: str) -> None:
 
 @functools.cache
 def _numba_cpu() -> ModuleType | None:
-    """The CPU kernels, or None with one warning where Numba does not work."""
+    """Return the CPU kernels, or None with one warning where Numba does not work."""
     try:
         from nerfcli.kernels import numba_cpu
     except ImportError as error:

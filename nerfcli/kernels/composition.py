@@ -169,11 +169,11 @@ class ComposedBackend(abc.ABC):
 
     @abc.abstractmethod
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
-        """The coordinates of samples again, with the gradients of their rays."""
+        """Return the coordinates of samples again, with the gradients of their rays."""
 
     @abc.abstractmethod
     def _encoded(self, samples: Samples, grid: HashGrid, *, widths: Tensor | None, sink: Tensor | None) -> Tensor:
-        """The codes of samples again, with gradients."""
+        """Return the codes of samples again, with gradients."""
 
     @abc.abstractmethod
     def _density_of(self, encoded: Tensor, grid: HashGrid) -> Tensor:
@@ -226,7 +226,7 @@ class ComposedBackend(abc.ABC):
 
 
 def _widths(rays: Rays, samples: Samples, index: Tensor, grid: HashGrid, *, contraction: str) -> Tensor | None:
-    """Of what rays stand for at their samples (N,), where the grid fades with them."""
+    """Return the widths that rays stand for at their samples (N,), where the grid fades with them."""
     if not grid.antialias or rays.cones is None:
         return None
     return sample_widths(

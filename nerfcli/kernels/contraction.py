@@ -16,7 +16,7 @@ CONTRACTIONS = ("none", "l2", "linf")
 
 
 def contract(points: Tensor) -> Tensor:
-    """All of space mapped into the ball of radius 2; the unit ball stays as it is.
+    """Map all of space into the ball of radius 2; the unit ball stays as it is.
 
     contract(x) = x for |x| <= 1, else (2 - 1/|x|) x / |x|
 
@@ -38,7 +38,7 @@ def contract(points: Tensor) -> Tensor:
 
 
 def contract_to_cube(points: Tensor) -> Tensor:
-    """All of space mapped into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
+    """Map all of space into the cube [-2, 2]^3; the cube [-1, 1]^3 stays as it is.
 
     contract_to_cube(x) = x for m <= 1, else (2 - 1/m) x / m,  m = the largest of |x_1|, |x_2|, |x_3|
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def spherical_harmonics(directions: Tensor, degree: int = 3) -> Tensor:
-    """The 16 real spherical harmonics of degree 0 to 3, orthonormal on the sphere.
+    """Return the 16 real spherical harmonics of degree 0 to 3, orthonormal on the sphere.
 
     Args:
         directions: (..., 3) unit norm.

@@ -32,7 +32,7 @@ class Rays(NamedTuple):
     cones: Tensor | None = None
 
     def detached(self) -> "Rays":
-        """The same rays without gradients."""
+        """Return the same rays without gradients."""
         return self._replace(origins=self.origins.detach(), directions=self.directions.detach())
 
 
@@ -294,7 +294,7 @@ class Backend(Protocol):
         betas: tuple[float, float],
         eps: float,
     ) -> None:
-        """One step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero."""
+        """Take one step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero."""
         ...
 
     def project(
@@ -316,11 +316,11 @@ class Backend(Protocol):
         first: tuple[float, float, float],
         size: float,
     ) -> Tensor:
-        """The transpose of `project`: (Z, Y, X) from (R,), without gradients."""
+        """Return the transpose of `project`: (Z, Y, X) from (R,), without gradients."""
         ...
 
     def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
-        """A volume (Z, Y, X) >= 0 near `target` whose total variation is smaller, without gradients.
+        """Return a volume (Z, Y, X) >= 0 near `target` whose total variation is smaller, without gradients.
 
         Args:
             threshold: (Z, Y, X) > 0.

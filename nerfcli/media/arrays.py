@@ -53,7 +53,7 @@ def write_npz(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file by name, without the description; that of a .npy file as "array".
+    """Read the arrays of a .npz file by name, without the description; that of a .npy file as "array".
 
     Nothing in the file is run as code.
 

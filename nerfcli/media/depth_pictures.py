@@ -107,7 +107,7 @@ class DepthMeta:
             raise ValueError(f"quantity must be one of {', '.join(QUANTITIES)}, got {self.quantity}")
 
     def of(self, quantity: str, *, opacity_floor: float | None = None, convention: str | None = None) -> Self:
-        """The meaning of another map of the same picture, along the same axis; the floor too if none is given.
+        """Return the meaning of another map of the same picture, along the same axis; the floor too if none is given.
 
         The convention is that of `CONVENTION_OF` if none is given.
         """
@@ -170,7 +170,7 @@ class DepthMeta:
         return cls(**{f.name: entries[f.name] for f in fields(cls) if f.name in entries})
 
     def in_words(self) -> str:
-        """One line for people: "conditional depth along the optical axis (z), in metres (gps): the mean ..."."""
+        """Return one line for people: "conditional depth along the optical axis (z), in metres (gps): the mean ..."."""
         if self.quantity in UNIT_OF:
             return f"{self.quantity.replace('_', ' ')}, in {self.unit}: {_IN_WORDS[self.convention]}"
         unit = "metres" if self.unit == "metre" else f"{self.unit} units"
@@ -200,7 +200,7 @@ def difference_of(one: DepthMeta, other: DepthMeta) -> str | None:
 
 
 def as_floats(meta: DepthMeta) -> DepthMeta:
-    """The meaning of a map once its levels are read as lengths."""
+    """Return the meaning of a map once its levels are read as lengths."""
     return replace(meta, invalid="nan", units_per_level=None)
 
 
@@ -219,7 +219,7 @@ def refuse_mixing(metas: Iterable[tuple[Path, DepthMeta]]) -> None:
 
 
 def mixed(path: Path, other: Path, difference: str) -> UserError:
-    """The two-line error for maps that would be taken for one kind and are not."""
+    """Return the two-line error for maps that would be taken for one kind and are not."""
     return UserError(
         f"{path} and {other} have different definitions: {difference}",
         "keep depth with different definitions in separate folders: choose another one with -o",
@@ -227,7 +227,7 @@ def mixed(path: Path, other: Path, difference: str) -> UserError:
 
 
 def entries_of_text(text: str | None) -> dict[str, Any] | None:
-    """The JSON object in a text; None where there is none."""
+    """Return the JSON object in a text; None where there is none."""
     try:
         entries = json.loads(text or "")
     except ValueError:

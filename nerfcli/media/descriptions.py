@@ -28,7 +28,7 @@ _DAMAGED = (
 
 
 def description_of(path: Path) -> dict[str, Any] | None:
-    """The description that a file of ours carries, as plain values; None where a file has none.
+    """Return the description that a file of ours carries, as plain values; None where a file has none.
 
     Args:
         path: TIFF, OpenEXR, NPZ, NPY (with its .json beside it), PNG or a video.
@@ -53,7 +53,7 @@ def description_of(path: Path) -> dict[str, Any] | None:
 
 
 def depth_meta_of(path: Path) -> DepthMeta | None:
-    """The meaning of the depth in a file of ours; None where it does not say.
+    """Return the meaning of the depth in a file of ours; None where it does not say.
 
     Raises:
         UserError: see `description_of`.
@@ -66,7 +66,7 @@ def depth_meta_of(path: Path) -> DepthMeta | None:
 
 
 def damaged(path: Path, error: Exception) -> UserError:
-    """The two-line error for a file that cannot be decoded."""
+    """Return the two-line error for a file that cannot be decoded."""
     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
     return UserError(f"{path} is damaged or truncated: {reason}", "copy it again, or render it again")
 
@@ -107,7 +107,7 @@ def _of_gif(path: Path) -> str | None:
 
 
 def _of_video(path: Path) -> str | None:
-    """The comment of the container, as ffmpeg tells it."""
+    """Return the comment of the container, as ffmpeg tells it."""
     path.stat()
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", f"file:{path}", "-f", "ffmetadata", "-"]
     done = subprocess.run(command, capture_output=True, check=False)
@@ -118,7 +118,7 @@ def _of_video(path: Path) -> str | None:
 
 
 def comment_of_ffmetadata(text: str) -> str | None:
-    """The value of "comment" in ffmpeg's own metadata format, in which =, ;, #, \\ and line ends are escaped."""
+    """Return the value of "comment" in ffmpeg's own metadata format, in which =, ;, #, \\ and line ends are escaped."""
     value, inside, escaped = "", False, False
     for line in text.splitlines(keepends=True):
         if not inside:

@@ -76,7 +76,7 @@ def write_exr(path: Path, maps: Mapping[str, np.ndarray], meta: DepthMeta) -> No
 
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Every channel of the first part by its name, as stored.
+    """Read every channel of the first part by its name, as stored.
 
     Raises:
         UserError: missing or damaged.

@@ -30,7 +30,7 @@ _LEVELS_NOT_STATED = "the length of a level is not stated either: often 1 mm, 0.
 
 
 def file_facts(path: Path) -> dict[str, Any]:
-    """The facts of one file as plain values.
+    """Return the facts of one file as plain values.
 
     Keys: kind ("depth", "preview", "picture", "video", "array"), format, width and height, meaning (`DepthMeta` as
     plain values, None where nothing is stated), in_words, maps: per map its dtype, valid_share, min, median and max
@@ -58,7 +58,7 @@ def file_facts(path: Path) -> dict[str, Any]:
 
 
 def renders_facts(folder: Path) -> dict[str, Any]:
-    """The facts of a folder that `nerfcli render` wrote.
+    """Return the facts of a folder that `nerfcli render` wrote.
 
     Keys: kind ("renders"), format, frames, meaning and in_words of its depth, files: how many depth files say so,
     outputs, run.
@@ -95,7 +95,7 @@ def renders_facts(folder: Path) -> dict[str, Any]:
 
 
 def _depth_metas(folder: Path) -> Iterator[tuple[Path, DepthMeta]]:
-    """Every file of numbers below a folder that says what its depth means."""
+    """Yield every file of numbers below a folder that says what its depth means."""
     for path in sorted(folder.rglob("*")):
         if path.suffix in _KINDS and path.is_file():
             meta = depth_meta_of(path)
@@ -105,7 +105,7 @@ def _depth_metas(folder: Path) -> Iterator[tuple[Path, DepthMeta]]:
 
 
 def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
-    """The meaning in a description.
+    """Return the meaning in a description.
 
     Raises:
         UserError: the description is ours, but of a format that is not known here.
@@ -122,7 +122,7 @@ def _meta(path: Path, entries: dict[str, Any] | None) -> DepthMeta | None:
 
 
 def _maps(path: Path, meta: DepthMeta | None) -> dict[str, np.ndarray]:
-    """The arrays of a file by name."""
+    """Return the arrays of a file by name."""
     match path.suffix.lower():
         case ".exr":
             channels = read_exr(path)
@@ -189,7 +189,7 @@ def _size_of(maps: dict[str, np.ndarray]) -> dict[str, int]:
 
 
 def _statistics(maps: dict[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-    """Of each map: how its numbers are stored, how many are valid, and their range."""
+    """Return of each map how its numbers are stored, how many are valid, and their range."""
     return {name: _range(array) for name, array in maps.items()}
 
 

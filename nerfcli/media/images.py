@@ -83,7 +83,7 @@ class Exif:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The picture files of a folder itself, sorted by name; hidden files and subfolders are left out.
+    """Return the picture files of a folder itself, sorted by name; hidden files and subfolders are left out.
 
     Raises:
         UserError: the folder is not there or cannot be listed.
@@ -107,7 +107,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """A picture as upright 8-bit sRGB, whatever the file holds.
+    """Read a picture as upright 8-bit sRGB, whatever the file holds.
 
     Grey, palette, CMYK and 16-bit pixels (the high byte is kept) are brought to 8-bit RGB. Colours in another
     embedded profile than sRGB are converted; a profile that cannot be used is ignored.
@@ -142,7 +142,7 @@ def upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def downscale(image: np.ndarray, factor: float) -> np.ndarray:
-    """A smaller picture; each pixel is the mean of the area that it covers, fractions of pixels included.
+    """Return a smaller picture; each pixel is the mean of the area that it covers, fractions of pixels included.
 
     Colours are averaged with alpha as their weight, so that what transparent pixels hide does not bleed in;
     where alpha is 0 all over, the colour is 0. A picture whose size stays the same is copied as it is.
@@ -172,7 +172,7 @@ def downscale(image: np.ndarray, factor: float) -> np.ndarray:
 
 
 def read_exif(path: Path) -> Exif:
-    """The EXIF entries that matter for cameras. Odd or damaged entries read as absent.
+    """Read the EXIF entries that matter for cameras. Odd or damaged entries read as absent.
 
     Raises:
         UserError: see `read_image`; damage behind the header is not seen.
@@ -243,7 +243,7 @@ def _check_pixels(image: np.ndarray) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """The file as a lazy Pillow image; what goes wrong with the file inside the block becomes a UserError."""
+    """Open the file as a lazy Pillow image; what goes wrong with the file inside the block becomes a UserError."""
     try:
         if path.stat().st_size == 0:
             raise UserError(f"{path} is empty (0 bytes)", "copy the photo again, or remove the file")
@@ -267,7 +267,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 
 def _to_srgb(image: Image.Image, path: Path) -> Image.Image:
-    """A loaded image in mode RGB or RGBA, in the sRGB colour space."""
+    """Return a loaded image in mode RGB or RGBA, in the sRGB colour space."""
     profile = image.info.get("icc_profile")
     mode = "RGBA" if image.has_transparency_data else "RGB"
     # A 16-bit PNG is "I" in older releases of Pillow.
@@ -320,7 +320,7 @@ def _orientation(image: Image.Image) -> int:
 
 
 def _ifd(image: Image.Image, which: int | None) -> dict[int, Any]:
-    """One directory of EXIF entries, the main one for None; empty if it cannot be parsed."""
+    """Return one directory of EXIF entries, the main one for None; empty if it cannot be parsed."""
     try:
         exif = image.getexif()
         return dict(exif) if which is None else dict(exif.get_ifd(which))
@@ -335,7 +335,7 @@ def _text(value: Any) -> str | None:
 
 
 def _number(value: Any) -> float | None:
-    """A finite number from a rational, or from the first of several."""
+    """Return a finite number from a rational, or from the first of several."""
     if isinstance(value, tuple) and value:
         return _number(value[0])
     if not isinstance(value, (int, float, Rational)):

@@ -21,7 +21,8 @@ MILLIMETRE = 1e-3
 
 
 def chosen_scale(largest: float, unit: str) -> float:
-    """The length of a level for a whole clip, in scene units: 1, 2 or 5 times a power of ten, the finest that fits.
+    """Return the length of a level for a whole clip, in scene units: 1, 2 or 5 times a power of ten, the finest that
+    fits.
 
     In metres it is never finer than a millimetre, so that files are in millimetres wherever that fits.
 
@@ -73,7 +74,7 @@ def write_png16(path: Path, depth: np.ndarray, meta: DepthMeta, *, units_per_lev
 
 
 def scale_in_words(meta: DepthMeta) -> str:
-    """ "a level is 1 mm, 0 is no value"."""
+    """Return "a level is 1 mm, 0 is no value"."""
     if meta.units_per_level is None:
         return "NaN means no value"
     if meta.unit == "metre":

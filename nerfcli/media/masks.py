@@ -18,7 +18,7 @@ _HINT = "a mask must have the size of its photo; black pixels are ignored"
 
 
 def find_mask(name: str, masks: Path) -> Path | None:
-    """The mask of the photo `name` in the folder `masks`, None if it has none.
+    """Find the mask of the photo `name` in the folder `masks`, None if it has none.
 
     photo.jpg.png, as COLMAP names it, goes before photo.png, and other formats come last; so does the photo's own name,
     photo.jpg.

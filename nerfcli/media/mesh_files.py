@@ -86,7 +86,7 @@ def write_ply(
 
 
 def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[str], int]:
-    """What a PLY file says it holds.
+    """Read what a PLY file says it holds.
 
     Returns:
         elements and how many there are; properties of a vertex and their NumPy types; comments; where the body begins,
@@ -118,7 +118,8 @@ def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[st
 
 
 def read_ply_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices (N, 3) and triangles (F, 3) int64 of a binary PLY whose faces hold nothing else than three vertices.
+    """Read the vertices (N, 3) and triangles (F, 3) int64 of a binary PLY whose faces hold nothing else than three
+    vertices.
 
     Raises:
         UserError: it is something else, or cut short.
@@ -237,7 +238,7 @@ def write_glb(
 
 
 def read_glb_json(path: Path) -> dict[str, Any]:
-    """The JSON of a binary glTF.
+    """Read the JSON of a binary glTF.
 
     Raises:
         UserError: it is none, or cut short.

@@ -18,7 +18,7 @@ SUFFIXES = (".ply", ".glb", ".obj", ".nrrd", *LAS_SUFFIXES)
 
 
 def model_facts(path: Path) -> dict[str, Any] | None:
-    """The facts of a file by their names; None where an archive is no volume.
+    """Return the facts of a file by their names; None where an archive is no volume.
 
     Keys: kind, format, counts, low and high corner where they are known, and the description: unit, frame, run, ...
 
@@ -99,7 +99,7 @@ def _obj_facts(path: Path) -> dict[str, Any]:
 
 
 def volume_facts(volume: Volume, form: str) -> dict[str, Any]:
-    """The facts of a volume, whatever its file."""
+    """Return the facts of a volume, whatever its file."""
     facts: dict[str, Any] = {"kind": "volume", "format": form, "voxel_size": volume.voxel_size}
     shape = next(iter(volume.maps.values())).shape[:3]
     facts |= {"voxels": "x".join(map(str, shape)), "first_centre": volume.origin.tolist()}

@@ -46,7 +46,9 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
 
 
 def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.ndarray:
-    """The colours of `preview` without its legend, uint8 RGB (height, width, 3); arguments and errors as there."""
+    """Return the colours of `preview` without its legend, uint8 RGB (height, width, 3); arguments and errors as
+    there.
+    """
     if not -math.inf < lo <= hi < math.inf:
         raise ValueError(f"lo <= hi must be finite, got {lo}, {hi}")
     valid = np.isfinite(depth)
@@ -107,7 +109,7 @@ def _legend(lines: tuple[str, ...], suffix: str, *, lo: float, hi: float, colour
 
 
 def _lines(meta: DepthMeta) -> tuple[str, ...]:
-    """What the legend says of the values."""
+    """Return what the legend says of the values."""
     unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
     if meta.quantity in UNIT_OF:
         return meta.title, f"in {unit}; hatched: no surface"

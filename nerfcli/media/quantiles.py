@@ -44,7 +44,7 @@ def quantiles(maps: Callable[[], Iterable[np.ndarray]], shares: Sequence[float])
 
 
 def _ordered(values: np.ndarray) -> np.ndarray:
-    """The finite values as uint32 in the same order: bits of negative floats count backwards."""
+    """Return the finite values as uint32 in the same order: bits of negative floats count backwards."""
     bits = np.ascontiguousarray(values[np.isfinite(values)], dtype=np.float32).view(np.uint32)
     return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31))
 

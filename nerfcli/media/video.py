@@ -137,7 +137,7 @@ def write_video(
 def _write_gif(
     partial: Path, frames: Callable[[], Iterable[np.ndarray]], *, fps: float, plays: int, comment: str, target: Path
 ) -> None:
-    """One palette over the whole clip, then the pixels; ffmpeg would keep all frames in memory to do it in one go."""
+    """Write one palette over the clip, then the pixels: to do both at once, ffmpeg would keep all frames in memory."""
     with tempfile.TemporaryDirectory(prefix=f"{partial.name}-", dir=partial.parent) as folder:
         palette, plain = Path(folder) / "palette.png", Path(folder) / "plain.gif"
         _encode(frames(), palette, ["-vf", "palettegen=reserve_transparent=0", "-update", "1"], fps=fps, target=target)

@@ -124,7 +124,7 @@ def measure_frames(
 
 
 def read_frames(video: Video, numbers: Sequence[int]) -> Iterator[np.ndarray]:
-    """Some frames in full size, one at a time.
+    """Yield some frames in full size, one at a time.
 
     Args:
         video: from `open_video`.
@@ -173,7 +173,7 @@ class _Decoder:
         return self._process.returncode
 
     def frames(self) -> Iterator[np.ndarray]:
-        """The pictures as they come."""
+        """Yield the pictures as they come."""
         assert self._process.stdout is not None
         while (picture := _read_picture(self._process.stdout)) is not None:
             yield picture
@@ -228,7 +228,7 @@ def _decoding(path: Path, filters: str, codec: str, *, more: Sequence[str] = ())
 
 
 def _read_picture(pipe: IO[bytes]) -> np.ndarray | None:
-    """The next PGM or PPM picture of 8 bits; None at the end, even if it comes amid one."""
+    """Read the next PGM or PPM picture of 8 bits; None at the end, even if it comes amid one."""
     magic = pipe.readline().strip()
     if not magic:
         return None

@@ -87,7 +87,7 @@ def write_nrrd(volume: Volume, name: str, path: Path) -> None:
 
 
 def read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
-    """A map [x, y, z] that `write_nrrd` wrote, and the fields of its header.
+    """Read a map [x, y, z] that `write_nrrd` wrote, and the fields of its header.
 
     Raises:
         UserError: it is another kind of file, or damaged.
@@ -113,7 +113,7 @@ def read_nrrd(path: Path) -> tuple[np.ndarray, dict[str, str]]:
 
 
 def read_volume_npz(path: Path) -> Volume | None:
-    """The volume that `write_volume_npz` wrote; None where the archive is something else.
+    """Read the volume that `write_volume_npz` wrote; None where the archive is something else.
 
     Raises:
         UserError: it is damaged.

@@ -117,12 +117,12 @@ class _Pair:
 
 
 def _median_miss(pairs: Sequence[_Pair], log_focal: float) -> float:
-    """In pixels."""
+    """Return the median distance in pixels."""
     return MISS_PX * float(np.median(np.concatenate([pair.misses(log_focal) for pair in pairs])))
 
 
 def _lowest(places: np.ndarray, costs: np.ndarray) -> float:
-    """Where a parabola through the lowest cost and its neighbours has its bottom."""
+    """Return where a parabola through the lowest cost and its neighbours has its bottom."""
     i = int(np.clip(costs.argmin(), 1, len(costs) - 2))
     before, at, after = costs[i - 1 : i + 2]
     bend = before - 2 * at + after

@@ -205,7 +205,7 @@ def together(pairs: Sequence[tuple[int, int, Motions]]) -> Stationary:
 
 
 def _common(x: np.ndarray, y: np.ndarray, *, one: np.ndarray, other: np.ndarray, within: float) -> np.ndarray:
-    """The fundamental matrix that most of two sets of matches agree on, as many of the one as of the other.
+    """Return the fundamental matrix that most of two sets of matches agree on, as many of the one as of the other.
 
     What moved may be flat, and then has many such matrices, of which one may hold for what stayed, too.
     """

@@ -25,7 +25,7 @@ SAME_WAY_COS = np.cos(np.radians(40.0))
 
 
 def match(photos: Sequence[LoadedPhoto], *, threads: int) -> tuple[Matches, ...]:
-    """The matches of `chosen_pairs` that have any."""
+    """Return the matches of `chosen_pairs` that have any."""
     pairs = chosen_pairs(photos)
     wanted = sorted({index for pair in pairs for index in pair})
     own_threads = cv2.getNumThreads()

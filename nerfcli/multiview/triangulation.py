@@ -37,7 +37,7 @@ class Surface:
 
 
 def triangulate(frames: Sequence[Frame], tracks: Tracks) -> Surface:
-    """The point that all rays of a track pass nearest to, for each track that two photos at least agree on.
+    """Return the point that all rays of a track pass nearest to, for each track that two photos at least agree on.
 
     x = (sum_i I - d_i d_i^T)^-1 sum_i (I - d_i d_i^T) o_i,  d_i unit rays, o_i camera centres
 

@@ -9,7 +9,7 @@ JPEG_QUALITY = 85
 
 
 def data_uri(data: bytes, kind: str) -> str:
-    """An encoded picture as the address of itself.
+    """Return an encoded picture as the address of itself.
 
     Args:
         kind: jpeg or png.
@@ -18,7 +18,7 @@ def data_uri(data: bytes, kind: str) -> str:
 
 
 def jpeg_bytes(picture: np.ndarray, *, longest_px: int | None = None, quality: int = JPEG_QUALITY) -> bytes:
-    """A photo or a rendering, encoded.
+    """Return a photo or a rendering, encoded.
 
     Args:
         picture: (H, W, 3) uint8 sRGB.
@@ -28,7 +28,7 @@ def jpeg_bytes(picture: np.ndarray, *, longest_px: int | None = None, quality: i
 
 
 def png_bytes(picture: np.ndarray) -> bytes:
-    """A drawing, encoded without loss: (H, W, 3) uint8 sRGB."""
+    """Return a drawing, encoded without loss: (H, W, 3) uint8 sRGB."""
     return _encoded(picture, ".png", [])
 
 
@@ -42,7 +42,7 @@ def fitted(picture: np.ndarray, longest_px: int | None) -> np.ndarray:
 
 
 def picture_rule(name: str, uri: str) -> str:
-    """A CSS rule that gives elements of a class a picture, so that one that is shown twice is stored once."""
+    """Return a CSS rule that gives elements of a class a picture, so that one that is shown twice is stored once."""
     return f".{name}{{background-image:url({uri})}}"
 
 

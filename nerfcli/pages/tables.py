@@ -7,7 +7,7 @@ from html import escape
 def table(
     columns: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Collection[int] = (), name: str = ""
 ) -> str:
-    """A table that scrolls sideways where the window is too narrow; all cells are plain text.
+    """Return a table that scrolls sideways where the window is too narrow; all cells are plain text.
 
     Args:
         columns: the headings.

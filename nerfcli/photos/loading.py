@@ -74,7 +74,7 @@ def load_photo(frame: Frame, factor: float, masks: str) -> LoadedPhoto:
 
 
 def downscaled_camera(camera: Camera, factor: float) -> Camera:
-    """The camera of a picture that `media.images.downscale` made smaller."""
+    """Return the camera of a picture that `media.images.downscale` made smaller."""
     return camera.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))
 
 

@@ -220,7 +220,7 @@ class PixelPool:
         return self.usable[places] == numbers
 
     def rays_of(self, numbers: Tensor) -> Drawn:
-        """The rays and colours of pixels (N,), counted through all photos."""
+        """Return the rays and colours of pixels (N,), counted through all photos."""
         pixels = PixelTable(self.first_pixel, self.first_bearing, self.bearings, self.poses, self.colours)
         rays = self._backend.pixel_rays(numbers, pixels)
         none = torch.zeros(0, device=numbers.device)
@@ -231,7 +231,7 @@ class PixelPool:
         return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
 
     def place(self, number: int) -> tuple[str, int, int]:
-        """The photo's name, column and row of the pixel with a number."""
+        """Return the photo's name, column and row of the pixel with a number."""
         photo = int(self.photo_of(torch.tensor(number, device=self.first_pixel.device)))
         name, width = self.names_and_widths[photo]
         row, column = divmod(number - int(self.first_pixel[photo]), width)

@@ -74,7 +74,7 @@ class InMemory:
     """Arrays as they are."""
 
     def array(self, shape: tuple[int, ...], dtype: np.dtype | type) -> np.ndarray:
-        """An array to be filled."""
+        """Return an array to be filled."""
         return np.empty(shape, dtype)
 
     def release_pages(self) -> None:
@@ -95,7 +95,7 @@ class InFiles:
         self._maps: list[mmap.mmap] = []
 
     def array(self, shape: tuple[int, ...], dtype: np.dtype | type) -> np.ndarray:
-        """An array to be filled.
+        """Return an array to be filled.
 
         Raises:
             UserError: the disk is full.

@@ -252,7 +252,7 @@ def _masks_of(report: PosesReport, scene_dir: Path) -> Path | None:
 
 
 def _split(report: PosesReport, holdout: str) -> dict[str, str | None]:
-    """Which of the placed photos are for training and which for testing."""
+    """Return which of the placed photos are for training and which for testing."""
     placed = [image.name for image in report.images if image.registered]
     if report.strict is not None:
         test = frozenset(report.strict["placed"])
@@ -262,7 +262,7 @@ def _split(report: PosesReport, holdout: str) -> dict[str, str | None]:
 
 
 def _check_destination(scene_dir: Path, photos_dir: Path) -> None:
-    """A scene takes the place of what is there, which must be a scene too, or nothing, and the photos least of all."""
+    """Refuse a destination that holds something else than a scene, since the scene takes its place."""
     scene_path, photos_path = scene_dir.resolve(), photos_dir.resolve()
     hint = "choose another folder with -o"
     if photos_path.is_relative_to(scene_path):

@@ -36,7 +36,7 @@ class Workspace:
 
 @contextmanager
 def workspace(scene_dir: Path) -> Iterator[Workspace]:
-    """The work folder of a scene, for one process at a time.
+    """Open the work folder of a scene, for one process at a time.
 
     Raises:
         UserError: another process works there, or nothing can be written there.

@@ -155,7 +155,7 @@ def _renderings(
 
 
 def _spread(differences: np.ndarray) -> Spread:
-    """Of those that are defined; zeros where there are none."""
+    """Return the spread of the values that are defined; zeros where there are none."""
     finite = differences[np.isfinite(differences)]
     if finite.size == 0:
         return Spread(0, 0.0, 0.0, 0.0)

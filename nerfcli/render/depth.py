@@ -80,7 +80,7 @@ def is_convention(name: str) -> bool:
 
 
 def effective_floor(request: DepthRequest) -> float:
-    """The opacity below which a pixel has no depth: 0 for the conventions that every ray has."""
+    """Return the opacity below which a pixel has no depth: 0 for the conventions that every ray has."""
     if request.convention in ("moment", "background"):
         return 0.0
     return max(request.min_opacity, request.share or 0.0)

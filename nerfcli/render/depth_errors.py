@@ -62,7 +62,7 @@ class DepthErrors:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> Self:
-        """The errors that `to_json` described."""
+        """Return the errors that `to_json` described."""
         rows: Sequence[Any] = content["quantiles"]
         empty = np.full(len(_SHARES), np.nan)
         quantiles = np.stack([empty if row is None else np.array(row) for row in rows])

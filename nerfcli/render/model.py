@@ -39,7 +39,7 @@ class Marching:
         return step_edges(self.near, self.far, shortest_step=self.shortest_step, growth=self.growth)
 
     def stretched(self, factor: float) -> "Marching":
-        """The same span in steps `factor` times as long, > 0."""
+        """Return the same span in steps `factor` times as long, > 0."""
         return replace(self, shortest_step=factor * self.shortest_step, growth=factor * self.growth)
 
 
@@ -90,7 +90,7 @@ class Model:
         return self.device.type == "cpu" and kernels.thread_safe()
 
     def stretched(self, factor: float) -> "Model":
-        """The same field, looked at in steps along rays `factor` times as long as those of the training."""
+        """Return the same field, looked at in steps along rays `factor` times as long as those of the training."""
         return replace(self, marching=self.marching.stretched(factor))
 
 
@@ -151,7 +151,7 @@ def load_model(path: Path, device: str) -> Model:
 
 
 def _background(described: Any, tensors: dict[str, Tensor]) -> Background:
-    """The background that `save_model` described; its tensor is taken out of `tensors`."""
+    """Return the background that `save_model` described; its tensor is taken out of `tensors`."""
     if isinstance(described, dict):
         sphere = SphereBackground(described["side"])
         sphere.logits.data = tensors.pop(BACKGROUND)

@@ -37,6 +37,6 @@ def _slope(points: np.ndarray, depth: np.ndarray, *, axis: int) -> np.ndarray:
 
 
 def _sides(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """The values without the last and without the first along an axis."""
+    """Return the values without the last and without the first along an axis."""
     count = values.shape[axis]
     return np.take(values, range(count - 1), axis), np.take(values, range(1, count), axis)

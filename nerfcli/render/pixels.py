@@ -81,7 +81,7 @@ def _scaled(ends: LightEnds, factor: Tensor) -> LightEnds:
 def _mixture(
     seen: RaysSeen, ends: LightEnds, *, factor: Tensor, shares: tuple[float, ...], count: int, backend: Backend
 ) -> LightEnds:
-    """Where light ends that goes along one of `count` rays; `ends` are theirs, scaled by `factor`."""
+    """Return where light ends that goes along one of `count` rays; `ends` are theirs, scaled by `factor`."""
     opacity = ends.opacity.view(-1, count)
     total = opacity.sum(1)
     defined = total > 0

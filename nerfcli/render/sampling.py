@@ -34,5 +34,5 @@ def step_edges(near: float, far: float, *, shortest_step: float, growth: float) 
 
 
 def step_length(distance: float, shortest_step: float, growth: float) -> float:
-    """The step of `step_edges` at a distance."""
+    """Return the step of `step_edges` at a distance."""
     return max(shortest_step, growth * distance * max(1.0, distance))

@@ -23,7 +23,7 @@ STOP_SHARE = 0.1
 
 
 def deepest(tolerance: float) -> float:
-    """The optical depth at which rays stop."""
+    """Return the optical depth at which rays stop."""
     return -math.log(STOP_SHARE * tolerance)
 
 

@@ -56,7 +56,7 @@ def origin_of(runs: Sequence[RunFacts], hashes: Sequence[str], *, views: int, de
 def page_html(
     runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]], *, depths: Sequence[DepthMeta], origin: str | None = None
 ) -> str:
-    """The page's text.
+    """Return the page's text.
 
     Args:
         runs: at least one.
@@ -102,7 +102,7 @@ def _structure(view: Seen) -> str:
 
 
 def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> list[tuple[float, float]]:
-    """The range of colours of each run's depths: the same for all runs of a scene."""
+    """Return the range of colours of each run's depths: the same for all runs of a scene."""
     scenes = [run.config.scene_fingerprint for run in runs]
     return [
         depth_range([view for other, look in zip(scenes, looks, strict=True) if other == scene for view in look])
@@ -145,7 +145,7 @@ def _views_html(
 def _layers(
     first: Seen, seen: Sequence[tuple[RunFacts, Seen, tuple[float, float]]], *, alone: bool
 ) -> list[dict[str, str]]:
-    """What can be shown of a photo: itself, then pictures, errors and depths of all runs."""
+    """Return what can be shown of a photo: itself, then pictures, errors and depths of all runs."""
 
     def layer(kind: str, run: RunFacts, picture: np.ndarray) -> dict[str, str]:
         return _layer(kind if alone else f"{run.label}: {kind}", picture)
@@ -206,7 +206,7 @@ def _curves_html(runs: Sequence[RunFacts]) -> str:
 
 
 def _cameras_html(runs: Sequence[RunFacts]) -> str:
-    """The cameras of every scene, once."""
+    """Return the cameras of every scene, once."""
     drawn: dict[str, str] = {}
     for run in runs:
         scene = run.config.scene_fingerprint or str(run.path)

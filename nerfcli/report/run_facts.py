@@ -146,7 +146,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _json(path: Path) -> dict[str, Any] | None:
-    """The object in a file; None where there is no such file.
+    """Return the object in a file; None where there is no such file.
 
     Raises:
         UserError: it is there and is no JSON object.

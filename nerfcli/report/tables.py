@@ -21,14 +21,14 @@ def capture_html(runs: Sequence[RunFacts]) -> str:
 
 
 def _columns(runs: Sequence[RunFacts], rows: Sequence[tuple[str, Callable[[RunFacts], str]]]) -> str:
-    """A table with a column for each run; rows that no run has anything for are left out."""
+    """Return a table with a column for each run; rows that no run has anything for are left out."""
     cells = [(name, *(read(run) for run in runs)) for name, read in rows]
     kept = [row for row in cells if any(row[1:])]
     return table(("", *(run.label for run in runs)), kept, numbers=range(1, len(runs) + 1))
 
 
 def _protocols_html(runs: Sequence[RunFacts]) -> str:
-    """How the numbers were made, each way once."""
+    """Return how the numbers were made, each way once."""
     protocols = dict.fromkeys(str(run.metrics["protocol"]) for run in runs if run.metrics)
     return "".join(f'<p class="legend"><b>protocol</b> {escape(protocol)}</p>' for protocol in protocols)
 
@@ -132,7 +132,7 @@ def _photos_html(runs: Sequence[RunFacts], *, of_many: bool) -> str:
 
 
 def _novelty(view: dict[str, Any] | None) -> list[str]:
-    """How far a held-out view is from the nearest that was trained on."""
+    """Return how far a held-out view is from the nearest that was trained on."""
     if view is None:
         return ["", "", "", ""]
     distance, angle = number(view.get("distance_relative"), 3), number(view.get("angle_deg"), 1)
@@ -174,7 +174,7 @@ def selection_html(runs: Sequence[RunFacts]) -> str:
 
 
 def settings_html(runs: Sequence[RunFacts]) -> str:
-    """Every setting and version; where runs differ, the row is marked and comes first."""
+    """Return every setting and version; where runs differ, the row is marked and comes first."""
     per_run = [
         _flat({"settings": run.config.settings.to_json(), "versions": dict(run.config.versions)}) for run in runs
     ]

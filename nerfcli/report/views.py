@@ -90,7 +90,7 @@ def look_at(
 
 
 def depth_range(views: Sequence[Seen]) -> tuple[float, float]:
-    """The 1st and 99th percentile of all depths that are defined; (0, 1) where there is none."""
+    """Return the 1st and 99th percentile of all depths that are defined; (0, 1) where there is none."""
     valid = np.concatenate([np.empty(0), *(view.depth[np.isfinite(view.depth)] for view in views)])
     if not len(valid):
         return 0.0, 1.0

@@ -147,7 +147,7 @@ def choose(start: Components, *, included: Sequence[str], excluded: Sequence[str
 
 
 def differences(components: Components) -> dict[str, Value]:
-    """The components that are not as they are by default, with their values."""
+    """Return the components that are not as they are by default, with their values."""
     default = Components()
     return {name: value for name in CHOICES if (value := getattr(components, name)) != getattr(default, name)}
 

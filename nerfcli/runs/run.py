@@ -130,8 +130,8 @@ class Run:
             )
 
     def is_trained_from(self, scene: Scene, settings: TrainSettings) -> bool:
-        """Whether it was trained from this scene with these settings; threads and device aside, an automatic downscale,
-        contraction and number of rows counting as whatever was chosen."""
+        """Return whether it was trained from this scene with these settings; threads and device aside, an automatic
+        downscale, contraction and number of rows counting as whatever was chosen."""
         wanted = {key: value for key, value in settings.to_json().items() if key not in ("device", "threads")}
         for name in ("downscale", "contraction", "log2_rows"):
             if wanted[name] is None:

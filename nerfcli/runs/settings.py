@@ -163,7 +163,7 @@ def sizes_for(device: str) -> dict[str, Any]:
 
 
 def automatic_downscale(width: int, height: int) -> int:
-    """The smallest downscale that brings the longer side to `AUTO_LONGER_SIDE_PX` or below."""
+    """Return the smallest downscale that brings the longer side to `AUTO_LONGER_SIDE_PX` or below."""
     for factor in DOWNSCALES:
         if max(width, height) / factor <= AUTO_LONGER_SIDE_PX:
             return factor

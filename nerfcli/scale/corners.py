@@ -85,7 +85,7 @@ def scale_from_corners(
 
 
 def _triangulated(frames: Sequence[Frame], seen: Sequence[tuple[int, np.ndarray]]) -> np.ndarray | str:
-    """The point (3,) where the directions meet, or why there is none."""
+    """Return the point (3,) where the directions meet, or why there is none."""
     rays = [(frames[index], *frames[index].camera.bearings(pixel)) for index, pixel in seen]
     rays = [(frame, directions[0]) for frame, directions, valid in rays if valid[0]]
     if len({frame.name for frame, _ in rays}) < 2:

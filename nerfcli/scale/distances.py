@@ -111,7 +111,7 @@ def scale_from_distances(distances: Sequence[KnownDistance]) -> ScaleEstimate:
 
 
 def _place(text: str, frames: Sequence[Frame]) -> np.ndarray:
-    """The point x,y,z, or the centre of the camera with this name; a name wins."""
+    """Return the point x,y,z, or the centre of the camera with this name; a name wins."""
     if _POINT.fullmatch(text) and all(frame.name != text for frame in frames):
         return point_of(text, EXPECTED)
     return frames_named(frames, [text])[0].centre

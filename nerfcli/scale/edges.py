@@ -26,7 +26,7 @@ _LEAST_PROFILES = 12
 
 
 def refined_corners(grey: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
-    """The corners of a dark square on white, to some hundredths of a pixel; None where an edge is not seen.
+    """Return the corners of a dark square on white, to some hundredths of a pixel; None where an edge is not seen.
 
     On profiles across each edge the edge is the mean position of the rise of brightness; a line is fitted to them, and
     neighbouring lines meet in the corners.
@@ -55,7 +55,7 @@ def refined_corners(grey: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
 
 
 def _edge(grey: np.ndarray, a: np.ndarray, b: np.ndarray, middle: np.ndarray) -> np.ndarray | None:
-    """The line [nx, ny, offset] along the edge from a to b of a dark square around `middle`."""
+    """Return the line [nx, ny, offset] along the edge from a to b of a dark square around `middle`."""
     length = float(np.linalg.norm(b - a))
     if length < 1:
         return None

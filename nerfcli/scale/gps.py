@@ -123,7 +123,7 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
 
 
 def _spans_a_plane(metres: np.ndarray, sigma: float) -> bool:
-    """Whether points (N, 3) are as far off their best line as noise requires."""
+    """Return whether points (N, 3) are as far off their best line as noise requires."""
     off = np.linalg.svd(metres - metres.mean(axis=0), compute_uv=False)[1] if len(metres) >= 3 else 0.0
     return bool(off > _SPREAD_PER_NOISE * sigma)
 

@@ -130,7 +130,7 @@ class Race:
             self._is_confirmed(change, judge_removal)
 
     def _try_once(self, changes: Sequence[Change]) -> None:
-        """Each with the first seed, beside what is kept: those that may gain are in `_once` then.
+        """Try each with the first seed, beside what is kept: those that may gain are in `_once` then.
 
         What gains is tried with the other seeds before others are tried at all, where there is no time for both.
         """
@@ -152,8 +152,8 @@ class Race:
         return self._rules.get(addition, judge_one)
 
     def _best(self) -> Change:
-        """The one that gains most; of a component's values that gain as much as seeds differ by, the one proposed
-        first, as it is the plainest."""
+        """Return the one that gains most; of a component's values that gain as much as seeds differ by, the one
+        proposed first, as it is the plainest."""
         gains = {change: self.decisions[change].gain_db or 0.0 for change in self._once}
         best = max(gains, key=lambda change: gains[change])
         return next(change for change in gains if change[0] == best[0] and gains[change] >= gains[best] - SEED_DB)

@@ -82,8 +82,8 @@ class Facts:
 
 
 def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components, float, list[Decision]]:
-    """The model with what matched features surely tell of the cameras: another focal length than the given one, or
-    poses that do not fit; the logarithm of the length's factor, which is 0 elsewhere; and the decisions.
+    """Return the model with what matched features surely tell of the cameras: another focal length than the given one,
+    or poses that do not fit; the logarithm of the length's factor, which is 0 elsewhere; and the decisions.
 
     Trials cannot decide about lengths: a model that has begun with a wrong one is bent to fit, and stays so for long.
     For the same reason a model that is asked for with lenses that learn begins with the length that features tell. And
@@ -140,7 +140,8 @@ def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bo
 
 
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
-    """The model with what photos tell before any training, where that is not decided; and the decisions about it.
+    """Return the model with what photos tell before any training, where that is not decided; and the decisions about
+    it.
 
     Rays end at the points that photos share, and photos have the exposures that shared pixels tell. All of it is in
     the model from the first step on: later, light has ended elsewhere already.
@@ -239,8 +240,8 @@ def removals(start: Components, facts: Facts) -> list[Change]:
 
 
 def _without_poses(model: Components) -> Components:
-    """What is tried of a model. Poses learn in their own trial only: they take a third of the time, and others are too
-    short for them to come anywhere."""
+    """Return what is tried of a model. Poses learn in their own trial only: they take a third of the time, and others
+    are too short for them to come anywhere."""
     return replace(model, cameras="fixed") if model.cameras == "poses" else model
 
 

@@ -36,7 +36,7 @@ def paint(background: SphereBackground, seen: Callable[[], tuple[Tensor, Tensor]
 
 
 def explained_by_direction(directions: Tensor, colours: Tensor, photos: Tensor) -> tuple[float, float]:
-    """How well colours that some photos have explain others: one colour for all directions, and one for each.
+    """Return how well colours that some photos have explain others: one colour for all directions, and one for each.
 
     A sky is where it is for all photos; surfaces are elsewhere in each. Photos of even numbers tell, and those of odd
     ones are explained: neighbours, which see the same part of a sky.

@@ -261,7 +261,7 @@ class Trials:
             fitting.field.forget_directions(start.description["field"]["view_degree"])
 
     def _advance(self, fitting: Fitting, fraction: float) -> float:
-        """A step, and the seconds it took."""
+        """Take a step; return it and the seconds it took."""
         began = time.perf_counter()
         fitting.advance(fraction)
         self._room.release_pages()
@@ -286,8 +286,8 @@ def _blocks(shape: tuple[int, ...], generator: np.random.Generator) -> np.ndarra
 
 
 def _split(photos: Sequence[LoadedPhoto], storage: PhotoStorage) -> tuple[list[LoadedPhoto], np.ndarray]:
-    """The photos without the blocks that are judged, and numbers of pixels of those blocks, counted through all photos:
-    as many of each photo, as far as it has them."""
+    """Return the photos without the blocks that are judged, and numbers of pixels of those blocks, counted through all
+    photos: as many of each photo, as far as it has them."""
     generator = np.random.default_rng(SEED)
     sizes = [photo.pixels.shape[0] * photo.pixels.shape[1] for photo in photos]
     masks = storage.array((sum(sizes),), bool)

@@ -51,7 +51,7 @@ class Group:
 
 
 def coarse(value: float) -> float:
-    """The nearest number of bfloat16."""
+    """Return the nearest number of bfloat16."""
     return torch.tensor(value, dtype=torch.float64).to(torch.bfloat16).item()
 
 
@@ -62,7 +62,7 @@ def fog(optical_depth: float, samples: int) -> Segments:
 
 
 def groups() -> tuple[Group, ...]:
-    """The rays for weights, colours and their gradients."""
+    """Return the rays for weights, colours and their gradients."""
     counts = (1, 2, 64, 1024, 4096)
     return (
         *(
@@ -120,7 +120,7 @@ def groups() -> tuple[Group, ...]:
 
 
 def lit(rays: list[Segments], precision: Precision) -> tuple[int, float]:
-    """The most intervals that light comes to, and the optical depth it comes through."""
+    """Return the most intervals that light comes to, and the optical depth it comes through."""
     counts, depths = [0], [0.0]
     for ray in rays:
         depth, count = 0.0, 0
@@ -140,7 +140,7 @@ def even(name: str, density: list[float], near: float, length: float) -> Ray:
 
 
 def depth_rays() -> list[Ray]:
-    """The rays for depths."""
+    """Return the rays for depths."""
     ln2 = math.log(2)
     optical_depths = (1e-12, 1e-6, 1e-3, 0.1, 1.0, 30.0, 1e6)
     return [
@@ -232,7 +232,7 @@ LINES: tuple[tuple[Point, Point], ...] = (
 
 
 def attenuations(thickness: float) -> list[list[list[float]]]:
-    """A volume (Z, Y, X) whose line integrals are at most about a thickness."""
+    """Return a volume (Z, Y, X) whose line integrals are at most about a thickness."""
     z, y, x = VOLUME_SHAPE
     largest = thickness / (x * VOXEL)
     values = [((3 * i + 5 * j + 7 * k) % 13 + 1) / 13 for k in range(z) for j in range(y) for i in range(x)]

@@ -100,7 +100,7 @@ class Row:
         return MET if self.holds(self.errors) else NOT_MET
 
     def holds(self, errors: Errors) -> bool:
-        """Whether errors are within the bounds of this row."""
+        """Return whether errors are within the bounds of this row."""
         pairs = ((errors.value, self.bounds.value), (errors.gradient, self.bounds.gradient))
         return all(error <= bound for error, bound in pairs if error is not None and bound is not None)
 
@@ -121,7 +121,9 @@ class Row:
 
 
 def by_formula(rows: Sequence[Row]) -> list[Row]:
-    """One row for each textbook formula: where it is farthest beyond the bounds, in float32 if it has such rows."""
+    """Return one row for each textbook formula: where it is farthest beyond the bounds, in float32 if it has such
+    rows.
+    """
     formulas: dict[str, list[Row]] = {}
     for row in rows:
         if row.textbook is not None:
@@ -131,7 +133,7 @@ def by_formula(rows: Sequence[Row]) -> list[Row]:
 
 
 def _beyond(row: Row) -> float:
-    """How many times its bounds the textbook's errors are."""
+    """Return how many times its bounds the textbook's errors are."""
     assert row.textbook is not None
     pairs = ((row.textbook.value, row.bounds.value), (row.textbook.gradient, row.bounds.gradient))
     bounded = [(error, bound) for error, bound in pairs if error is not None and bound is not None]
@@ -139,7 +141,7 @@ def _beyond(row: Row) -> float:
 
 
 def largest_error(values: Any, wanted: Any, *, tiny: float, scale: Any = None) -> float:
-    """The largest |value - wanted| / max(|wanted|, tiny).
+    """Return the largest |value - wanted| / max(|wanted|, tiny).
 
     Args:
         values: tensor, array or numbers, as all that follow.

@@ -68,7 +68,7 @@ def both(roundings: float, precision: Precision) -> Errors:
 
 
 def gradients_of(function: Callable[[Tensor], Tensor], given: Tensor) -> Outcome:
-    """A function of numbers or points, and the gradient of a weighted sum, relative to the largest of its point."""
+    """Return a function of numbers or points, and the gradient of a weighted sum relative to its largest."""
     given = given.detach().requires_grad_()
     values = function(given)
     weights = torch.tensor(COLOUR_GRADIENT if given.ndim == 2 else 1.0).to(values)
@@ -118,7 +118,7 @@ def light_bound(rays: Sequence[Segments], precision: Precision) -> Errors:
 
 
 def surface_inputs(precision: Precision) -> Inputs:
-    """A far surface."""
+    """Return a far surface."""
     return {name: precision.tensor(values) for name, values in cases.FAR_SURFACE.items()}
 
 
@@ -160,7 +160,7 @@ def distortion(module: ModuleType, given: Inputs) -> Outcome:
 
 
 def _by(values: Tensor, density: Tensor) -> tuple[Tensor, ...]:
-    """The gradient of the sum of what is defined, where the operation has one."""
+    """Return the gradient of the sum of what is defined, where the operation has one."""
     if not values.requires_grad:
         return ()
     return torch.autograd.grad(torch.where(values.isnan(), 0.0, values).sum(), density, retain_graph=True)
@@ -172,7 +172,7 @@ def depths_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Er
 
 
 def _density_for(module: ModuleType, given: Inputs) -> Tensor:
-    """The densities of rays; the compiled depths have no gradient by them."""
+    """Return the densities of rays; the compiled depths have no gradient by them."""
     return given["density"].detach().requires_grad_(module in (reference, textbook))
 
 
@@ -211,7 +211,7 @@ def depth_bound(rays: Sequence[Ray], factor: float, precision: Precision) -> Err
 
 
 def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> Outcome:
-    """Some of the depths of rays."""
+    """Return some of the depths of rays."""
     density = _density_for(module, given)
     seen = module.light_ends(density, given["starts"], given["ends"], offsets=given["offsets"], shares=SHARES)
     named = {"opacity": seen.opacity, "transmittance": seen.transmittance, "spread": seen.spread}
@@ -221,7 +221,7 @@ def light_ends(columns: tuple[str, ...], module: ModuleType, given: Inputs) -> O
 
 
 def depth_by_textbook(columns: tuple[str, ...], given: Inputs) -> Outcome:
-    """The same depths by the formulas of textbooks, which have the mean for that of the heaviest interval, too."""
+    """Return the same depths by textbook formulas, which have the mean for that of the heaviest interval, too."""
     density = given["density"].detach().requires_grad_()
     named = textbook.depth(density, given["starts"], given["ends"], offsets=given["offsets"])
     return _depths(
@@ -253,7 +253,7 @@ def mixture(module: ModuleType, given: Inputs) -> Outcome:
 
 
 def mixture_by_mean(given: Inputs) -> Outcome:
-    """The mean of the quantiles of two rays."""
+    """Return the mean of the quantiles of two rays."""
     spans = (given["density"], given["starts"], given["ends"])
     seen = reference.light_ends(*spans, offsets=given["offsets"], shares=cases.PIXEL_SHARES)
     return Outcome(tuple(column.view(-1, 2).mean(1) for column in seen.quantiles.unbind(1)))
@@ -281,7 +281,7 @@ def encode(grids: tuple[int, ...], rounded: int, module: ModuleType, given: Inpu
 
 
 def encode_in_half(grids: tuple[int, ...], given: Inputs) -> Outcome:
-    """The same in half precision."""
+    """Return the same in half precision."""
     half = {name: values.half() for name, values in given.items()}
     return encode(grids, 0, reference, half)
 
@@ -364,7 +364,7 @@ def march_inputs(full: bool, precision: Precision) -> Inputs:
 
 
 def chords(module: ModuleType, given: Inputs) -> Outcome:
-    """How much of each ray is kept, in a cube whose network gives no density."""
+    """Return how much of each ray is kept, in a cube whose network gives no density."""
     origins = given["origins"]
     rays = Rays(origins, given["directions"], origins.new_zeros(len(origins)))
     march = March(given["edges"], given["occupied"], "none", 1e9)
@@ -373,7 +373,7 @@ def chords(module: ModuleType, given: Inputs) -> Outcome:
 
 
 def volume_inputs(thickness: float, precision: Precision) -> Inputs:
-    """A volume, lines in float64, and what the loss gains by each line integral."""
+    """Return a volume, lines in float64, and what the loss gains by each line integral."""
     lines = torch.tensor(cases.LINES, dtype=torch.float64, device=precision.device)
     return {
         "volume": precision.tensor(cases.attenuations(thickness)),
@@ -395,5 +395,5 @@ def project(module: ModuleType, given: Inputs) -> Outcome:
 
 
 def project_in_single(given: Inputs) -> Outcome:
-    """The same with lines in float32."""
+    """Return the same with lines in float32."""
     return project(reference, {name: values.float() for name, values in given.items()})

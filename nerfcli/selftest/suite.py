@@ -21,7 +21,7 @@ def precisions(device: str) -> tuple[Precision, ...]:
 
 
 def rows(device: str, notify: Callable[[str], None]) -> Iterator[Row]:
-    """Every row, one after the other as they are measured."""
+    """Yield every row, one after the other as they are measured."""
     kernels.prepare(notify)
     if device != "cpu":
         kernels.prepare(notify, device)

@@ -88,7 +88,7 @@ def row_of(check: Check, precision: Precision) -> Row:
 
 
 def checks() -> Iterator[Check]:
-    """Every hard case."""
+    """Yield every hard case."""
     for group in cases.groups():
         yield Check(
             group.name,

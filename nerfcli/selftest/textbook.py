@@ -51,7 +51,7 @@ def depth(density: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor) -> 
 
 
 def optical_depth_before(density: Tensor, lengths: Tensor, *, offsets: Tensor) -> Tensor:
-    """The cumulative sum of density length, less the own part."""
+    """Return the cumulative sum of density length, less the own part."""
     return torch.cat([(d * n).cumsum(0) - d * n for d, n in _split(offsets, density, lengths)])
 
 

@@ -41,7 +41,7 @@ def read_map(path: Path) -> np.ndarray:
 
 
 def photo_name(name: str) -> str:
-    """The name of a photo in the folder: its own where COLMAP reads such files, else with .png behind it."""
+    """Return the name of a photo in the folder: its own where COLMAP reads such files, else with .png behind it."""
     return name if Path(name).suffix.lower() in _READABLE else f"{name}.png"
 
 

@@ -27,7 +27,7 @@ class Grid:
 
     @staticmethod
     def over(box: tuple[float, ...], voxel_size: float) -> "Grid":
-        """The grid that covers a box, from its low corner on.
+        """Return the grid that covers a box, from its low corner on.
 
         Raises:
             UserError: it would have too many voxels.

@@ -98,7 +98,7 @@ def without_small_pieces(mesh: Mesh, share: float = _SMALLEST_PIECE) -> Mesh:
 
 
 def _any_block(index: np.ndarray) -> np.ndarray:
-    """Which bricks of 8^3 blocks hold a block."""
+    """Return which bricks of 8^3 blocks hold a block."""
     size = _BRICK // SIDE
     padded = np.pad(index >= 0, [(0, -length % size) for length in index.shape])
     x, y, z = (length // size for length in padded.shape)

@@ -39,7 +39,7 @@ def candidate_frames(frames: Sequence[Frame], *, depth_hint: float) -> list[Fram
 
 
 def _tilted(frame: Frame, focus: np.ndarray, up: np.ndarray, angle_deg: float) -> Frame:
-    """The view from higher above the focus, at the same distance from it."""
+    """Return the view from higher above the focus, at the same distance from it."""
     offset = frame.centre - focus
     across = np.cross(offset, up)
     turn = rotation_from_vector(np.radians(angle_deg) * across / np.linalg.norm(across))

@@ -82,7 +82,7 @@ class _Candidates:
 
 
 def _thinned(views: Sequence[DepthView], grid: Grid) -> _Candidates:
-    """Of all depths that are sure, the one of each voxel with the smallest spread."""
+    """Return, of all depths that are sure, the one of each voxel with the smallest spread."""
     parts: list[tuple[np.ndarray, ...]] = []
     for view in views:
         with np.errstate(invalid="ignore"):
@@ -104,6 +104,6 @@ def _thinned(views: Sequence[DepthView], grid: Grid) -> _Candidates:
 
 
 def _best(keys: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Where the smallest spread of each key is, in the order of the keys."""
+    """Return where the smallest spread of each key is, in the order of the keys."""
     order = np.lexsort((spread, keys))
     return order[np.unique(keys[order], return_index=True)[1]]

@@ -45,7 +45,7 @@ class DepthView:
         return (plane_rays(self.frame.camera) * self.depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
 
     def distances(self) -> DepthMap:
-        """The depths as distances along the rays."""
+        """Return the depths as distances along the rays."""
         return DepthMap(self.frame, self.depth * np.linalg.norm(plane_rays(self.frame.camera), axis=-1))
 
     def cosines(self) -> np.ndarray:
@@ -85,7 +85,7 @@ def depth_views(
 
 
 def small_pinhole(camera: Camera, max_size: int) -> Camera:
-    """The pinhole camera of a lens, with a longer side of `max_size` pixels at most."""
+    """Return the pinhole camera of a lens, with a longer side of `max_size` pixels at most."""
     factor = max(1.0, max(camera.width, camera.height) / max_size)
     pinhole = pinhole_of(camera)
     return pinhole.resized(max(1, round(camera.width / factor)), max(1, round(camera.height / factor)))

@@ -18,7 +18,7 @@ _VISIBLE = 1e-3
 
 
 def automatic_volume_voxel(box: tuple[float, ...]) -> float:
-    """The voxel size that makes `CELLS` along the longest side of a box."""
+    """Return the voxel size that makes `CELLS` along the longest side of a box."""
     return float(np.max(np.array(box[3:]) - np.array(box[:3]))) / CELLS
 
 

@@ -137,7 +137,7 @@ def _ramp(projections: np.ndarray, width: float) -> np.ndarray:
 
 
 def _turn(outward: np.ndarray) -> float:
-    """The angle that the views go around, with one more step."""
+    """Return the angle that the views go around, with one more step."""
     angle = np.unwrap(np.arctan2(outward[:, 1], outward[:, 0]))
     return float(abs(angle[-1] - angle[0]) * len(angle) / max(len(angle) - 1, 1))
 

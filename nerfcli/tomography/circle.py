@@ -46,7 +46,7 @@ class Circle:
     mirrored: bool = False
 
     def geometry(self) -> ScanGeometry:
-        """The vectors of this scan.
+        """Return the vectors of this scan.
 
         Raises:
             ValueError: see `circular_cone`.
@@ -74,7 +74,7 @@ class Circle:
         return geometry.mirrored() if self.mirrored else geometry
 
     def scaled(self, factor: float) -> "Circle":
-        """The same scan in a unit that is `factor` times smaller."""
+        """Return the same scan in a unit that is `factor` times smaller."""
         lengths = ("pixel_width", "pixel_height", "source_origin", "source_detector", "lateral")
         return replace(self, **{name: factor * getattr(self, name) for name in lengths})
 
@@ -84,7 +84,7 @@ class Circle:
 
 
 def circle_from_json(content: Mapping[str, Any]) -> Circle:
-    """What `Circle.to_json` wrote."""
+    """Return what `Circle.to_json` wrote."""
     return Circle(**{**content, "angles": tuple(content["angles"])})
 
 
@@ -156,7 +156,7 @@ def differences(one: Circle, other: Circle) -> dict[str, float]:
 
 
 def _distance(one: ScanGeometry, other: ScanGeometry) -> float:
-    """The largest distance between detectors' corners and sources; of parallel beams across the rays."""
+    """Return the largest distance between detectors' corners and sources; of parallel beams across the rays."""
     worst = 0.0
     for along in (-0.5, 0.5):
         for down in (-0.5, 0.5):

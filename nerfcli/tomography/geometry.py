@@ -55,7 +55,7 @@ class ScanGeometry:
         return len(self.emitter)
 
     def select(self, views: ArrayLike) -> "ScanGeometry":
-        """The same scan with some of its views, given by their indices."""
+        """Return the same scan with some of its views, given by their indices."""
         index = np.asarray(views)
         return replace(
             self,
@@ -66,7 +66,8 @@ class ScanGeometry:
         )
 
     def binned(self, factor: int) -> "ScanGeometry":
-        """The detector with pixels `factor` times as large; pixels that fill no larger one are cut off at the end.
+        """Return the detector with pixels `factor` times as large; pixels that fill no larger one are cut off at the
+        end.
 
         Rows are kept as they are where there are fewer of them than `factor`.
         """
@@ -85,11 +86,13 @@ class ScanGeometry:
         )
 
     def shifted(self, columns: float, rows: float = 0.0) -> "ScanGeometry":
-        """The detector moved by some pixels along its rows and columns, as a wrong centre of rotation moves it."""
+        """Return the detector moved by some pixels along its rows and columns, as a wrong centre of rotation moves
+        it.
+        """
         return replace(self, centre=self.centre + columns * self.column_step + rows * self.row_step)
 
     def tilted(self, angle: float) -> "ScanGeometry":
-        """The detector turned in its plane about its centre, from its columns towards its rows, in radians."""
+        """Return the detector turned in its plane about its centre, from its columns towards its rows, in radians."""
         width = np.linalg.norm(self.column_step, axis=1, keepdims=True)
         height = np.linalg.norm(self.row_step, axis=1, keepdims=True)
         along, down = self.column_step / width, self.row_step / height
@@ -99,7 +102,7 @@ class ScanGeometry:
         )
 
     def mirrored(self) -> "ScanGeometry":
-        """The detector whose columns are numbered from the other side."""
+        """Return the detector whose columns are numbered from the other side."""
         return replace(self, column_step=-self.column_step)
 
     def rays(self, views: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -177,7 +180,7 @@ class ScanGeometry:
 
 
 def from_vectors(beam: Beam, vectors: ArrayLike, *, rows: int, columns: int) -> ScanGeometry:
-    """The geometry of ASTRA's (V, 12) vectors; directions of a parallel beam may have any length.
+    """Return the geometry of ASTRA's (V, 12) vectors; directions of a parallel beam may have any length.
 
     Raises:
         ValueError: the vectors are not (V, 12) or not finite, or a direction is 0.
@@ -204,7 +207,7 @@ def circular_cone(
     rows: int,
     columns: int,
 ) -> ScanGeometry:
-    """A source and a flat detector on a circle around z, on opposite sides of the origin.
+    """Return a source and a flat detector on a circle around z, on opposite sides of the origin.
 
     The source of a view with angle a stands at (cos a, sin a, 0) * source_origin. Seen from there, columns run to the
     right and rows down, with +z up.
@@ -235,7 +238,7 @@ def circular_cone(
 def circular_parallel(
     angles: ArrayLike, *, pixel_width: float, pixel_height: float, rows: int, columns: int
 ) -> ScanGeometry:
-    """A parallel beam around z: `circular_cone` with a source infinitely far away.
+    """Return a parallel beam around z: `circular_cone` with a source infinitely far away.
 
     Args:
         angles: (V,) radians, counter-clockwise seen from +z: rays of a view come from (cos a, sin a, 0).

@@ -36,7 +36,7 @@ class VoxelGrid:
         return self.first[index] + self.size * np.arange(self.shape[2 - index])
 
     def coarser(self, factor: int) -> "VoxelGrid":
-        """A grid over the same box with voxels `factor` times as large, rounded up."""
+        """Return a grid over the same box with voxels `factor` times as large, rounded up."""
         shape = tuple(-(-count // factor) for count in self.shape)
         half = self.size * (factor - 1) / 2
         first = (self.first[0] + half, self.first[1] + half, self.first[2] + half)
@@ -44,14 +44,14 @@ class VoxelGrid:
 
 
 def centred_grid(extent: tuple[float, float, float], size: float) -> VoxelGrid:
-    """A grid around the frame's origin that covers a box of these lengths (x, y, z) with whole voxels."""
+    """Return a grid around the frame's origin that covers a box of these lengths (x, y, z) with whole voxels."""
     counts = [max(1, int(np.ceil(length / size - 1e-9))) for length in extent]
     first = tuple(-(count - 1) / 2 * size for count in counts)
     return VoxelGrid((counts[2], counts[1], counts[0]), (first[0], first[1], first[2]), size)
 
 
 def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid:
-    """The box that the detector sees in some view, in voxels of a pixel's size at the object.
+    """Return the box that the detector sees in some view, in voxels of a pixel's size at the object.
 
     Across the axis it is the square around the circle that the widest ray of any view touches; along z it is what the
     detector's first and last row see at the axis. A detector of one row gets one layer.
@@ -74,7 +74,9 @@ def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid
 
 
 def layers_of_rays(grid: VoxelGrid, geometry: ScanGeometry) -> VoxelGrid:
-    """The layers of a grid that the rays of a scan pass, for a detector of fewer rows than the grid was made for."""
+    """Return the layers of a grid that the rays of a scan pass, for a detector of fewer rows than the grid was made
+    for.
+    """
     origins, directions = geometry.rays()
     across = np.linalg.norm(directions[..., :2], axis=-1)
     nearest = -(origins[..., :2] * directions[..., :2]).sum(-1) / across**2

@@ -91,7 +91,7 @@ class HashVolume:
 
 
 def new_arrays(seed: int) -> dict[str, np.ndarray]:
-    """What a volume of one value has learned."""
+    """Return what a volume of one value has learned."""
     generator = torch.Generator().manual_seed(seed)
     shapes = ((LEVELS, 2**LOG2_ROWS, FEATURES), (WIDTH, LEVELS * FEATURES), (1, WIDTH))
     bounds = (1e-4, math.sqrt(6 / (LEVELS * FEATURES)), math.sqrt(6 / WIDTH))
@@ -102,7 +102,7 @@ def new_arrays(seed: int) -> dict[str, np.ndarray]:
 
 
 def hash_volume(grid: VoxelGrid, start: float, arrays: Mapping[str, np.ndarray], *, passes: float = 0.0) -> HashVolume:
-    """A volume around a grid, by what it has learned; its finest level has a cell per voxel."""
+    """Return a volume around a grid, by what it has learned; its finest level has a cell per voxel."""
     table, one, two = (torch.from_numpy(np.array(arrays[name])).requires_grad_() for name in ARRAYS)
     x, y, z = (centre - grid.size / 2 for centre in grid.first)
     return HashVolume(table, (one, two), start, (x, y, z), max(grid.shape) * grid.size, max(grid.shape), passes)

@@ -37,7 +37,7 @@ class Likelihood(Protocol):
         ...
 
     def by_ray(self) -> "Likelihood":
-        """The same with each pixel as a view of its own."""
+        """Return the same with each pixel as a view of its own."""
         ...
 
 
@@ -87,16 +87,16 @@ class Poisson:
         return torch.where(self.open_beam[views] > 0, torch.log(self.open_beam[views] / signal), torch.nan)
 
     def by_ray(self) -> "Poisson":
-        """The same with each pixel as a view of its own."""
+        """Return the same with each pixel as a view of its own."""
         counts, open_beam, background = (x.reshape(-1, 1) for x in (self.counts, self.open_beam, self.background))
         return replace(self, counts=counts, open_beam=open_beam, background=background)
 
     def scaled(self, factors: Tensor) -> "Poisson":
-        """The same counts behind an open beam that is multiplied by a factor per view (views,)."""
+        """Return the same counts behind an open beam that is multiplied by a factor per view (views,)."""
         return replace(self, open_beam=self.open_beam * factors[:, None])
 
     def with_model_error(self, error: float) -> "Poisson":
-        """The same counts for a model whose line integrals are off by about so much."""
+        """Return the same counts for a model whose line integrals are off by about so much."""
         return replace(self, model_error=error)
 
     def found_model_error(self, integrals: Tensor, views: Tensor) -> float:
@@ -137,7 +137,7 @@ class Gaussian:
         return torch.where(self.weight[views] > 0, self.measured[views], torch.nan)
 
     def by_ray(self) -> "Gaussian":
-        """The same with each pixel as a view of its own."""
+        """Return the same with each pixel as a view of its own."""
         return Gaussian(self.measured.reshape(-1, 1), self.weight.reshape(-1, 1))
 
 

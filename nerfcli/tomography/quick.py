@@ -36,14 +36,14 @@ class Row:
     number: int
 
     def binned(self, columns: int) -> "Row":
-        """The row with at most so many columns, each a mean of neighbours."""
+        """Return the row with at most so many columns, each a mean of neighbours."""
         factor = -(-self.geometry.columns // columns)
         kept = self.geometry.columns // factor
         means = self.integrals[:, : kept * factor].reshape(len(self.integrals), kept, factor).mean(2)
         return Row(self.geometry.binned(factor), means, self.number)
 
     def thinned(self, views: int = MOST_VIEWS) -> "Row":
-        """The row with at most so many views, at equal steps."""
+        """Return the row with at most so many views, at equal steps."""
         index = np.unique(np.linspace(0, len(self.integrals) - 1, min(views, len(self.integrals))).round().astype(int))
         return Row(self.geometry.select(index), self.integrals[index], self.number)
 
@@ -115,7 +115,7 @@ def predicted(volume: np.ndarray, row: Row, grid: VoxelGrid) -> np.ndarray:
 
 
 def reconstructed(row: Row) -> tuple[np.ndarray, VoxelGrid]:
-    """A quick reconstruction from all views, (Y, X), and its grid."""
+    """Return a quick reconstruction from all views, (Y, X), and its grid."""
     grid = _grid(row.geometry)
     return _reconstructed(row.geometry, row.integrals, grid)[0].numpy(), grid
 
@@ -161,7 +161,7 @@ def _rays(geometry: ScanGeometry) -> tuple[Tensor, Tensor]:
 
 
 def _grid(geometry: ScanGeometry) -> VoxelGrid:
-    """The square around all that some ray passes through, in voxels of a pixel's size at the object."""
+    """Return the square around all that some ray passes through, in voxels of a pixel's size at the object."""
     _, width = geometry.pixel_at_origin
     origins, directions = geometry.rays()
     across = np.abs(origins[..., 0] * directions[..., 1] - origins[..., 1] * directions[..., 0]).max()
@@ -171,7 +171,7 @@ def _grid(geometry: ScanGeometry) -> VoxelGrid:
 
 
 def _row_of_source(geometry: ScanGeometry) -> float:
-    """The row that the plane of the source across z crosses, median over views."""
+    """Return the row that the plane of the source across z crosses, median over views."""
     lift = geometry.emitter[:, 2] - geometry.centre[:, 2]
     down = np.where(geometry.row_step[:, 2] == 0, -1.0, geometry.row_step[:, 2])
     return (geometry.rows - 1) / 2 + float(np.median(lift / down))

@@ -96,7 +96,7 @@ class Projector:
         return integrals.view(len(views), -1)
 
     def backward(self, values: Tensor, views: np.ndarray) -> Tensor:
-        """The transpose: a volume from values (len(views), pixels)."""
+        """Return the transpose: a volume from values (len(views), pixels)."""
         origins, directions = self._rays(views)
         return self._backend.back_project(
             values.reshape(-1),

@@ -109,7 +109,7 @@ class Reconstruction:
 
 
 def is_reconstruction(run: Path) -> bool:
-    """Whether a folder is a run that `save_reconstruction` wrote."""
+    """Return whether a folder is a run that `save_reconstruction` wrote."""
     try:
         return (run / DESCRIPTION).is_file() and read_sealed(run / DESCRIPTION).get("measurement") == MEASUREMENT
     except (OSError, ValueError):

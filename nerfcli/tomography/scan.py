@@ -88,12 +88,12 @@ class Scan:
         return hasher.hexdigest()
 
     def of_views(self, name: str, views: np.ndarray) -> np.ndarray | None:
-        """One of the arrays `open_beam`, `dark` and `usable` for some views, in its own broadcast shape."""
+        """Return one of the arrays `open_beam`, `dark` and `usable` for some views, in its own broadcast shape."""
         array = getattr(self, name)
         return array if array is None or len(array) == 1 else array[views]
 
     def only_rows(self, first: int, end: int) -> "Scan":
-        """The scan by some rows of its detector, `first` up to `end`."""
+        """Return the scan by some rows of its detector, `first` up to `end`."""
         middle = (first + end - 1) / 2 - (self.geometry.rows - 1) / 2
 
         def cut(array: np.ndarray | None) -> np.ndarray | None:
@@ -130,7 +130,7 @@ class Scan:
 
 
 def is_scan(path: Path) -> bool:
-    """Whether a folder holds a scan that `save_scan` wrote."""
+    """Return whether a folder holds a scan that `save_scan` wrote."""
     try:
         return (path / SCENE_FILE).is_file() and read_sealed(path / SCENE_FILE).get("measurement") == MEASUREMENT
     except (OSError, ValueError):

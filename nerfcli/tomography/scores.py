@@ -105,7 +105,7 @@ def score_volume(volume: np.ndarray, grid: VoxelGrid, true: np.ndarray, true_gri
 
 
 def resampled(volume: np.ndarray, grid: VoxelGrid, other: VoxelGrid) -> np.ndarray:
-    """A volume at the voxel centres of another grid, by trilinear interpolation; 0 outside."""
+    """Return a volume at the voxel centres of another grid, by trilinear interpolation; 0 outside."""
     place = [(other.axis(name) - grid.first["xyz".index(name)]) / grid.size for name in "zyx"]
     coordinates = np.meshgrid(*place, indexing="ij")
     return map_coordinates(volume, coordinates, order=1, mode="constant", cval=0.0, prefilter=False)

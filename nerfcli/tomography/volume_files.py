@@ -96,7 +96,7 @@ def _writer(path: Path) -> Callable[[Path, VolumeFile], None]:
 
 
 def is_volume_file(path: Path) -> bool:
-    """Whether a file is a MetaImage or a NIfTI, or a TIFF stack that `write_volume` wrote."""
+    """Return whether a file is a MetaImage or a NIfTI, or a TIFF stack that `write_volume` wrote."""
     if path.suffix.lower() not in (".tif", ".tiff"):
         return path.suffix.lower() in (".mha", ".nii") and path.is_file()
     try:
@@ -107,7 +107,7 @@ def is_volume_file(path: Path) -> bool:
 
 
 def map_of(volume: VolumeFile) -> Volume:
-    """The volume indexed [x, y, z], under the name of what it is."""
+    """Return the volume indexed [x, y, z], under the name of what it is."""
     name = "marks" if volume.values.dtype == np.uint8 else "attenuation"
     description = {"unit": volume.unit, "quantity": volume.quantity}
     values = np.ascontiguousarray(volume.values).transpose(2, 1, 0)

@@ -101,7 +101,7 @@ class Checkpoints:
         return log_exposures(self._scene.train_frames)
 
     def _held_out_exposures(self) -> dict[str, tuple[float, ...]]:
-        """What the exposures that were learned tell of held-out photos, by name."""
+        """Return what the exposures that were learned tell of held-out photos, by name."""
         learned = self._learned_gains()
         if learned is None:
             return {}
@@ -109,7 +109,7 @@ class Checkpoints:
         return {frame.name: tuple(row) for frame, row in zip(self._scene.test_frames, gains.tolist(), strict=True)}
 
     def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
-        """The training photos and those held out, with their cameras as they are now."""
+        """Return the training photos and those held out, with their cameras as they are now."""
         given = (self._scene.train_frames, self._scene.test_frames)
         refinement = self._fitting.parts.cameras
         if refinement is None:

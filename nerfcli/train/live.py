@@ -83,7 +83,7 @@ class LiveTraining:
             time.sleep(seconds)
 
     def _request(self) -> Request | None:
-        """What viewers want; None where nobody looks.
+        """Return what viewers want; None where nobody looks.
 
         Raises:
             KeyboardInterrupt: somebody wants the training to end.

@@ -240,7 +240,9 @@ def _run(
 
 
 def _share(settings: TrainSettings, step: int, totals: Totals) -> float:
-    """How much of the budget is used: the larger of the shares of time, that of the search aside, and of steps."""
+    """Return how much of the budget is used: the larger of the shares of time, that of the search aside, and of
+    steps.
+    """
     left = settings.budget_seconds - totals.searched if settings.budget_seconds else 0.0
     by_time = (totals.seconds - totals.searched) / left if left > 0 else 0.0
     by_steps = step / settings.steps if settings.steps else 0.0
@@ -248,6 +250,6 @@ def _share(settings: TrainSettings, step: int, totals: Totals) -> float:
 
 
 def peak_memory_bytes() -> int:
-    """The largest resident size this process has had."""
+    """Return the largest resident size this process has had."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # kilobytes everywhere else

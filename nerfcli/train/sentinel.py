@@ -54,7 +54,7 @@ class Sentinel:
         self._tensors, self._description = _copied(*fitting.state())
 
     def advance(self, share: float) -> StepResult:
-        """One step, see `Fitting.advance`; after a failure, the first step on the way again.
+        """Take one step, see `Fitting.advance`; after a failure, the first step on the way again.
 
         Raises:
             UserError: numbers become non-finite although the steps are small, exit code 5.
@@ -233,7 +233,7 @@ def replay(path: Path) -> tuple[dict[str, Any], BadTensor | None]:
 
 
 def _watched_step(fitting: Fitting, fraction: float) -> tuple[StepResult | None, BadTensor | None]:
-    """A step that looks at every number, and the first tensor that is not finite."""
+    """Return a step that looks at every number, and the first tensor that is not finite."""
     watch = FirstBad()
     try:
         result = fitting.advance(fraction, watch)
@@ -244,7 +244,7 @@ def _watched_step(fitting: Fitting, fraction: float) -> tuple[StepResult | None,
 
 
 def _first_of_ranks(fitting: Fitting, bad: BadTensor | None) -> BadTensor | None:
-    """The bad tensor of the first rank that has one, with the numbers of its rays among those of all ranks."""
+    """Return the bad tensor of the first rank that has one, with the numbers of its rays among those of all ranks."""
     ranks = fitting.ranks
     if bad is not None:
         bad = replace(bad, rays=tuple(ranks.rank + ranks.count * ray for ray in bad.rays))

@@ -81,7 +81,7 @@ def measure_waypoints(
 
 
 def _kept(run: Path) -> list[int]:
-    """The steps of which there are waypoints, in order."""
+    """Return the steps of which there are waypoints, in order."""
     return sorted(int(path.stem) for path in (run / FOLDER).glob("*.safetensors") if path.stem.isdecimal())
 
 

@@ -95,7 +95,7 @@ def live_page_html(
 def _scene(
     model: Model, *, run: Path, frames: Sequence[Frame], photos: Sequence[dict[str, Any]], box: Sequence[float]
 ) -> dict[str, Any]:
-    """What both kinds of page have, plain values."""
+    """Return what both kinds of page have, plain values."""
     size = 1.0 / model.training_from_scene.scale
     home = view_of(frames[len(frames) // 2])
     unit = {"metre": "metres", "arbitrary": "arbitrary units"}.get(model.unit, model.unit)
@@ -119,7 +119,7 @@ def _scene(
 
 
 def _html(scene: dict[str, Any], numbers: str, *, run: Path, connect: bool) -> str:
-    """The page around a scene."""
+    """Return the page around a scene."""
     shaders = "".join(_element(part, "x-shader/x-fragment", _text(f"{part}.glsl")) for part in ("trace", "show"))
     body = "\n".join(
         [
@@ -158,5 +158,5 @@ def array_element(name: str, values: np.ndarray) -> str:
 
 @cache
 def _text(name: str) -> str:
-    """The text of a part of the page that stands beside this file."""
+    """Return the text of a part of the page that stands beside this file."""
     return Path(__file__).with_name(name).read_text(encoding="utf-8")

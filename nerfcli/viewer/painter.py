@@ -54,7 +54,7 @@ class View:
     quantile: float
 
     def coarse(self, stride: int) -> Frame:
-        """The frame with one pixel for stride x stride; its rays are those of their middles."""
+        """Return the frame with one pixel for stride x stride; its rays are those of their middles."""
         camera = self.frame.camera
         width, height = (-(-size // stride) for size in (camera.width, camera.height))
         lens = tuple(value / stride for value in camera.params)

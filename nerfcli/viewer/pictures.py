@@ -116,13 +116,13 @@ def view_of(frame: Frame) -> dict[str, Any]:
 
 
 def _sorted(train: Sequence[Frame], test: Sequence[Frame]) -> list[tuple[Frame, str]]:
-    """The frames with their split, in the order of their names."""
+    """Return the frames with their split, in the order of their names."""
     frames = [*((frame, "train") for frame in train), *((frame, "test") for frame in test)]
     return sorted(frames, key=lambda entry: entry[0].name)
 
 
 def _entries(model: Model, frames: Sequence[tuple[Frame, str]]) -> list[dict[str, Any]]:
-    """What the page holds of each frame besides its picture."""
+    """Return what the page holds of each frame besides its picture."""
     gains = log_gains_of([frame for frame, _ in frames], model)
     return [
         {
@@ -136,7 +136,7 @@ def _entries(model: Model, frames: Sequence[tuple[Frame, str]]) -> list[dict[str
 
 
 def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_bytes: int) -> int:
-    """The largest size at which all pictures fit, judged by a few; 0 where none does."""
+    """Return the largest size at which all pictures fit, judged by a few; 0 where none does."""
     if not shown:
         return 0
     sample = shown[:: max(1, len(shown) // _SAMPLE)][:_SAMPLE]
@@ -150,7 +150,7 @@ def _longest(frames: Sequence[tuple[Frame, str]], shown: Sequence[int], room_byt
 
 
 def _small_photo(frame: Frame, longest_px: int) -> np.ndarray:
-    """A photo as its pinhole camera took it, its longer side at most so many pixels; white where it is clear."""
+    """Return a photo as its pinhole camera took it, its longer side at most so many pixels; white where it is clear."""
     factor = max(1.0, max(frame.camera.width, frame.camera.height) / longest_px)
     photo = load_photo(frame, factor, "ignore")
     small = photo.frame.camera

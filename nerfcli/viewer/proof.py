@@ -58,13 +58,13 @@ def make_proof(model: Model, frames: Sequence[Frame]) -> Proof:
 
 
 def _small(camera: Camera) -> Camera:
-    """A picture of 64 x 48 that shows as much as fits into it."""
+    """Return a picture of 64 x 48 that shows as much as fits into it."""
     scale = max(WIDTH / camera.width, HEIGHT / camera.height)
     return Camera.pinhole(WIDTH, HEIGHT, camera.focal_px * scale)
 
 
 def _maps(model: Model, frame: Frame) -> list[np.ndarray]:
-    """The picture of one camera, pixel by pixel inside a map: as `nerfcli render` makes it."""
+    """Return the picture of one camera, pixel by pixel inside a map: as `nerfcli render` makes it."""
     farthest = model.marching.far / model.training_from_scene.scale
     pictures = {}
     for name in MAPS[1:-2]:

@@ -32,7 +32,7 @@ class Show(Protocol):
         ...
 
     def field(self) -> bytes:
-        """The newest numbers of the field, see `live_data.field_bytes`."""
+        """Return the newest numbers of the field, see `live_data.field_bytes`."""
         ...
 
     def proof(self) -> bytes:
@@ -52,7 +52,7 @@ class Show(Protocol):
         ...
 
     def control(self, action: str) -> None:
-        """One of `ACTIONS`."""
+        """Pass on one of `ACTIONS`."""
         ...
 
 
@@ -92,7 +92,7 @@ class PageServer(ThreadingHTTPServer):
         return self.server_address[1]
 
     def url(self, host: str) -> str:
-        """The address of the page for a browser that reaches this machine as `host`."""
+        """Return the address of the page for a browser that reaches this machine as `host`."""
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/{self.token}/"
 
     def announce(self) -> None:

@@ -73,7 +73,7 @@ def ablate_scene(
     measure = _measured_whole if whole else _measured_pixels
 
     def trained(name: str, settings: TrainSettings) -> Run:
-        """A run with these settings, trained now or by an earlier call."""
+        """Return a run with these settings, trained now or by an earlier call."""
         target = folder / RUNS / f"{name}-{settings.seed}"
         resume = not overwrite and was_interrupted(path, target, settings, holdout=holdout)
         run = train_scene(
@@ -119,7 +119,7 @@ def ablate_scene(
 
 
 def _capture(scene: Scene) -> CaptureTraits:
-    """What the scene offers to components."""
+    """Return what the scene offers to components."""
     first, sparse = scene.train_frames[0].image, model_folder(scene.root)
     seen = parse_colmap(sparse).observations if sparse is not None else None
     exif = relative_log_exposures(scene.train_frames, mean_log_exposure(scene.train_frames))

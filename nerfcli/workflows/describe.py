@@ -56,7 +56,7 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def _is_scan_to_describe(path: Path) -> bool:
-    """Whether it is a scan; depth and pictures of one projection are none, whatever stands beside them."""
+    """Return whether it is a scan; depth and pictures of one projection are none, whatever stands beside them."""
     if path.is_file() and path.suffix.lower() in (".npy", ".npz", ".tif", ".tiff", ".png", ".safetensors"):
         return False
     from nerfcli.tomography.formats.read import recognise

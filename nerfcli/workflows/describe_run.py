@@ -80,7 +80,7 @@ def costs_of_run(run: Run, model: Model) -> dict[str, dict[str, Any]]:
 
 
 def describe_tensors(path: Path) -> dict[str, Any]:
-    """A field, the state of a training, or the state before a failure, whose step is taken again."""
+    """Return a field, the state of a training, or the state before a failure, whose step is taken again."""
     tensors, description = load_tensors(path, "cpu")
     facts: dict[str, Any] = {
         "kind": description.get("format"),

@@ -161,7 +161,7 @@ def saved_predictions(
 
 
 def _kept(path: Path, checkpoint: str, *, align_poses: bool, predictions: str | None) -> dict[str, Any]:
-    """The metrics that are there, if they are of this checkpoint and have all that is wanted."""
+    """Return the metrics that are there, if they are of this checkpoint and have all that is wanted."""
     metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
     if metrics.get("checkpoint_sha256") != checkpoint:
         raise UserError(f"{path} belongs to an earlier checkpoint of this run", "add --overwrite to replace it")

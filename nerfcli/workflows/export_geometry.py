@@ -170,7 +170,7 @@ def _part(progress: Progress, start: float, end: float, words: str) -> Callable[
 
 
 def _description(run: Run, model: Model, kind: str, grid: Grid) -> dict[str, Any]:
-    """What a file says of itself."""
+    """Return what a file says of itself."""
     return {
         "format": FORMAT,
         "holds": kind,
@@ -227,7 +227,7 @@ def _write_volume(path: Path, volume: Volume, name: str) -> None:
 
 
 def _y_up_from_scene(run: Run) -> np.ndarray:
-    """The rotation after which up, as the cameras have it, is +y."""
+    """Return the rotation after which up, as the cameras have it, is +y."""
     up = up_direction(run.cameras.train)
     aside = np.eye(3)[np.argmin(np.abs(up))]
     # A camera whose picture's down is -up: its axes are right, down, ahead.

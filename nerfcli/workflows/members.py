@@ -177,7 +177,7 @@ def members_of(run: Run) -> list[Run]:
 
 
 def _difference(one: TrainSettings, other: TrainSettings) -> str | None:
-    """The first setting in which two trainings differ, of those that do not vary between members."""
+    """Return the first setting in which two trainings differ, of those that do not vary between members."""
     there, wanted = one.to_json(), other.to_json()
     names = [name for name in wanted if name not in _VARIED_SETTINGS and there[name] != wanted[name]]
     return f"{names[0]} {there[names[0]]}, not {wanted[names[0]]}" if names else None

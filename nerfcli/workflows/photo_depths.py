@@ -76,7 +76,7 @@ def depth_errors(
 
 
 def _without_masked(view: DepthMap, frame: Frame, notify: Notify) -> DepthMap:
-    """The map without the pixels whose photo was not used there."""
+    """Return the map without the pixels whose photo was not used there."""
     assert frame.mask is not None
     assert frame.image is not None
     try:

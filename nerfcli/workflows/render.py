@@ -26,7 +26,7 @@ USUAL = ExportSettings(outputs=OUTPUTS[:3], depth=DepthRequest(convention="condi
 
 
 def folder_name(views: Views, settings: ExportSettings) -> str:
-    """The folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
+    """Return the folder's name in RUN/renders: the cameras and, so that conventions never mix, the kind of depth."""
     if not settings.measured:
         return views.name
     return f"{views.name}-{settings.depth.convention.replace(':', '-')}-{settings.depth.axis}"

@@ -125,7 +125,7 @@ def examine_scan_input(
 
 
 def scan_diagnosis_record(diagnosis: ScanDiagnosis) -> dict[str, Any]:
-    """A diagnosis as plain values."""
+    """Return a diagnosis as plain values."""
     return {
         "kind": "scan",
         "verdict": diagnosis.verdict,
@@ -145,7 +145,7 @@ def describe_scan(path: Path) -> dict[str, Any]:
 
 
 def facts_of(scan: Scan) -> dict[str, Any]:
-    """A scan as plain values, those of `nerfcli info`."""
+    """Return a scan as plain values, those of `nerfcli info`."""
     geometry = scan.geometry
     height, width = geometry.pixel_at_origin
     circle, apart = circle_of(geometry)
@@ -178,7 +178,7 @@ def _rounded(value: float) -> float:
 
 
 def in_words(scan: Scan) -> str:
-    """A scan in a few words."""
+    """Return a scan in a few words."""
     geometry = scan.geometry
     beam = "fan" if geometry.beam == "cone" and geometry.rows == 1 else geometry.beam
     size = f"{geometry.columns} x {geometry.rows} pixels"
@@ -220,7 +220,7 @@ def _proof(checks: dict[str, float]) -> str:
 
 
 def judgement_record(found: Judgement) -> dict[str, Any]:
-    """A judgement as plain values."""
+    """Return a judgement as plain values."""
     return {
         "verdict": found.verdict,
         "ratio": found.ratio,

@@ -109,18 +109,18 @@ def train_scan(
 
 
 def corrected_by(geometry: ScanGeometry, centre: float, tilt: float) -> ScanGeometry:
-    """The geometry with its centre moved by some columns and its detector turned."""
+    """Return the geometry with its centre moved by some columns and its detector turned."""
     shifted = geometry.shifted(centre) if centre else geometry
     return shifted.tilted(tilt) if tilt else shifted
 
 
 def _holds_something(run: Path) -> bool:
-    """Whether a folder has more in it than what an interrupted reconstruction leaves."""
+    """Return whether a folder has more in it than what an interrupted reconstruction leaves."""
     return run.is_dir() and any(not path.name.startswith(".") for path in run.iterdir())
 
 
 def _wanted(settings: ReconstructionSettings) -> ReconstructionSettings:
-    """What of settings makes another result."""
+    """Return what of settings makes another result."""
     return replace(settings, threads=0)
 
 
@@ -132,7 +132,7 @@ def _fit(
     earlier: Reconstruction | None,
     progress: Progress,
 ) -> tuple[Reconstruction, bool]:
-    """The reconstruction, and whether it was interrupted after some passes; before that, `KeyboardInterrupt`."""
+    """Fit the reconstruction, and whether it was interrupted after some passes; before that, `KeyboardInterrupt`."""
     begun = time.perf_counter()
     decisions: list[str] = []
     views = scan.training_views
@@ -258,7 +258,7 @@ def _fit_hash(
     seed: int,
     progress: Progress,
 ) -> tuple[Fit, dict[str, np.ndarray], bool]:
-    """The volume at the centres of voxels, what the hash grid has learned, and whether it was interrupted."""
+    """Fit the volume at the centres of voxels, what the hash grid has learned, and whether it was interrupted."""
     learned = new_arrays(seed) if earlier is None else earlier.learned
     volume = hash_volume(problem.grid, used["start"], learned, passes=limit.done)
     interrupted = False
@@ -347,7 +347,7 @@ def _coarse_start(
     weights: tuple[float, float],
     seconds: float | None,
 ) -> Fit:
-    """A start for the fine grid from one with voxels and pixels twice as large."""
+    """Return a start for the fine grid from one with voxels and pixels twice as large."""
     views = scan.training_views
     small = grid.coarser(2)
     likelihood = likelihood_of(scan, views, binning=2)

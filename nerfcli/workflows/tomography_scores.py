@@ -158,7 +158,9 @@ def corrected(geometry: ScanGeometry, result: Reconstruction) -> ScanGeometry:
 
 
 def _held_out_air(scan: Scan, result: Reconstruction) -> np.ndarray | None:
-    """The factor on the open beam of each held-out view, from its own pixels beside the object, as everywhere."""
+    """Return the factor on the open beam of each held-out view, from its own pixels beside the object, as
+    everywhere.
+    """
     if result.used.get("air") is None:
         return None
     views = np.array(scan.held_out, dtype=int)

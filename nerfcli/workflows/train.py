@@ -225,13 +225,13 @@ def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path
 
 
 def _load(folder: Path, settings: TrainSettings, holdout: str | None) -> Scene:
-    """The scene with the training photos that these settings use."""
+    """Load the scene with the training photos that these settings use."""
     loaded = scenes.load(folder, holdout=holdout)
     return scenes.with_fraction_of_photos(loaded, settings.photo_fraction, seed=settings.seed)
 
 
 def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, overwrite: bool) -> bool:
-    """Whether the run at `path` is already what is wanted.
+    """Return whether the run at `path` is already what is wanted.
 
     Raises:
         UserError: it is something else, which is not ours to replace; or nothing to resume.

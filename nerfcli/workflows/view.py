@@ -222,7 +222,7 @@ class RunShow:
             self._ask()
 
     def model(self) -> "tuple[int, Model]":
-        """The newest field with its number.
+        """Return the newest field with its number.
 
         Raises:
             UserError: there is none that can be read.
@@ -246,7 +246,7 @@ class RunShow:
         write_request(self._path, self._request)
 
     def _field_path(self) -> Path:
-        """The newer one of the last checkpoint and what a training wrote for viewers."""
+        """Return the newer one of the last checkpoint and what a training wrote for viewers."""
         live, saved = live_field(self._path), self._path / FIELD
         return live if _stamp(live)[0] > _stamp(saved)[0] else saved
 
@@ -272,7 +272,9 @@ def _refusal(model: "Model") -> str | None:
 
 
 def _box(model: "Model", frames: Any, *, trained: bool) -> tuple[float, ...]:
-    """The box around what the photos are about; of a field in training, the cube around the training frame's ball."""
+    """Return the box around what the photos are about; of a field in training, the cube around the training frame's
+    ball.
+    """
     import numpy as np
 
     from nerfcli.surface.extent import scene_box

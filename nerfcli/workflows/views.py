@@ -100,7 +100,7 @@ class Views:
 
 
 def chosen_frames(run: Run, views: Views, *, depth_hint: float) -> list[Frame]:
-    """The frames of a run that are to be seen.
+    """Return the frames of a run that are to be seen.
 
     Args:
         run: the run.
@@ -163,7 +163,7 @@ def refuse_z_all_around(frames: Sequence[Frame], *, notify: Notify) -> None:
 
 
 def file_fps(cameras: str) -> float | None:
-    """The frame rate that a nerfstudio camera path gives; None of anything else."""
+    """Return the frame rate that a nerfstudio camera path gives; None of anything else."""
     path = Path(cameras)
     found = find_camera_path(path) if path.is_file() else None
     return None if found is None else read_path(found).fps
@@ -202,7 +202,7 @@ def refuse_frames(target: Path, *, overwrite: bool) -> None:
 
 
 def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
-    """The cameras of a scene, fitted to its photos, or of any file or folder that `nerfcli convert` reads."""
+    """Return the cameras of a scene, fitted to its photos, or of any file or folder that `nerfcli convert` reads."""
     if not path.exists():
         raise UserError(
             f"no cameras found at {path}",
@@ -221,5 +221,5 @@ def _frames_of(path: Path, nerfstudio_frame: Path | None) -> tuple[Frame, ...]:
 
 
 def _within(camera: Camera, max_size: int) -> Camera:
-    """The camera of the picture made smaller, if need be, until its longer side fits."""
+    """Return the camera of the picture made smaller, if need be, until its longer side fits."""
     return downscaled_camera(camera, max(1.0, max(camera.width, camera.height) / max_size))

@@ -93,7 +93,7 @@ def write_npz(capture: Capture, path: Path) -> None:
 
 
 def parse_npz(path: Path) -> Capture:
-    """The capture in a file that `write_npz` wrote, exactly; paths are joined to the file's folder.
+    """Read the capture in a file that `write_npz` wrote, exactly; paths are joined to the file's folder.
 
     Raises:
         UserError: the file is missing, damaged or of another kind; the file and the array are named.
@@ -168,11 +168,11 @@ class _Arrays:
         return name in self._bytes
 
     def damaged(self, name: str, what: str) -> UserError:
-        """The error that says what is wrong with an array."""
+        """Return the error that says what is wrong with an array."""
         return UserError(f"{self.path}: {name}: {what}", _HINT)
 
     def numbers(self, name: str, shape: tuple[int | None, ...], *, integer: bool = False) -> np.ndarray:
-        """The array of this name as float64 or int64; None in the shape stands for any length."""
+        """Return the array of this name as float64 or int64; None in the shape stands for any length."""
         array = self._array(name)
         fits = array.ndim == len(shape) and all(
             want in (None, got) for want, got in zip(shape, array.shape, strict=True)
@@ -183,7 +183,7 @@ class _Arrays:
         return array.astype(np.int64 if integer else np.float64)
 
     def texts(self, name: str, count: int | None = None) -> list[str]:
-        """The texts of this name; `count` of them if it is given."""
+        """Return the texts of this name; `count` of them if it is given."""
         array = self._array(name)
         if array.dtype.kind != "U" or array.ndim != 1 or (count is not None and len(array) != count):
             raise self.damaged(
@@ -197,7 +197,7 @@ class _Arrays:
         return texts
 
     def text(self, name: str) -> str:
-        """The one text of this name."""
+        """Return the one text of this name."""
         array = self._array(name)
         if array.dtype.kind != "U" or array.shape != ():
             raise self.damaged(name, f"{array.shape} values of type {array.dtype}, expected one text")
@@ -272,7 +272,9 @@ def _observations(arrays: _Arrays, num_frames: int, *, num_points: int) -> Obser
 
 
 def _relative(path: Path | None, folder: Path) -> str:
-    """A path as seen from a folder, with forward slashes, or empty; absolute where there is none (another drive)."""
+    """Return a path as seen from a folder, with forward slashes, or empty; absolute where there is none (another
+    drive).
+    """
     if path is None:
         return ""
     try:

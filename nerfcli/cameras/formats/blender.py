@@ -33,7 +33,7 @@ from nerfcli.errors import UserError
 
 
 def read_blender(folder: Path, measure: Measure) -> Capture:
-    """A Blender capture's views that are on disk, of train and test; val frames are left out.
+    """Read a Blender capture's views that are on disk, of train and test; val frames are left out.
 
     Raises:
         UserError: a file is malformed or lists no image that is on disk.
@@ -53,7 +53,7 @@ def read_blender(folder: Path, measure: Measure) -> Capture:
 
 
 def parse_blender(folder: Path, measure: Measure, *, images: Path | None = None) -> Capture:
-    """All that the files of a Blender capture say: the views of all three splits that there are.
+    """Read all that the files of a Blender capture say: the views of all three splits that there are.
 
     Args:
         folder: holds at least one of the three files.
@@ -145,14 +145,14 @@ def _by_split(capture: Capture) -> dict[str, list[Frame]]:
 
 
 def _file_path(frame: Frame, folder: Path) -> str:
-    """The image's path as NeRF's own loader wants it: without .png, which it appends."""
+    """Return the image's path as NeRF's own loader wants it: without .png, which it appends."""
     path = PurePosixPath(relative_path(frame, folder))
     text = str(path.with_suffix("")) if path.suffix == ".png" else str(path)
     return text if text.startswith(("/", "../")) else f"./{text}"
 
 
 def _angle(frame: Frame) -> float:
-    """The horizontal angle between the edges of a picture whose principal point is its middle, radians."""
+    """Return the horizontal angle between the edges of a picture whose principal point is its middle, radians."""
     camera = frame.camera
     values = dict(zip(parameter_names(camera.model), camera.params, strict=True))
     return 2 * math.atan(camera.width / 2 / values.get("fx", values.get("f", math.inf)))

@@ -35,7 +35,7 @@ Numbered = tuple[int, str]
 def parse_bundler(
     path: Path, measure: Measure, *, images: Path | None = None, image_list: Path | None = None
 ) -> Capture:
-    """The registered cameras, the points with their colours, and where the points were seen.
+    """Read the registered cameras, the points with their colours, and where the points were seen.
 
     Cameras of focal length 0 are the ones that Bundler could not register; they are no frames. The file gives neither
     the names nor the sizes of the photos: the names come from the list, the sizes from the photos, and those that are
@@ -87,7 +87,7 @@ def _lines(path: Path) -> list[Numbered]:
 
 
 def _counts(lines: list[Numbered], path: Path) -> tuple[int, int]:
-    """The numbers of cameras and points, which the file must be long enough for."""
+    """Return the numbers of cameras and points, which the file must be long enough for."""
     words, count, where = _line(lines, 0, 2, path)
     cameras, points = numbers(words, count, where)
     if not (cameras >= 0 and points >= 0 and cameras == int(cameras) and points == int(points)):
@@ -102,7 +102,7 @@ def _counts(lines: list[Numbered], path: Path) -> tuple[int, int]:
 
 
 def _line(lines: list[Numbered], index: int, count: int, path: Path) -> tuple[list[str], int, str]:
-    """The words of a line, how many they should be, and its place: what `numbers` takes."""
+    """Return the words of a line, how many they should be, and its place: what `numbers` takes."""
     if index >= len(lines):
         raise malformed(str(path), "ends too early", "the file is cut off; copy it again")
     number, line = lines[index]
@@ -174,7 +174,7 @@ def _points(
 
 
 def _observations(views: np.ndarray, index_of_camera: np.ndarray, middles: np.ndarray) -> Observations | None:
-    """The views in frames; y turns downwards and the origin moves to the top left corner."""
+    """Return the views in frames; y turns downwards and the origin moves to the top left corner."""
     if not len(views):
         return None
     frame_index = index_of_camera[views[:, 0].astype(np.int64)]

@@ -55,7 +55,7 @@ def is_camera_path(content: dict[str, Any]) -> bool:
 
 
 def read_path(path: Path) -> CameraPath:
-    """The path in a nerfstudio camera-path JSON; without fps or seconds it has 24 frames per second.
+    """Read the path in a nerfstudio camera-path JSON; without fps or seconds it has 24 frames per second.
 
     Raises:
         UserError: the file is malformed; file and field are named.
@@ -82,7 +82,7 @@ def read_path(path: Path) -> CameraPath:
 
 
 def parse_camera_path(path: Path) -> Capture:
-    """The views of a camera path as a capture without pictures; see `read_path`."""
+    """Read the views of a camera path as a capture without pictures; see `read_path`."""
     return Capture(read_path(path).frames, np.zeros((0, 3)), (), None, "camera-path")
 
 
@@ -147,7 +147,7 @@ def write_camera_path(capture: Capture, path: Path, *, fps: float = _DEFAULT_FPS
 
 
 def read_normalisation(path: Path) -> Similarity:
-    """The similarity nerfstudio_from_world in a run's dataparser_transforms.json: scale * (transform @ point).
+    """Read the similarity nerfstudio_from_world in a run's dataparser_transforms.json: scale * (transform @ point).
 
     The world is the one of the transforms.json that nerfstudio trained on, or where that has an applied_transform, the
     one before it.
@@ -196,7 +196,7 @@ def _pose(record: dict[str, Any], where: str) -> np.ndarray:
 
 
 def _matrix(values: list[Any], rows: int, where: str) -> np.ndarray:
-    """A matrix (rows, 4) of a flat list."""
+    """Return a matrix (rows, 4) of a flat list."""
     if len(values) != 4 * rows:
         raise UserError(f"{where} has {len(values)} numbers", f"expected {4 * rows} numbers, row by row")
     numbers = [_number({f"[{i}]": value}, f"[{i}]", where) for i, value in enumerate(values)]
@@ -235,7 +235,7 @@ def _short(value: Any) -> str:
 
 
 def _common_cameras(frames: Sequence[Frame]) -> tuple[Camera, ...]:
-    """What the format can hold of the frames' cameras: one type, one size, square pixels, no distortion."""
+    """Return what the format can hold of the frames' cameras: one type, one size, square pixels, no distortion."""
     if not frames:
         return ()
     kind = Counter(_kind(frame.camera) for frame in frames).most_common(1)[0][0]

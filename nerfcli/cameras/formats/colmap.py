@@ -31,7 +31,7 @@ def is_model(folder: Path) -> bool:
 
 
 def read_colmap(model_dir: Path, image_dir: Path, measure: Measure) -> Capture:
-    """The registered images of a COLMAP model, with the pictures found under `image_dir`.
+    """Read the registered images of a COLMAP model, with the pictures found under `image_dir`.
 
     Args:
         model_dir: holds cameras, images and points3D, as .bin (which wins) or .txt.
@@ -91,7 +91,7 @@ def parse_colmap(model_dir: Path, image_dir: Path | None = None) -> Capture:
 
 
 def read_model(model_dir: Path) -> ColmapModel:
-    """A COLMAP model as its files hold it, whatever pictures are on disk; images in the order of their names.
+    """Read a COLMAP model as its files hold it, whatever pictures are on disk; images in the order of their names.
 
     Raises:
         UserError: a file is missing, truncated or inconsistent; the file is named.
@@ -119,8 +119,8 @@ def read_model(model_dir: Path) -> ColmapModel:
 
 
 def read_cameras(path: Path) -> tuple[dict[int, Camera], dict[str, int]]:
-    """The cameras of a cameras.bin or cameras.txt by their ids, and the ids by the names of the images, which are known
-    where the model's file of images is beside it.
+    """Read the cameras of a cameras.bin or cameras.txt by their ids, and the ids by the names of the images, which are
+    known where the model's file of images is beside it.
 
     Raises:
         UserError: a file is not readable, truncated or inconsistent; the file is named.
@@ -145,12 +145,12 @@ def _check_camera(image: ColmapImage, cameras: Mapping[int, Camera], images_file
 
 
 def _file(model_dir: Path, name: str) -> Path:
-    """The file of a model, binary if its cameras are binary."""
+    """Return the file of a model, binary if its cameras are binary."""
     return model_dir / f"{name}{'.bin' if (model_dir / 'cameras.bin').is_file() else '.txt'}"
 
 
 def _parse(path: Path, reader: Callable[[bytes], T]) -> T:
-    """What `reader` makes of a file's bytes, with damage reported as one error that names the file."""
+    """Read what `reader` makes of a file's bytes, with damage reported as one error that names the file."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -41,7 +41,7 @@ def cameras_from_bytes(data: bytes) -> dict[int, Camera]:
 
 
 def images_from_bytes(data: bytes) -> list[ColmapImage]:
-    """The images, in the file's order. Raises ValueError or struct.error where the bytes are damaged."""
+    """Return the images, in the file's order. Raises ValueError or struct.error where the bytes are damaged."""
     image_ids, names, camera_ids, poses, features = [], [], [], [], []
     offset = 8
     for _ in range(_count(data, 73)):
@@ -85,7 +85,7 @@ def points_from_bytes(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def cameras_to_bytes(model: ColmapModel) -> bytes:
-    """The bytes of cameras.bin."""
+    """Return the bytes of cameras.bin."""
     parts = [struct.pack("<Q", len(model.cameras))]
     for camera_id, camera in model.cameras.items():
         model_id = pycolmap.CameraModelId.__members__[camera.model].value
@@ -95,7 +95,7 @@ def cameras_to_bytes(model: ColmapModel) -> bytes:
 
 
 def images_to_bytes(model: ColmapModel) -> bytes:
-    """The bytes of images.bin."""
+    """Return the bytes of images.bin."""
     parts = [struct.pack("<Q", len(model.images))]
     for image, pose in zip(model.images, pose_rows(model).tolist(), strict=True):
         features = np.empty(len(image.pixels), _FEATURE)
@@ -107,7 +107,7 @@ def images_to_bytes(model: ColmapModel) -> bytes:
 
 
 def points_to_bytes(model: ColmapModel) -> bytes:
-    """The bytes of points3D.bin; the tracks are those of the images' features."""
+    """Return the bytes of points3D.bin; the tracks are those of the images' features."""
     elements, lengths = tracks(model)
     points = np.empty(len(model.points), _POINT)
     points["id"], points["xyz"], points["rgb"] = model.point_ids, model.points, model.colours
@@ -123,7 +123,7 @@ def points_to_bytes(model: ColmapModel) -> bytes:
 
 
 def _gathered(data: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """The records (N, bytes of a point) that begin at the offsets (N,)."""
+    """Return the records (N, bytes of a point) that begin at the offsets (N,)."""
     records = np.empty((len(offsets), _POINT.itemsize), np.uint8)
     for column in range(_POINT.itemsize):
         records[:, column] = data[offsets + column]
@@ -137,7 +137,7 @@ def _scatter(body: np.ndarray, offsets: np.ndarray, records: np.ndarray) -> None
 
 
 def _count(data: bytes, least_bytes: int) -> int:
-    """The number of records that a file announces, if it is long enough to hold them."""
+    """Return the number of records that a file announces, if it is long enough to hold them."""
     (count,) = struct.unpack_from("<Q", data, 0)
     if count * least_bytes > len(data) - 8:
         raise ValueError(f"it announces {count} records, but has {len(data)} bytes")

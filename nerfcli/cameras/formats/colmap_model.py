@@ -62,7 +62,7 @@ def images_of_parts(
     cam_from_world: np.ndarray,
     features: list[tuple[np.ndarray, np.ndarray]],
 ) -> list[ColmapImage]:
-    """The images of a file, from lists with one item per image.
+    """Return the images of a file, from lists with one item per image.
 
     Args:
         image_ids, names, camera_ids: of the images.
@@ -134,7 +134,7 @@ def capture_of(model: ColmapModel, image_dir: Path | None) -> Capture:
 
 
 def model_of(capture: Capture) -> ColmapModel:
-    """The model that holds a capture: ids count from 1, and equal cameras have one id."""
+    """Return the model that holds a capture: ids count from 1, and equal cameras have one id."""
     camera_ids: dict[Camera, int] = {}
     for frame in capture.frames:
         camera_ids.setdefault(frame.camera, len(camera_ids) + 1)
@@ -195,7 +195,7 @@ def tracks(model: ColmapModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _point_index(ids: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Where the ids (M,) stand in `known` (N,); -1 for `NO_POINT`, and everywhere if nothing is known."""
+    """Return where the ids (M,) stand in `known` (N,); -1 for `NO_POINT`, and everywhere if nothing is known."""
     if not len(known):
         return np.full(len(ids), -1, dtype=np.int64)
     order = np.argsort(known, kind="stable")

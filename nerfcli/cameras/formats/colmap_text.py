@@ -29,7 +29,7 @@ def cameras_from_text(data: bytes) -> dict[int, Camera]:
 
 
 def images_from_text(data: bytes) -> list[ColmapImage]:
-    """The images, in the file's order. Raises ValueError where a line is damaged."""
+    """Return the images, in the file's order. Raises ValueError where a line is damaged."""
     image_ids, names, camera_ids, poses, features = [], [], [], [], []
     lines = iter(_lines(data))
     for line in lines:
@@ -68,7 +68,7 @@ def points_from_text(data: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def cameras_to_text(model: ColmapModel) -> bytes:
-    """The bytes of cameras.txt."""
+    """Return the bytes of cameras.txt."""
     lines = ["# Camera list with one line of data per camera:", "#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     lines.append(f"# Number of cameras: {len(model.cameras)}")
     for camera_id, camera in model.cameras.items():
@@ -77,7 +77,7 @@ def cameras_to_text(model: ColmapModel) -> bytes:
 
 
 def images_to_text(model: ColmapModel) -> bytes:
-    """The bytes of images.txt."""
+    """Return the bytes of images.txt."""
     lines = [
         "# Image list with two lines of data per image:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
@@ -95,7 +95,7 @@ def images_to_text(model: ColmapModel) -> bytes:
 
 
 def points_to_text(model: ColmapModel) -> bytes:
-    """The bytes of points3D.txt; the tracks are those of the images' features, and errors -1: not measured."""
+    """Return the bytes of points3D.txt; the tracks are those of the images' features, and errors -1: not measured."""
     elements, lengths = tracks(model)
     words = list(map(str, elements.ravel().tolist()))
     ends = (2 * np.cumsum(lengths)).tolist()

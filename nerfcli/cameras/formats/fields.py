@@ -23,13 +23,13 @@ def malformed(where: str, what: str, hint: str) -> UserError:
 
 
 def shown(value: Any) -> str:
-    """A value as a message can show it: on one line and not longer than 60 characters."""
+    """Return a value as a message can show it: on one line and not longer than 60 characters."""
     text = repr(value) if not isinstance(value, dict | list) else f"a {type(value).__name__} of {len(value)}"
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def read_text(path: Path, expected: str) -> str:
-    """The text of a file in UTF-8, with or without a byte order mark.
+    """Read the text of a file in UTF-8, with or without a byte order mark.
 
     Raises:
         UserError: the file is not there, not readable, or no text; `expected` says what it should have been.
@@ -43,7 +43,7 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def read_json(path: Path, expected: str) -> Any:
-    """The value that a JSON file holds.
+    """Read the value that a JSON file holds.
 
     Raises:
         UserError: as for `read_text`, or the text is no JSON, or is nested deeper than any file of cameras.
@@ -59,7 +59,7 @@ def read_json(path: Path, expected: str) -> Any:
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file.
+    """Read the JSON object in a file.
 
     Raises:
         UserError: the file cannot be read, is no JSON, or holds something else than an object.
@@ -74,7 +74,7 @@ def filled_lines(text: str) -> list[tuple[int, str]]:
 
 
 def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
-    """The numbers of a line of text.
+    """Return the numbers of a line of text.
 
     Raises:
         UserError: there are more or fewer than `count`, or one of them is no finite number.
@@ -92,7 +92,7 @@ def numbers(words: Sequence[str], count: int, where: str) -> list[float]:
 
 
 def record_of(value: Any, where: str) -> dict[str, Any]:
-    """A JSON object.
+    """Return a JSON object.
 
     Raises:
         UserError: the value is something else.
@@ -103,7 +103,7 @@ def record_of(value: Any, where: str) -> dict[str, Any]:
 
 
 def number(record: dict[str, Any], key: str, where: str, *, default: float | None = None) -> float:
-    """A number of a JSON object, or `default` where the key is absent.
+    """Return a number of a JSON object, or `default` where the key is absent.
 
     Raises:
         UserError: the key is absent and there is no default, or its value is no finite number.
@@ -117,7 +117,7 @@ def number(record: dict[str, Any], key: str, where: str, *, default: float | Non
 
 
 def vector(record: dict[str, Any], key: str, count: int, where: str) -> np.ndarray:
-    """A list of `count` numbers of a JSON object, as float64.
+    """Return a list of `count` numbers of a JSON object, as float64.
 
     Raises:
         UserError: the key is absent or holds something else.
@@ -142,7 +142,7 @@ def size_of(width: float, height: float, where: str) -> tuple[int, int]:
 
 
 def name_of(value: Any, where: str) -> str:
-    """The name of an image, with forward slashes.
+    """Return the name of an image, with forward slashes.
 
     Raises:
         UserError: no text, an empty one, or one that no file can have as its name.
@@ -172,7 +172,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_plain(text: str) -> bool:
-    """Whether a text has no control characters and no halves of characters (a lone surrogate from JSON)."""
+    """Return whether a text has no control characters and no halves of characters (a lone surrogate from JSON)."""
     return not any(ord(char) < 32 or ord(char) == 127 or 0xD800 <= ord(char) <= 0xDFFF for char in text)
 
 

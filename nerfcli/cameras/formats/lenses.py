@@ -19,7 +19,7 @@ def brown_camera(
     tangential: Pair,
     where: str,
 ) -> Camera:
-    """A perspective camera with Brown's distortion.
+    """Return a perspective camera with Brown's distortion.
 
     With x = X/Z, y = Y/Z, r^2 = x^2 + y^2:
         u = fx (x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)) + cx
@@ -54,7 +54,7 @@ def fisheye_camera(
     prism: Pair,
     where: str,
 ) -> Camera:
-    """A camera with equidistant projection and Brown's distortion, thin prisms (sx, sy) included.
+    """Return a camera with equidistant projection and Brown's distortion, thin prisms (sx, sy) included.
 
     With R = sqrt(X^2 + Y^2), t = atan2(R, Z), x = t X/R, y = t Y/R, r^2 = x^2 + y^2:
         u = fx (x (1 + k1 r^2 + ... + k4 r^8) + 2 p1 x y + p2 (r^2 + 2 x^2) + sx r^2) + cx
@@ -84,7 +84,7 @@ def long_fisheye_camera(
 
 
 def spherical_camera(size: tuple[int, int], where: str) -> Camera:
-    """The camera of a panorama of the whole sphere: longitude and latitude on equally long pixels.
+    """Return the camera of a panorama of the whole sphere: longitude and latitude on equally long pixels.
 
     Raises:
         UserError: the picture is not twice as wide as high, so that it shows something else.

@@ -21,7 +21,7 @@ def plausible(positions: np.ndarray) -> np.ndarray:
 
 
 def stated_camera(model: str, width: int, height: int, params: tuple[float, ...], *, where: str) -> Camera:
-    """The camera that a file states.
+    """Return the camera that a file states.
 
     Raises:
         UserError: it makes no camera, or one of a size or with a number that no camera has; `where` opens the message.

@@ -31,7 +31,7 @@ _NEAR_PERCENT, _FAR_PERCENT = 0.1, 99.9
 
 
 def read_llff(folder: Path, measure: Measure, list_images: Callable[[Path], list[Path]]) -> Capture:
-    """A capture in LLFF's format, with the first image folder that holds one image per row.
+    """Read a capture in LLFF's format, with the first image folder that holds one image per row.
 
     Args:
         folder: holds poses_bounds.npy.
@@ -206,7 +206,7 @@ def _percentile_bounds(capture: Capture) -> np.ndarray:
 
 
 def _points_seen(capture: Capture) -> list[np.ndarray]:
-    """Which points each view sees: indices of those that it observes, or that lie within its picture."""
+    """Return which points each view sees: indices of those that it observes, or that lie within its picture."""
     seen = capture.observations
     if seen is not None and (seen.point_index >= 0).any():
         with_point = seen.point_index >= 0

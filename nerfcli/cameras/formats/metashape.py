@@ -39,7 +39,7 @@ _NEGLIGIBLE_PX = 1e-9
 
 
 def parse_metashape(path: Path) -> Capture:
-    """The aligned cameras of the file's first chunk.
+    """Read the aligned cameras of the file's first chunk.
 
     Cameras without a transform (not aligned, or a follower in a rig of cameras) and disabled ones are no frames, as in
     Agisoft's own export script. Where components lack a transform to the world, they have nothing to do with each
@@ -78,7 +78,7 @@ def parse_metashape(path: Path) -> Capture:
 
 
 def _chunk(path: Path) -> Element:
-    """The first chunk: the root's child in an exported file, the root itself in the file of a project."""
+    """Return the first chunk: the root's child in an exported file, the root itself in the file of a project."""
     root = _parse_xml(path)
     chunk = root if root.tag == "chunk" else root.find("chunk")
     if chunk is None:
@@ -87,7 +87,7 @@ def _chunk(path: Path) -> Element:
 
 
 def _parse_xml(path: Path) -> Element:
-    """The root of an XML file that declares no document type, so that there are no entities to expand."""
+    """Read the root of an XML file that declares no document type, so that there are no entities to expand."""
     try:
         data = path.read_bytes()
     except OSError as error:

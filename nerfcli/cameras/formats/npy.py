@@ -15,7 +15,7 @@ _HEADERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_ar
 
 
 def array_from_npy(data: bytes) -> np.ndarray:
-    """The array that the bytes of an .npy file hold; it shares their memory and cannot be written.
+    """Return the array that the bytes of an .npy file hold; it shares their memory and cannot be written.
 
     Raises:
         ValueError: no .npy file, an array of Python objects, or more or fewer bytes than the header's shape needs.

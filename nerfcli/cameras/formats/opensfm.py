@@ -53,7 +53,7 @@ _NO_WORDS = ("FOV", "SIMPLE_DIVISION", "DIVISION", "EUCM")
 
 
 def parse_opensfm(path: Path) -> Capture:
-    """The reconstruction with the most shots of a reconstruction.json; the others are not in the same world.
+    """Read the reconstruction with the most shots of a reconstruction.json; the others are not in the same world.
 
     The photos are where OpenSfM has them, in images/ beside the file. The unit of length is the metre where the file
     has a `reference_lla` other than latitude 0, longitude 0: OpenSfM then aligned the world to GPS positions, east,
@@ -111,7 +111,9 @@ def write_opensfm(capture: Capture, path: Path) -> None:
 
 
 def _lost_of(camera: Camera) -> list[str]:
-    """The distortion terms of a camera that OpenSfM has no key for, or its model where there is nothing like it."""
+    """Return the distortion terms of a camera that OpenSfM has no key for, or its model where there is nothing like
+    it.
+    """
     if camera.model in _NO_WORDS:
         return [f"the {camera.model} lens"]
     return [name for name in distortion(camera) if name in _LOST_TERMS.get(camera.model, ())]
@@ -174,7 +176,7 @@ def _long_fisheye(
     prism: Sequence[float],
     where: str,
 ) -> Camera:
-    """The camera of fisheye62 or fisheye624, whose terms no COLMAP model holds all at once."""
+    """Return the camera of fisheye62 or fisheye624, whose terms no COLMAP model holds all at once."""
     tangential = (term["p1"], term["p2"])
     if not any(tangential) and not any(prism):
         radial = tuple(term[f"k{index}"] for index in range(1, 7))
@@ -189,7 +191,7 @@ def _long_fisheye(
 
 
 def _camera_record(camera: Camera) -> dict[str, Any]:
-    """The entry that describes a camera; the inverse of `_camera`."""
+    """Return the entry that describes a camera; the inverse of `_camera`."""
     size = {"width": camera.width, "height": camera.height}
     if camera.is_spherical:
         return {"projection_type": "spherical", **size}
@@ -262,7 +264,7 @@ def _rows(values: list[Any]) -> np.ndarray:
 
 
 def _is_on_earth(content: dict[str, Any], path: Path) -> bool:
-    """Whether the world was aligned to GPS positions."""
+    """Return whether the world was aligned to GPS positions."""
     where = f"{path}: reference_lla"
     reference = content.get("reference_lla")
     if reference is None:

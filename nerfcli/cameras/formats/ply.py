@@ -43,7 +43,7 @@ class _Element:
 
 
 def read_ply_points(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """The vertices of a PLY file and their colours.
+    """Read the vertices of a PLY file and their colours.
 
     Returns:
         points (N, 3) float64; colours (N, 3) uint8, or None where vertices have none. Colours that are stored as floats
@@ -181,7 +181,7 @@ def _binary_columns(
 
 
 def _as_bytes(channel: np.ndarray, kind: str) -> np.ndarray:
-    """A colour channel as uint8."""
+    """Return a colour channel as uint8."""
     most = 1.0 if kind.startswith("f") else 255.0
     if kind not in ("u1", "f4", "f8") or not ((channel >= 0) & (channel <= most)).all():
         raise ValueError(f"its colours are not numbers from 0 to {most:g}")

@@ -40,7 +40,7 @@ _NUMBERS = ("x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", 
 
 
 def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None = None) -> Capture:
-    """The cameras of the file, in the coordinates that it was exported in (z up); the unit stays arbitrary.
+    """Read the cameras of the file, in the coordinates that it was exported in (z up); the unit stays arbitrary.
 
     The file does not give the size of the photos, so they are measured; those that are not on disk are `missing`.
     Distortion must be of one of the Brown models: the division model gives k1 another meaning, and the file does not
@@ -71,7 +71,9 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
 
 
 def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
-    """The images' names, their numbers (images, 15) in the order of `_NUMBERS`, and the place in the file of each."""
+    """Return the images' names, their numbers (images, 15) in the order of `_NUMBERS`, and the place in the file of
+    each.
+    """
     lines = read_text(path, _EXPECTED).splitlines()
     start = next((index for index, line in enumerate(lines) if line.lower().startswith(("#name,", "name,"))), None)
     if start is None:
@@ -99,7 +101,7 @@ def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
 
 
 def _cells(line: str, where: str) -> list[str]:
-    """The cells of a line, where a name that has a comma in it is quoted."""
+    """Return the cells of a line, where a name that has a comma in it is quoted."""
     if '"' not in line:
         return line.split(",")
     try:

@@ -47,7 +47,7 @@ class Description:
     provenance: Mapping[str, Any]
 
     def described(self, frames: Sequence[Frame], find_mask: FindMask) -> tuple[Frame, ...]:
-        """The frames of the model with their masks and their part of the split; None for unused ones.
+        """Return the frames of the model with their masks and their part of the split; None for unused ones.
 
         Args:
             frames: of the model.
@@ -130,7 +130,7 @@ def _text(content: dict[str, Any], key: str, path: Path) -> str:
 
 
 def _listed_names(content: dict[str, Any], path: Path) -> dict[str, frozenset[str]]:
-    """The names under "test", "val" and "unused" of the split; the first is never left out."""
+    """Return the names under "test", "val" and "unused" of the split; the first is never left out."""
     split = content.get("split")
     names: dict[str, frozenset[str]] = {}
     for part in ("test", "val", UNUSED):

@@ -31,7 +31,7 @@ _PICTURE = re.compile(r"\.(png|jpe?g|tiff?|bmp|webp)$", re.IGNORECASE)
 
 
 def parse_tum(path: Path, camera: Camera | None) -> Capture:
-    """A trajectory in the TUM format; a frame's name is its timestamp as the file has it.
+    """Read a trajectory in the TUM format; a frame's name is its timestamp as the file has it.
 
     Args:
         path: the text file.
@@ -44,7 +44,7 @@ def parse_tum(path: Path, camera: Camera | None) -> Capture:
 
 
 def parse_kitti(path: Path, camera: Camera | None) -> Capture:
-    """A trajectory in the KITTI format; a frame's name is its index in six digits, as KITTI names its pictures.
+    """Read a trajectory in the KITTI format; a frame's name is its index in six digits, as KITTI names its pictures.
 
     Args:
         path: the text file.
@@ -138,7 +138,7 @@ def _indexed(index: int) -> str:
 
 
 def _timestamps(capture: Capture) -> list[str]:
-    """The frames' names without the suffix of a picture where all are different numbers, else their indices."""
+    """Return the frames' names without the suffix of a picture where all are different numbers, else their indices."""
     stems = [_PICTURE.sub("", frame.name.rsplit("/", 1)[-1]) for frame in capture.frames]
     if all(map(_NUMBER.fullmatch, stems)) and len(set(stems)) == len(stems):
         return stems

@@ -37,7 +37,7 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp", ".tif", 
 
 
 def read_transforms(path: Path, measure: Measure) -> Capture:
-    """A capture that one transforms.json lists (nerfstudio, instant-ngp), of the images that are on disk.
+    """Read a capture that one transforms.json lists (nerfstudio, instant-ngp), of the images that are on disk.
 
     Args:
         path: the JSON file; image paths in it are relative to its folder.
@@ -124,7 +124,7 @@ def write_transforms(capture: Capture, path: Path) -> None:
 
 
 def records_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
-    """The entries of the list `frames`.
+    """Return the entries of the list `frames`.
 
     Raises:
         UserError: there is no such list, or it is empty.
@@ -148,7 +148,7 @@ class Found:
 
 
 def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> Found:
-    """The frames of a file whose image is on disk."""
+    """Return the frames of a file whose image is on disk."""
     frames, missing, rescaled = [], [], []
     records = records_of(path, content)
     poses = _poses(path, records)
@@ -170,7 +170,7 @@ def frames_on_disk(path: Path, content: dict[str, Any], measure: Measure) -> Fou
 
 
 def capture_on_disk(path: Path, found: Found, *, kind: str) -> Capture:
-    """The capture of `frames_on_disk`, if there are any and no two have the same name."""
+    """Return the capture of `frames_on_disk`, if there are any and no two have the same name."""
     if not found.frames:
         raise UserError(
             f"{path}: none of the {len(found.missing)} listed images exists, such as {found.missing[0]}",
@@ -238,7 +238,9 @@ def listed_frames(
 
 
 def relative_path(frame: Frame, folder: Path) -> str:
-    """A frame's image as seen from a folder, with forward slashes; its name where the image's place is not known."""
+    """Return a frame's image as seen from a folder, with forward slashes; its name where the image's place is not
+    known.
+    """
     return frame.name if frame.image is None else _seen_from(folder, frame.image)
 
 
@@ -283,7 +285,9 @@ def _listed_path(record: dict[str, Any], where: str) -> str:
 
 
 def _name_of(listed: str, where: str, *, suffix: str = "") -> str:
-    """A name with forward slashes and without "./"; of an absolute path, which is one machine's, the file name."""
+    """Return a name with forward slashes and without "./"; of an absolute path, which is one machine's, the file
+    name.
+    """
     pure = PurePosixPath(listed.replace("\\", "/"))
     if pure.is_absolute() or ":" in str(pure).split("/")[0]:
         pure = PurePosixPath(pure.name)
@@ -319,7 +323,7 @@ def _poses(path: Path, records: list[dict[str, Any]]) -> np.ndarray:
 
 
 def _matrix(record: dict[str, Any], where: str) -> np.ndarray:
-    """The matrix of a frame, (4, 4) or (3, 4)."""
+    """Return the matrix of a frame, (4, 4) or (3, 4)."""
     if "transform_matrix" not in record:
         raise malformed(where, "transform_matrix is missing", "expected 4 rows of 4 numbers, world from camera")
     try:

@@ -42,7 +42,7 @@ _KEY_OF_TERM = {
 
 
 def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) -> Camera:
-    """The camera of a frame.
+    """Return the camera of a frame.
 
     Args:
         record: the frame's keys over those of the whole file.
@@ -89,7 +89,7 @@ def camera_of_record(record: dict[str, Any], size: tuple[int, int], where: str) 
 
 
 def record_of_camera(camera: Camera) -> dict[str, Any]:
-    """The keys that describe a camera, without the terms that the format cannot hold."""
+    """Return the keys that describe a camera, without the terms that the format cannot hold."""
     size = {"w": camera.width, "h": camera.height}
     if camera.is_spherical:
         return {"camera_model": "EQUIRECTANGULAR", **size}
@@ -102,7 +102,7 @@ def record_of_camera(camera: Camera) -> dict[str, Any]:
 
 
 def lost_to_transforms(camera: Camera) -> list[str]:
-    """The distortion terms of a camera that the format has no key for."""
+    """Return the distortion terms of a camera that the format has no key for."""
     keys = _KEY_OF_TERM.get(camera.model, {})
     return [name for name in distortion(camera) if name not in keys]
 
@@ -124,7 +124,7 @@ def given_size(record: dict[str, Any], where: str) -> tuple[int, int] | None:
 
 
 def number(record: dict[str, Any], key: str, where: str) -> float | None:
-    """The number under a key, or None where there is none.
+    """Return the number under a key, or None where there is none.
 
     Raises:
         UserError: something else than a finite number.

@@ -46,7 +46,7 @@ def lost_of_cameras(capture: Capture, lost: Callable[[Camera], Iterable[str]]) -
 
 
 def distortion(camera: Camera) -> dict[str, float]:
-    """The parameters beside focal lengths and principal point that are not 0, by name."""
+    """Return the parameters beside focal lengths and principal point that are not 0, by name."""
     if camera.is_spherical:
         return {}
     values = zip(parameter_names(camera.model), camera.params, strict=True)

@@ -137,6 +137,6 @@ def _encode(
 
 
 def _fits(grid: HashGrid, layers: tuple[Tensor, ...]) -> bool:
-    """Whether marching is compiled for these sizes of a table and of layers."""
+    """Return whether marching is compiled for these sizes of a table and of layers."""
     code = grid.table.new_empty(0, grid.table.shape[0] * grid.table.shape[2])
     return numba_cpu.can_hash_encode(code, grid.table, grid.resolutions) and numba_cpu.can_radiance(code, layers)

@@ -17,7 +17,7 @@ from nerfcli.kernels.numba_cpu.threads import use_threads
 
 @numba.njit(inline="always")
 def _back_from_cube(x: Any, y: Any, z: Any, contraction: Any, a: Any, b: Any, c: Any) -> Any:
-    """The transposed Jacobian of `rays.cube` at (x, y, z), times (a, b, c).
+    """Return the transposed Jacobian of `rays.cube` at (x, y, z), times (a, b, c).
 
     cube(p) = s(m) p / 4 + 1/2 with s(m) = (2 - 1/m) / m and m the norm, at least 1: the Jacobian is
     (s + s'(m) p grad(m)^T) / 4, where grad(m) is 0 inside.

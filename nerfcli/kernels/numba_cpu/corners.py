@@ -60,7 +60,7 @@ def _weights(builder: Any, inside: Any) -> list[Any]:
 
 
 def _corners(rows_of: Callable[..., list[Any]]) -> Any:
-    """An intrinsic: (points, at, stride, resolution, rows, place, apart, index, weight, inside).
+    """Return an intrinsic: (points, at, stride, resolution, rows, place, apart, index, weight, inside).
 
     Reads the coordinates of 16 samples at points[at], points[at + stride], points[at + 2 stride]; writes the table row
     and the weight of corner c to index[place + c apart] and weight[place + c apart] (bit 0 of c is x, bit 1 is y, bit 2

@@ -118,7 +118,7 @@ def light_ends_of(sums: np.ndarray, quantiles: np.ndarray, shares: tuple[float, 
 
 @numba.njit(inline="always")
 def _passed(density: Any, starts: Any, ends: Any, offsets: Any, first: Any, count: Any, t: Any) -> Any:
-    """The mean transmittance of some rays at distance t."""
+    """Return the mean transmittance of some rays at distance t."""
     total = 0.0
     for ray in range(first, first + count):
         depth = 0.0

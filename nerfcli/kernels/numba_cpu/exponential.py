@@ -51,6 +51,6 @@ def sigmoid(x: Any) -> Any:
 
 @numba.njit(inline="always")
 def sigmoid_slope(x: Any) -> Any:
-    """The derivative of `sigmoid`: value * (1 - value) would lose every digit near 1."""
+    """Return the derivative of `sigmoid`: value * (1 - value) would lose every digit near 1."""
     tail = exponential(-abs(x))
     return tail / ((np.float32(1) + tail) * (np.float32(1) + tail))

@@ -65,7 +65,7 @@ def encode_range(
     points: Any, stride: Any, widths: Any, first: Any, last: Any, flat: Any, rows: Any, resolutions: Any, scratch: Any,
     out: Any,
 ) -> None:  # fmt: skip
-    """All levels of samples first to last into the flat array `out`, with `new_scratch`.
+    """Encode all levels of samples first to last into the flat array `out`, with `new_scratch`.
 
     Args:
         points: coordinates as `by_axis` lays them out, the next axis `stride` further on.

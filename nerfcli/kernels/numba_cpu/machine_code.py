@@ -37,7 +37,7 @@ def is_there() -> bool:
 
 
 def sources() -> list[Path]:
-    """The files that the machine code is made of."""
+    """Return the files that the machine code is made of."""
     return list(Path(__file__).parent.parent.rglob("*.py"))
 
 

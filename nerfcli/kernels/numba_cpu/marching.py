@@ -17,7 +17,7 @@ from nerfcli.kernels.numba_cpu.threads import use_threads
 def _count(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, contraction: Any, counts: Any
 ) -> None:
-    """How many samples each ray has."""
+    """Count the samples of each ray."""
     intervals = edges.shape[0] - 2 - CHUNK
     for ray in numba.prange(origins.shape[0]):
         places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)
@@ -35,7 +35,7 @@ def _write(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, side: Any, contraction: Any, offsets: Any,
     starts: Any, ends: Any, coordinates: Any,
 ) -> None:  # fmt: skip
-    """The samples of each ray, from its offset on."""
+    """Write the samples of each ray, from its offset on."""
     intervals = edges.shape[0] - 2 - CHUNK
     for ray in numba.prange(origins.shape[0]):
         places, cells = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.int32)

@@ -98,7 +98,7 @@ def _load_rows(source: Any, first: Any, count: Any, out: Any) -> None:
 
 @numba.njit(inline="always")
 def _colour_inputs(geometry: Any, harmonics: Any, rays: Any, first: Any, count: Any, out: Any) -> None:
-    """The 16 outputs of the density network beside the 16 harmonics of the sample's ray."""
+    """Write the 16 outputs of the density network beside the 16 harmonics of the sample's ray."""
     for i in range(count):
         ray = rays[first + i]
         for j in range(OUT):
@@ -118,7 +118,7 @@ def _densities(geometry: Any, density: Any) -> None:
 
 @numba.njit(inline="always")
 def _channels(out: Any, channels: Any) -> None:
-    """The three numbers (TILE, 3) of what the colour network puts out, (TILE, 16)."""
+    """Write the three numbers (TILE, 3) of the output (TILE, 16) of the colour network."""
     for i in range(TILE):
         for channel in range(3):
             channels[3 * i + channel] = out[i * OUT + channel]
@@ -270,13 +270,13 @@ def _radiance_backward(
 
 
 def flat_weights(weights: Sequence[Tensor]) -> np.ndarray:
-    """All layers as (inputs, outputs), outputs padded to a multiple of 16, in one array."""
+    """Return all layers as (inputs, outputs), outputs padded to a multiple of 16, in one array."""
     padded = [torch.nn.functional.pad(w.detach(), (0, 0, 0, -len(w) % OUT)) for w in weights]
     return torch.cat([w.t().reshape(-1) for w in padded]).numpy()
 
 
 def _flat_back(weights: Sequence[Tensor]) -> np.ndarray:
-    """All layers as (outputs, inputs), padded alike, as the backward pass reads them."""
+    """Return all layers as (outputs, inputs), padded alike, as the backward pass reads them."""
     padded = [torch.nn.functional.pad(w.detach(), (0, 0, 0, -len(w) % OUT)) for w in weights]
     return torch.cat([w.reshape(-1) for w in padded]).numpy()
 

@@ -32,7 +32,7 @@ def cube(x: Any, y: Any, z: Any, contraction: Any) -> Any:
 
 @numba.njit(inline="always")
 def cut(edges: Any, shift: Any, k: Any) -> Any:
-    """The jittered edge number k."""
+    """Return the jittered edge number k."""
     return edges[k] + shift * (edges[k + 1] - edges[k])
 
 

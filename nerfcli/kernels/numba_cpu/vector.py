@@ -20,23 +20,23 @@ INTS, FLOATS = ir.VectorType(INT, LANES), ir.VectorType(FLOAT, LANES)
 
 
 def ints(value: int) -> Any:
-    """A vector of one whole number."""
+    """Return a vector of one whole number."""
     return ir.Constant(INTS, [value % 2**32] * LANES)
 
 
 def floats(value: float) -> Any:
-    """A vector of one number, which float32 must hold exactly."""
+    """Return a vector of one number, which float32 must hold exactly."""
     return ir.Constant(FLOATS, [value] * LANES)
 
 
 def in_all_lanes(builder: Any, scalar: Any, kind: Any) -> Any:
-    """A vector of type `kind` of one number that the machine code computes."""
+    """Return a vector of type `kind` of one number that the machine code computes."""
     undefined = ir.Constant(kind, ir.Undefined)
     return builder.shuffle_vector(builder.insert_element(undefined, scalar, ir.Constant(INT, 0)), undefined, ints(0))
 
 
 def vector_at(builder: Any, pointer: Any, first: Any, step: Any, count: int, kind: Any) -> Any:
-    """The place of a vector of type `kind`: `count` steps behind element `first`."""
+    """Return the place of a vector of type `kind`: `count` steps behind element `first`."""
     element = builder.add(first, builder.mul(step, ir.Constant(LONG, count)))
     return builder.bitcast(builder.gep(pointer, [element]), kind.as_pointer())
 
@@ -67,7 +67,7 @@ CORNERS = 8
 
 
 def _row_access(generate: Callable[..., None]) -> Any:
-    """An intrinsic over the 8 corners of a cell: (flat, offset, index, weight, at, stride, row, row_at).
+    """Return an intrinsic over the 8 corners of a cell: (flat, offset, index, weight, at, stride, row, row_at).
 
     Corner c has the table row index[at + c stride], at flat[offset + 4 index], and the weight weight[at + c stride].
     `generate` is given the builder, pointers to the corners' rows and weights, and one to row[row_at : row_at + 4].
@@ -103,7 +103,7 @@ def _row_access(generate: Callable[..., None]) -> Any:
 
 
 def _in_all_lanes(builder: Any, pointer: Any) -> Any:
-    """The number at a pointer, once for each number of a row."""
+    """Return the number at a pointer, once for each number of a row."""
     undefined = ir.Constant(ir.VectorType(ir.FloatType(), ROW), ir.Undefined)
     first = builder.insert_element(undefined, builder.load(pointer), ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(ir.IntType(32), ROW), [0] * ROW))
@@ -148,7 +148,7 @@ dot_rows = _row_access(_dot)
 
 
 def _block_product(vectors: int, *, begin: Callable[..., Any], finish: Callable[..., Any]) -> Callable[..., None]:
-    """An intrinsic for blocks that are `vectors` vectors wide.
+    """Return an intrinsic for blocks that are `vectors` vectors wide.
 
     Args:
         vectors: of a row.

@@ -28,13 +28,13 @@ BLOCK_SIDE = 4
 
 @numba.njit(inline="always")
 def _block(x: Any, side: Any) -> Any:
-    """The block of a coordinate along one axis; of the nearest one inside the cube."""
+    """Return the block of a coordinate along one axis; of the nearest one inside the cube."""
     return min(np.int64(min(max(x, np.float32(0)), np.float32(1)) * np.float32(side)), side - 1) // BLOCK_SIDE
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def occupied_blocks(occupied: Any) -> Any:
-    """Which blocks of cells are occupied, or touch one that is."""
+    """Return which blocks of cells are occupied, or touch one that is."""
     side = occupied.shape[0]
     blocks = (side + BLOCK_SIDE - 1) // BLOCK_SIDE
     own = np.zeros((blocks, blocks, blocks), np.bool_)
@@ -56,7 +56,7 @@ def occupied_blocks(occupied: Any) -> Any:
 def _may_hold_something(
     origins: Any, directions: Any, ray: Any, start: Any, end: Any, blocks: Any, side: Any, reach: Any, contraction: Any
 ) -> Any:
-    """Whether an interval of a ray may come through an occupied cell.
+    """Return whether an interval of a ray may come through an occupied cell.
 
     Where both its ends are within a block's size of its middle, the middle's block and its neighbours hold all of it:
     coordinates of the cube change by at most 1/2 per distance, 1/4 where space is contracted to a ball, and 1/4 times
@@ -76,7 +76,7 @@ def _may_hold_something(
 
 @numba.njit(inline="always")
 def _stretch(origins: Any, directions: Any, ray: Any, t: Any, contraction: Any) -> Any:
-    """How much `contraction.cube_widths` makes of a width of 1 at a distance along a ray."""
+    """Return how much `contraction.cube_widths` makes of a width of 1 at a distance along a ray."""
     quarter, one, two = np.float32(0.25), np.float32(1), np.float32(2)
     if contraction == 0:
         return np.float32(0.5)
@@ -98,7 +98,9 @@ def new_round() -> Any:
 
 @numba.njit(inline="always")
 def block_reach(side: Any, contraction: Any) -> Any:
-    """The longest interval of which `_may_hold_something` knows where it goes: a block is BLOCK_SIDE / side wide."""
+    """Return the longest interval of which `_may_hold_something` knows where it goes: a block is BLOCK_SIDE / side
+    wide.
+    """
     return np.float32(BLOCK_SIDE / side * (4.0 if contraction == 0 else 7.8))
 
 

@@ -10,7 +10,7 @@ MOST_DEVIATION = 0.25
 
 
 def ray_indices(offsets: Tensor) -> Tensor:
-    """The ray of each packed sample, (N,) int64."""
+    """Return the ray of each packed sample, (N,) int64."""
     counts = offsets.diff()
     return torch.repeat_interleave(torch.arange(len(counts), device=offsets.device), counts)
 

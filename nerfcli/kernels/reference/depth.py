@@ -243,13 +243,13 @@ def mixture_quantile(
 
 
 def _largest(weights: Tensor, offsets: Tensor) -> Tensor:
-    """The largest weight of each ray; 0 for a ray without samples."""
+    """Return the largest weight of each ray; 0 for a ray without samples."""
     result = torch.zeros(len(offsets) - 1, dtype=weights.dtype, device=weights.device)
     return result.scatter_reduce(0, ray_indices(offsets), weights, "amax")
 
 
 def _nearest(distances: Tensor, offsets: Tensor) -> Tensor:
-    """The smallest of each ray's distances; NaN where all are infinite."""
+    """Return the smallest of each ray's distances; NaN where all are infinite."""
     result = torch.full((len(offsets) - 1,), torch.inf, dtype=distances.dtype, device=distances.device)
     result = result.scatter_reduce(0, ray_indices(offsets), distances, "amin")
     return torch.where(result.isinf(), torch.nan, result)

@@ -7,7 +7,7 @@ HASH_PRIMES = (1, 2654435761, 805459861)
 
 
 def corner_rows(cells: Tensor, resolution: int, rows: int) -> Tensor:
-    """The table row of each grid vertex: its place in the dense grid where that fits, else its spatial hash.
+    """Return the table row of each grid vertex: its place in the dense grid where that fits, else its spatial hash.
 
     hash(i, j, k) = (i * 1 xor j * 2654435761 xor k * 805459861) mod rows, in unsigned 32-bit arithmetic.
 

@@ -35,7 +35,7 @@ def march(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor]:
 def sample_coordinates(
     origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor, *, offsets: Tensor, contraction: str
 ) -> Tensor:
-    """The middles of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`.
+    """Return the middles of intervals as coordinates of the field's unit cube: (N, 3). See `grid_coordinates`.
 
     Differentiable in origins and directions.
     """
@@ -45,7 +45,7 @@ def sample_coordinates(
 
 
 def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The samples of `march` with their places.
+    """Return the samples of `march` with their places.
 
     Returns:
         starts (N,), ends (N,), coordinates (N, 3) in the field's unit cube, offsets (R + 1,).

@@ -7,7 +7,7 @@ from nerfcli.kernels.activations import density_from_log
 
 
 def geometry(encoded: Tensor, weights: tuple[Tensor, ...]) -> Tensor:
-    """The density network: (N, E) to (N, G), W2 relu(W1 x); the first output is the log of the density."""
+    """Return the density network: (N, E) to (N, G), W2 relu(W1 x); the first output is the log of the density."""
     return torch.relu(encoded @ weights[0].t()) @ weights[1].t()
 
 

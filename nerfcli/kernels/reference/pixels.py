@@ -7,7 +7,7 @@ from nerfcli.kernels.interface import PixelTable
 
 
 def pixel_rays(chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
-    """The rays of chosen pixels (N,) int64 of many photos, and their colours.
+    """Return the rays of chosen pixels (N,) int64 of many photos, and their colours.
 
     Returns:
         origins (N, 3), directions (N, 3) = rotation @ bearing, colours (N, C) in [0, 1].

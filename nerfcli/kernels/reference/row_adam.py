@@ -16,7 +16,7 @@ def adam_rows(
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """One step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero.
+    """Take one step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero.
 
     m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g^2
     table -= rate (m / (1 - b1^step)) / (sqrt(v / (1 - b2^step)) + eps)

@@ -181,7 +181,7 @@ class _Radiance(torch.autograd.Function):
 
 
 def _fits(grid: HashGrid) -> bool:
-    """Whether the kernels are written for these sizes."""
+    """Return whether the kernels are written for these sizes."""
     levels, _, features = grid.table.shape
     return hash_grid.can_hash_encode(grid.table, grid.resolutions) and networks.can_radiance(
         levels * features, grid.layers

@@ -85,7 +85,7 @@ def _forward(
 
 @jit
 def _worth(rgb, by_weight, i, valid, red, green, blue):
-    """What the loss gains per unit of weight of samples."""
+    """Return what the loss gains per unit of weight of samples."""
     value = tl.load(by_weight + i, mask=valid, other=0.0)
     value += red * tl.load(rgb + i * 3, mask=valid, other=0.0)
     value += green * tl.load(rgb + i * 3 + 1, mask=valid, other=0.0)

@@ -16,7 +16,7 @@ from nerfcli.kernels.triton_cuda.rays import RAYS, STEPS, blocks_of, contracted_
 
 @jit
 def _back_from_cube(x, y, z, a, b, c, CONTRACTION: tl.constexpr):
-    """The transposed Jacobian of `rays.cube` at (x, y, z), times (a, b, c).
+    """Return the transposed Jacobian of `rays.cube` at (x, y, z), times (a, b, c).
 
     cube(p) = s(m) p / 4 + 1/2 with s(m) = (2 - 1/m) / m and m the norm, at least 1: the Jacobian is
     (s + s'(m) p grad(m)^T) / 4, where grad(m) is 0 inside.

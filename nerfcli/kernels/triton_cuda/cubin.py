@@ -134,7 +134,9 @@ def folder() -> Path:
 
 
 def _formats(ptx: str, types: tuple[str, ...]) -> str:
-    """The parameters of the only entry, which are the arguments and at most `_MOST_EXTRA` pointers behind them."""
+    """Return the parameters of the only entry, which are the arguments and at most `_MOST_EXTRA` pointers behind
+    them.
+    """
     entry = re.search(r"\.entry\s+\w+\s*\((.*?)\)", ptx, re.DOTALL)
     found = re.findall(r"\.param\s+\.(\w+)", entry[1]) if entry else []
     wanted = ["Q" if name.startswith("*") else _OF_TYPES[name] for name in types]

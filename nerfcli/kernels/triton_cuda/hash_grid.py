@@ -52,7 +52,7 @@ def _weight(fx, fy, fz, corner: tl.constexpr):
 
 @jit
 def _fade(widths, i, valid, resolution, fades: tl.constexpr):
-    """What a level counts where its cells are smaller than a pixel."""
+    """Return the weight of a level where its cells are smaller than a pixel."""
     if fades:
         width = tl.load(widths + i, mask=valid, other=0.0)
         return 1.0 / tl.maximum(resolution.to(tl.float32) * width, 1.0)
@@ -210,7 +210,7 @@ def points_gradient(
     scale: Tensor,
     widths: Tensor | None,
 ) -> Tensor:
-    """What a gradient (N, L * 4), multiplied by `scale` (), makes of the points': (N, 3)."""
+    """Return what a gradient (N, L * 4), multiplied by `scale` (), makes of the points': (N, 3)."""
     levels, rows, _ = table.shape
     out = torch.empty_like(points)
     launch(

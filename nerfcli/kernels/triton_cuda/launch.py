@@ -171,7 +171,7 @@ def _count(out, first, step, count, BLOCK: tl.constexpr):
 
 
 def _counts(device: torch.device) -> bool:
-    """Whether a small kernel does on a device what it should."""
+    """Return whether a small kernel does on a device what it should."""
     out = torch.zeros(100, device=device)
     launch(_count, (3,), out, 7, 0.5, 90, BLOCK=32)
     expected = torch.where(torch.arange(100) < 90, 7 + 0.5 * torch.arange(100), 0.0)

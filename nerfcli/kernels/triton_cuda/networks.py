@@ -102,13 +102,13 @@ def _forward(
 
 @jit
 def _half(gradient):
-    """In float16. Infinity would spoil the sums of all samples; NaN stays, so that it is found."""
+    """Return float16 numbers. Infinity would spoil the sums of all samples; NaN stays, so that it is found."""
     return tl.clamp(gradient, -END, END, propagate_nan=tl.PropagateNan.ALL).to(tl.float16)
 
 
 @jit
 def _largest(by_density, density, by_rgb, out, samples, BLOCK: tl.constexpr):
-    """The largest gradient of a log density or a colour."""
+    """Return the largest gradient of a log density or a colour."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     valid = i < samples
     thick = tl.load(by_density + i, mask=valid, other=0.0) * tl.load(density + i, mask=valid, other=0.0)
@@ -258,7 +258,7 @@ def radiance_gradients(
 
 
 def plain(layers: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """The layers without gradients, as kernels read them."""
+    """Return the layers without gradients, as kernels read them."""
     return tuple(layer.detach().contiguous() for layer in layers)
 
 

@@ -18,13 +18,13 @@ SHRINK = tl.constexpr(2.0**-66)
 
 
 def blocks_of(rays: int) -> tuple[int]:
-    """The grid of programs that own `RAYS` rays each."""
+    """Return the grid of programs that own `RAYS` rays each."""
     return (blocks(rays, RAYS),)
 
 
 @jit
 def contracted_norm(x, y, z, CONTRACTION: tl.constexpr):
-    """The norm of the contraction, at least 1."""
+    """Return the norm of the contraction, at least 1."""
     largest = tl.maximum(tl.maximum(tl.abs(x), tl.abs(y)), tl.abs(z))
     if CONTRACTION == 1:
         shrink = tl.where(largest > FAR, SHRINK, 1.0)

@@ -170,6 +170,6 @@ def _forget_pairs(database: sqlite3.Connection, image_id: int, tables: Iterable[
 
 @contextmanager
 def _edited(job: Job) -> Iterator[sqlite3.Connection]:
-    """The database in Python's SQLite, for one transaction."""
+    """Open the database in Python's SQLite, for one transaction."""
     with closing(sqlite3.connect(job.database)) as database, database:
         yield database

@@ -188,7 +188,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
 
 
 def _only_turns(job: Job) -> bool:
-    """Whether rotations of the camera explain all matches: then no model is accepted, whatever is tried."""
+    """Return whether rotations of the camera explain all matches: then no model is accepted, whatever is tried."""
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
     sizes = {job.image_ids[photo]: (group.width, group.height) for group in job.groups for photo in group.photos}

@@ -82,7 +82,7 @@ def write_model(model: pycolmap.Reconstruction, job: Job) -> None:
 
 
 def model_keys(job: Job) -> dict[str, str]:
-    """A hash of each file of the model in the job's folder, by the file's name; none if there is no model."""
+    """Return a hash of each file of the model in the job's folder, by the file's name; none if there is no model."""
     folder = _model_folder(job)
     return {path.name: file_key(path) for path in sorted(folder.iterdir())} if folder.is_dir() else {}
 

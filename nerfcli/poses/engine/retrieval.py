@@ -30,7 +30,9 @@ _VERSION = "256 coarsest"
 
 
 def with_neighbours(job: Job, report: Report) -> Job:
-    """The job with its pairs complete: each photo's look-alikes are among them. A complete stage is not done again."""
+    """Return the job with its pairs complete: each photo's look-alikes are among them. A complete stage is not done
+    again.
+    """
     if job.neighbours == 0:
         return job
     path = Path(job.folder) / f"{job.rung}{'-' if job.rung else ''}pairs.json"

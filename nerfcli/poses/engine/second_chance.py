@@ -167,7 +167,7 @@ def _core(model: pycolmap.Reconstruction, job: Job) -> _Core:
 
 
 def _neighbours_in_order(job: Job, pairs: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Of an ordered capture, the pairs that are near in the order: the camera was in nearly the same place."""
+    """Return, of an ordered capture, the pairs that are near in the order: the camera was in nearly the same place."""
     order = capture_order(job.names)
     if order is None:
         return set()

@@ -37,13 +37,15 @@ class Placed:
 
 
 def held_out_last(job: Job) -> Job:
-    """The job with cameras that took only held-out photos behind the others, so that the others keep their numbers."""
+    """Return the job with cameras that took only held-out photos behind the others, so that the others keep their
+    numbers.
+    """
     held_out = frozenset(job.held_out)
     return replace(job, groups=tuple(sorted(job.groups, key=lambda group: held_out.issuperset(group.photos))))
 
 
 def training_part(job: Job) -> Job:
-    """The job of the training photos alone; their files keep their numbers, and so their ids."""
+    """Return the job of the training photos alone; their files keep their numbers, and so their ids."""
     held_out = frozenset(job.held_out)
     kept = [number for number in range(len(job.files)) if number not in held_out]
     place = {number: index for index, number in enumerate(kept)}
@@ -116,7 +118,9 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
 
 
 def fingerprint(model: pycolmap.Reconstruction, *, without: frozenset[str] = frozenset()) -> str:
-    """A hash of every bit of cameras, points with their tracks, and poses of the images that are not in `without`."""
+    """Return a hash of every bit of cameras, points with their tracks, and poses of the images that are not in
+    `without`.
+    """
     cameras = [(number, camera.model.name, _bits(camera.params)) for number, camera in sorted(model.cameras.items())]
     points = [
         (number, _bits(point.xyz), sorted((e.image_id, e.point2D_idx) for e in point.track.elements))
@@ -168,7 +172,9 @@ def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[t
 def _seen_points(
     model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) of a photo and the points (N, 3) that its verified matches with placed photos say are there."""
+    """Return pixels (N, 2) of a photo and the points (N, 3) that its verified matches with placed photos say are
+    there.
+    """
     image_id = job.image_ids[number]
     seen: set[tuple[int, int]] = set()  # feature of the photo, point
     with closing(pycolmap.Database.open(str(job.database))) as database:
@@ -189,7 +195,7 @@ def _seen_points(
 
 
 def _renumbered(job: Job, training: Job, result: Mapping[str, Any]) -> dict[str, Any]:
-    """A result of the training photos with the numbers that photos have among all."""
+    """Return a result of the training photos with the numbers that photos have among all."""
     number = {index: job.files.index(file) for index, file in enumerate(training.files)}
     by_number = {number[index]: known for index, known in enumerate(result["evidence"])}
     nothing = {"features": 0, "best_matches": 0, "best_partner": None}

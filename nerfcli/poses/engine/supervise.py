@@ -94,7 +94,7 @@ def run_worker(
 
 
 def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> UserError:
-    """The error for a worker that ended with `returncode` while at `stage`, with the last words of its log.
+    """Return the error for a worker that ended with `returncode` while at `stage`, with the last words of its log.
 
     Args:
         free_bytes: on the disk that it wrote to. Where that is full, the log may be empty.
@@ -170,6 +170,6 @@ def _limit_reached(which: str, limits: Limits, stage: str) -> UserError:
 
 
 def _last_words(log: str) -> str:
-    """The last lines that say something: not the stack frames that glog prints below them."""
+    """Return the last lines that say something: not the stack frames that glog prints below them."""
     lines = [line.strip() for line in log.splitlines() if line.strip() and not line.strip().startswith(("@", "***"))]
     return " / ".join(lines[-3:]) or "no message"

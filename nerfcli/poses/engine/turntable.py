@@ -66,7 +66,8 @@ def scene_masks(job: Job) -> Path:
 
 
 def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
-    """The job with the masks that an earlier call found, and what is to be reported; None if that is to be done anew.
+    """Return the job with the masks that an earlier call found, and what is to be reported; None if that is to be done
+    anew.
 
     Masks that the user gave are not doubted.
     """
@@ -93,7 +94,8 @@ def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
 
 
 def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[str, Any] | None]:
-    """The job with masks of the object, if one turns before a still background; and what is to be reported of it.
+    """Return the job with masks of the object, if one turns before a still background; and what is to be reported of
+    it.
 
     Args:
         job: its photos get masks.
@@ -141,7 +143,7 @@ def sentence(facts: dict[str, Any]) -> str:
 
 
 def advised(error: UserError, facts: dict[str, Any] | None) -> UserError:
-    """A refusal with what to do about an object that turns before a still background, if there is one."""
+    """Return a refusal with what to do about an object that turns before a still background, if there is one."""
     if facts is None or not facts["wide"]:
         return error
     masks = f"the edited masks in {MASKS}/ of the scene" if facts["masked"] else "white where the object is"
@@ -157,7 +159,7 @@ class _Features:
         self._read: dict[int, tuple[np.ndarray, np.ndarray, tuple[int, int]]] = {}
 
     def of(self, number: int) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-        """Pixels (N, 2), descriptors (N, 128), and the photo's (width, height)."""
+        """Return pixels (N, 2), descriptors (N, 128), and the photo's (width, height)."""
         if number not in self._read:
             with closing(pycolmap.Database.open(str(self.job.database))) as database:
                 image_id = self.job.image_ids[number]
@@ -236,7 +238,7 @@ def _same_place(pairs: Sequence[ComparedPair], places: dict[int, int]) -> list[l
 def _masks(
     job: Job, pairs: Sequence[ComparedPair], *, groups: Sequence[Sequence[int]], places: dict[int, int]
 ) -> list[np.ndarray | None]:
-    """A small mask for each photo that a background is found for."""
+    """Return a small mask for each photo that a background is found for."""
     pictures = [still.small(read_image(job.photos / file)[..., :3]) for file in job.files]
     behinds = []
     for group in groups:
@@ -259,7 +261,7 @@ def _masks(
 def _judged(
     masks: Sequence[np.ndarray | None], pairs: Sequence[ComparedPair], places: dict[int, int]
 ) -> dict[str, Any]:
-    """How much of the photos the masks leave, and how many matches of the two motions are on the right side."""
+    """Return how much of the photos the masks leave, and how many matches of the two motions are on the right side."""
     found = [mask for mask in masks if mask is not None]
     moving, staying = [], []
     for pair in pairs:

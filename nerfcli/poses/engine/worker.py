@@ -176,7 +176,7 @@ def _coloured(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> pycol
 
 
 def _is_complete(job: Job, key: str) -> bool:
-    """Whether the result is there and its model is the one that was written with it."""
+    """Return whether the result is there and its model is the one that was written with it."""
     there = read_stage(Path(job.folder) / RESULT, key)
     return there is not None and there["model_files"].items() <= model_keys(job).items()
 

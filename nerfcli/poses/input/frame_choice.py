@@ -43,7 +43,7 @@ class FrameMeter:
         self._anchor: MotionPicture | None = None
 
     def measure(self, grey: np.ndarray) -> FrameMeasure:
-        """The measures of the next frame, uint8 (height, width), at `SHARPNESS_SIZE_PX`."""
+        """Return the measures of the next frame, uint8 (height, width), at `SHARPNESS_SIZE_PX`."""
         picture = MotionPicture(grey)
         moved = self._anchor.moved_to(picture) if self._anchor else np.inf
         if moved >= MOVED_SHARE:

@@ -118,7 +118,7 @@ def database_path(work: Path, rung: str = "") -> Path:
 
 
 def write_job(path: Path, job: Job) -> None:
-    """The job as JSON."""
+    """Write the job as JSON."""
     path.write_text(json.dumps(asdict(job)), encoding="utf-8")
 
 

@@ -81,7 +81,7 @@ def _best_rule(photos: Sequence[Photo]) -> str:
 
 
 def sequential_pairs(order: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Each photo with the next 10 in the order, and with those 16, 32, 64... further on."""
+    """Return each photo with the next 10 in the order, and with those 16, 32, 64... further on."""
     count = len(order)
     steps = [*range(1, _FOLLOWERS + 1), *(2**k for k in range(4, count.bit_length()))]
     near = {(i, i + step) for step in steps for i in range(count - step)}
@@ -89,7 +89,7 @@ def sequential_pairs(order: Sequence[int]) -> tuple[tuple[int, int], ...]:
 
 
 def nearest_pairs(places: np.ndarray, count: int) -> tuple[tuple[int, int], ...]:
-    """Each of the places (N, 2) with the `count` that are nearest to it."""
+    """Return each of the places (N, 2) with the `count` that are nearest to it."""
     distances = np.linalg.norm(places[:, None] - places[None], axis=-1)
     np.fill_diagonal(distances, np.inf)
     nearest = np.argsort(distances, axis=1, kind="stable")[:, : min(count, len(places) - 1)]
@@ -97,7 +97,7 @@ def nearest_pairs(places: np.ndarray, count: int) -> tuple[tuple[int, int], ...]
 
 
 def all_pairs(count: int) -> tuple[tuple[int, int], ...]:
-    """Every (i, j) with i < j < count, block by block."""
+    """Return every (i, j) with i < j < count, block by block."""
     return in_blocks(combinations(range(count), 2))
 
 
@@ -112,7 +112,9 @@ def looked_at_features(photos: int) -> int:
 
 
 def in_blocks(pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """The pairs in an order in which few photos are in use at a time, since the matcher keeps what it used last."""
+    """Return the pairs in an order in which few photos are in use at a time, since the matcher keeps what it used
+    last.
+    """
     block = 16
     return tuple(sorted(pairs, key=lambda pair: (pair[0] // block, pair[1] // block, pair)))
 

@@ -9,7 +9,7 @@ from nerfcli.poses.input.photos import Photos
 
 
 def read_pairs(path: Path, photos: Photos) -> Pairing:
-    """The pairs that a text file lists. Empty lines and those that begin with # are passed over.
+    """Read the pairs that a text file lists. Empty lines and those that begin with # are passed over.
 
     Names may hold spaces: a line is cut where both parts are names of photos. Quotes around a name, or a tab between
     the two, help where more than one cut would do. Pairs with a photo that cannot be read are left out.
@@ -40,7 +40,7 @@ def read_pairs(path: Path, photos: Photos) -> Pairing:
 
 
 def _names(line: str, known: Container[str], place: str, folder: Path) -> tuple[str, str]:
-    """The two names of a line."""
+    """Return the two names of a line."""
     found = [(one, other) for one, other in _cuts(line) if one in known and other in known]
     if len(set(found)) > 1:
         raise UserError(f"{place}: {line!r} can be split into two names in more than one way", "put a tab between them")
@@ -53,7 +53,7 @@ def _names(line: str, known: Container[str], place: str, folder: Path) -> tuple[
 
 
 def _cuts(line: str) -> Iterator[tuple[str, str]]:
-    """All ways to cut a line in two, at a tab if it has one, else at every space."""
+    """Yield all ways to cut a line in two, at a tab if it has one, else at every space."""
     separator = "\t" if "\t" in line else " "
     for at, character in enumerate(line):
         if character == separator:
@@ -68,7 +68,7 @@ def _bare(text: str) -> str:
 
 
 def _unknown(line: str, known: Container[str]) -> str:
-    """What is wrong with a line that holds no two names."""
+    """Return what is wrong with a line that holds no two names."""
     cuts = list(_cuts(line))
     for one, other in cuts:
         if one in known:

@@ -93,7 +93,9 @@ def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
 
 
 def _same_as(focal: float | None, focals: list[float]) -> float | None:
-    """The first of the focal lengths so far that is the same as this one; if there is none, this one joins them."""
+    """Return the first of the focal lengths so far that is the same as this one; if there is none, this one joins
+    them.
+    """
     if focal is None:
         return None
     for earlier in focals:
@@ -104,7 +106,7 @@ def _same_as(focal: float | None, focals: list[float]) -> float | None:
 
 
 def _examine(path: Path) -> Photo | str:
-    """The photo, or why it cannot be read."""
+    """Return the photo, or why it cannot be read."""
     try:
         height, width = read_image(path).shape[:2]
         return Photo(name=path.name, width=width, height=height, exif=read_exif(path))

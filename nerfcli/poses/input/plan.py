@@ -50,7 +50,7 @@ class Plan:
         return asdict(self)
 
     def describe(self) -> str:
-        """One sentence."""
+        """Return one sentence."""
         times = ", ".join(f"{_WORDS[stage]} {duration(seconds)}" for stage, seconds in self.seconds.items())
         about = f"about {duration(sum(self.seconds.values()))}"
         return f"{self.photos} photos, {self.pairs} pairs to match ({self.rule}), {about}: {times}"
@@ -61,7 +61,7 @@ _WORDS = {"extract": "features", "pair": "pairs", "match": "matches", "map": "po
 
 
 def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threads: int) -> Plan:
-    """The plan for these photos; threads is how many there really are."""
+    """Return the plan for these photos; threads is how many there really are."""
     count = len(photos.photos)
     all_pairs = count * (count - 1) // 2
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
@@ -182,7 +182,7 @@ class Outlook:
         return self._share, left
 
     def _begins_again(self, stage: str, ratio: float) -> bool:
-        """Whether the work goes back, for another attempt. Stages without a plan come last."""
+        """Return whether the work goes back, for another attempt. Stages without a plan come last."""
         order = list(self._seconds)
         new, old = (order.index(name) if name in order else len(order) for name in (stage, self._stage))
         return bool(self._stage) and (new < old or (new == old and ratio < self._ratio))

@@ -14,13 +14,13 @@ from nerfcli.atomic import write_json
 
 
 def stage_key(*parts: Any) -> str:
-    """A hash of plain values: equal for equal values, in every process and on every machine."""
+    """Return a hash of plain values: equal for equal values, in every process and on every machine."""
     text = json.dumps(parts, sort_keys=True, ensure_ascii=False)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def file_key(path: Path) -> str:
-    """A hash of a file's content."""
+    """Return a hash of a file's content."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
@@ -31,7 +31,7 @@ def write_stage(path: Path, key: str, content: Any) -> None:
 
 
 def read_stage(path: Path, key: str) -> Any | None:
-    """The content of a complete stage with this key, None where there is none, or a damaged one."""
+    """Read the content of a complete stage with this key, None where there is none, or a damaged one."""
     if not path.is_file():
         return None
     try:

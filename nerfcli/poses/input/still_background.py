@@ -50,7 +50,7 @@ class Background:
 
 
 def small(picture: np.ndarray) -> np.ndarray:
-    """A picture (height, width, 3) uint8 at `SIDE_PX`."""
+    """Return a picture (height, width, 3) uint8 at `SIDE_PX`."""
     height, width = picture.shape[:2]
     scale = min(1.0, SIDE_PX / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -58,7 +58,7 @@ def small(picture: np.ndarray) -> np.ndarray:
 
 
 def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background:
-    """What stays in pictures (h, w, 3) of one place, `LEAST_PHOTOS` or more.
+    """Return what stays in pictures (h, w, 3) of one place, `LEAST_PHOTOS` or more.
 
     Args:
         pictures: of it, see `small`.
@@ -88,7 +88,9 @@ def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background
 
 
 def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
-    """Where a picture (h, w, 3) shows something else than the background, (h, w) bool: the object, a little wider."""
+    """Return where a picture (h, w, 3) shows something else than the background, (h, w) bool: the object, a little
+    wider.
+    """
     raw = ((cv2.medianBlur(_distances(picture, behind), 5) > 1) | behind.covered).astype(np.uint8)
     raw = cv2.morphologyEx(raw, cv2.MORPH_OPEN, _disc(1))
     closed = cv2.morphologyEx(np.pad(raw, _CLOSED_PX), cv2.MORPH_CLOSE, _disc(_CLOSED_PX))
@@ -103,24 +105,24 @@ def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
 
 
 def agreement(picture: np.ndarray, behind: Background) -> float:
-    """Of the places where there is a background, the share that a picture (h, w, 3) shows as it is there."""
+    """Return the fraction of places with a background that a picture (h, w, 3) shows as it is there."""
     free = ~behind.covered
     return float(np.mean(_distances(picture, behind)[free] <= 1)) if free.any() else 0.0
 
 
 def enlarged(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A mask in the size (width, height) of its photo, with smooth edges."""
+    """Return a mask in the size (width, height) of its photo, with smooth edges."""
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 def _distances(picture: np.ndarray, behind: Background) -> np.ndarray:
-    """How far each pixel is from the background's colour, in tolerances, float32 (h, w)."""
+    """Return how far each pixel is from the background's colour, in tolerances, float32 (h, w)."""
     levels = picture.astype(np.float32)
     return np.abs(levels * _gain(levels, behind) - behind.colours).max(axis=2) / behind.tolerance
 
 
 def _gain(picture: np.ndarray, behind: Background) -> np.ndarray:
-    """What the picture's channels are to be multiplied by, so that most of it is as light as the background."""
+    """Return what the picture's channels are to be multiplied by, so that most of it is as light as the background."""
     bright = (behind.colours > 16) & (behind.colours < 240) & (picture > 8) & (picture < 245)
     gains = []
     for channel in range(3):

@@ -141,7 +141,7 @@ def _write(
 def _different(
     frames: Iterator[tuple[int, np.ndarray]], measures: Sequence[FrameMeasure]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """The frames without those that show the same as the one before; of a run of them, the sharpest stays."""
+    """Yield the frames without those that show the same as the one before; of a run of them, the sharpest stays."""
     best: tuple[int, np.ndarray] | None = None
     first: MotionPicture | None = None
     for number, picture in frames:
@@ -158,7 +158,7 @@ def _different(
 
 
 def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool, notify: Callable[[str], None]) -> bool:
-    """Whether `folder` holds already what is asked for.
+    """Return whether `folder` holds already what is asked for.
 
     Raises:
         UserError: it holds something else, and must not be replaced.
@@ -186,7 +186,7 @@ def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool,
 
 
 def _identity(path: Path) -> dict[str, Any]:
-    """What tells a video from others, wherever it lies."""
+    """Return what tells a video from others, wherever it lies."""
     size = path.stat().st_size
     digest = hashlib.sha256()
     with path.open("rb") as file:
@@ -197,7 +197,7 @@ def _identity(path: Path) -> dict[str, Any]:
 
 
 def _description(video: Video, request: dict[str, Any], *, total: int, frames: Sequence[VideoFrame]) -> dict[str, Any]:
-    """The content of frames.json."""
+    """Return the content of frames.json."""
     return {
         "request": request,
         "width": video.width,

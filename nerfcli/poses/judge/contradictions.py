@@ -44,7 +44,8 @@ class Contradiction:
 def leave_out_contradicting(
     model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]
 ) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
-    """The model without the photos that its strongest evidence contradicts, and why each was left out, by image id.
+    """Return the model without the photos that its strongest evidence contradicts, and why each was left out, by image
+    id.
 
     Photos are held together by their pairs. Where the strongest chain of pairs runs over one that contradicts the
     model, the smaller side may be anywhere. If all such sides together are few, they are left out; if they are many,
@@ -93,7 +94,7 @@ def strong_contradictions(model: pycolmap.Reconstruction, found: Sequence[Agreem
 
 
 def _spanning_tree(placed: Sequence[int], found: Sequence[Agreement]) -> list[Agreement]:
-    """The strongest pairs that hold all photos together, as few as can be."""
+    """Return the strongest pairs that hold all photos together, as few as can be."""
     taken: list[Agreement] = []
     chains = {photo: {photo} for photo in placed}
     for a in sorted(found, key=lambda a: -a.matches):

@@ -184,7 +184,7 @@ def _relative_distance(
 def _with_or_without_distortion(
     evidence: LensEvidence, free: list[str], found: Estimate, camera: pycolmap.Camera, steps: list[Step]
 ) -> tuple[list[str], Estimate]:
-    """The free parameters without k1, if it is neither sure nor harmless."""
+    """Return the free parameters without k1, if it is neither sure nor harmless."""
     distance = found.distance(["k1"]) / float(chi2.isf(_CHANCE, 1))
     if _is_harmless(evidence, found, camera) or distance > 1:
         return free, found
@@ -221,7 +221,9 @@ def _held(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
 def has_open_distortion(
     model: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int] = ()
 ) -> bool:
-    """Whether the one distortion term of a camera is neither sure nor harmless, its focal length being as it is."""
+    """Return whether the one distortion term of a camera is neither sure nor harmless, its focal length being as it
+    is.
+    """
     camera = model.cameras[camera_id]
     try:
         evidence = lens_evidence(model, camera_id, seed=seed, fixed=fixed)
@@ -249,7 +251,7 @@ def _model_name(free: Sequence[str]) -> str:
 
 
 def _camera(camera: pycolmap.Camera, found: Estimate, *, named: bool) -> pycolmap.Camera:
-    """A camera with the parameters that were found; those that were not free are as they were, or not there."""
+    """Return a camera with the parameters that were found; those that were not free are as they were, or not there."""
     name = camera.model.name if named else _model_name(found.names)
     values = dict(zip(found.names, found.values.tolist(), strict=True))
     new = pycolmap.Camera.create_from_model_name(

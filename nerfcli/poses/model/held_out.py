@@ -33,7 +33,7 @@ class HeldOutObservations:
 
 
 def split(model: pycolmap.Reconstruction, *, seed: int) -> tuple[pycolmap.Reconstruction, HeldOutObservations]:
-    """A copy of a model without every tenth observation, and these; at most one of each point.
+    """Return a copy of a model without every tenth observation, and these; at most one of each point.
 
     Points seen fewer than three times give none away. Of a large model the copy holds a part of the points.
     """
@@ -116,7 +116,9 @@ def adjust(
 
 
 def loss_scale_px(errors: Array) -> float:
-    """Where a robust adjustment begins to count observations less, from their errors (distances in the picture)."""
+    """Return where a robust adjustment begins to count observations less, from their errors (distances in the
+    picture).
+    """
     finite = errors[np.isfinite(errors)]
     if len(finite) == 0:
         return _LEAST_LOSS_PX

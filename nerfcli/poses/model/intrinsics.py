@@ -89,7 +89,7 @@ def choose_lenses(
     named: Sequence[int] = (),
     exif_focal_px: Mapping[int, float] | None = None,
 ) -> Lenses:
-    """The model with the lens models that it can hold, adjusted anew.
+    """Return the model with the lens models that it can hold, adjusted anew.
 
     Args:
         model: a converged model; it is not changed.
@@ -222,7 +222,9 @@ def _by_trials(
     fixed: Sequence[int],
     named: Sequence[int],
 ) -> tuple[bool, list[Candidate]]:
-    """Whether the principal point is free after trials with held-out observations, and these; sets the camera."""
+    """Return whether the principal point is free after trials with held-out observations, and these; sets the
+    camera.
+    """
     training, held = held_out.split(result, seed=seed)
     choice = _Choice(held, camera_id, threads=threads, fixed=fixed)
     best = choice.make(training, named=camera_id in named)
@@ -249,7 +251,9 @@ def settle(
 
 
 def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
-    """A camera of another COLMAP model that sees each ray at nearly the same pixel, the principal point unchanged."""
+    """Return a camera of another COLMAP model that sees each ray at nearly the same pixel, the principal point
+    unchanged.
+    """
     start = pycolmap.Camera.create_from_model_name(
         camera.camera_id, name, camera.mean_focal_length(), camera.width, camera.height
     )
@@ -302,7 +306,7 @@ class _Choice:
         self.tried: list[Candidate] = []
 
     def make(self, training: pycolmap.Reconstruction, *, named: bool) -> _Trial:
-        """The best trial.
+        """Return the best trial.
 
         The principal point comes before the tangential terms: both shift the picture, but a sensor off its axis is
         what cameras have, and it turns the poses.
@@ -359,7 +363,7 @@ class _Choice:
 
 
 def _gain(before: Array, after: Array) -> float:
-    """By how many standard errors the mean of paired errors fell."""
+    """Return by how many standard errors the mean of paired errors fell."""
     difference = before - after
     if len(difference) < 2 or difference.std() == 0:
         return 0.0

@@ -62,7 +62,7 @@ class LensEvidence:
     border_px: Array
 
     def estimate(self, names: Sequence[str]) -> "Estimate":
-        """The parameters `names` if they alone are free, the others being as they are.
+        """Estimate the parameters `names` if they alone are free, the others being as they are.
 
         Raises:
             UndeterminedError: the observations leave one of them open.
@@ -83,7 +83,7 @@ class LensEvidence:
         return Estimate(tuple(names), self.current[index] + change, change, tuple(covariances))
 
     def without(self, name: str) -> "LensEvidence":
-        """The evidence as it would be with a parameter at zero: what it explained is among the residuals."""
+        """Return the evidence as it would be with a parameter at zero: what it explained is among the residuals."""
         index = NAMES.index(name)
         value = self.current[index]
         scores = tuple(
@@ -110,11 +110,13 @@ class Estimate:
         return float(np.sqrt(max(covariance[index, index] for covariance in self.covariances)))
 
     def value(self, name: str) -> float:
-        """The value of a parameter."""
+        """Return the value of a parameter."""
         return float(self.values[self.names.index(name)])
 
     def distance(self, names: Sequence[str]) -> float:
-        """How far some parameters are from zero, squared and in units of their covariance; the least of all ways."""
+        """Return how far some parameters are from zero, squared and in units of their covariance; the least of all
+        ways.
+        """
         index = [self.names.index(name) for name in names]
         values = self.values[index]
         return float(
@@ -224,7 +226,7 @@ def _observations(model: pycolmap.Reconstruction, *, seed: int) -> _Seen:
 def _jacobians(
     model: pycolmap.Reconstruction, seen: _Seen, camera_id: int, *, others: list[int]
 ) -> tuple[Array, Array, Array, Array]:
-    """Pixels per unit of pose (n, 2, 6), point (n, 2, 3) and lenses (n, 2, 8 + 2 others); residuals (n, 2)."""
+    """Return pixels per unit of pose (n, 2, 6), point (n, 2, 3) and lenses (n, 2, 8 + 2 others); residuals (n, 2)."""
     count = len(seen.photos)
     poses, points = np.zeros((count, 2, 6)), np.zeros((count, 2, 3))
     lens, residuals = np.zeros((count, 2, len(NAMES) + 2 * len(others))), np.zeros((count, 2))

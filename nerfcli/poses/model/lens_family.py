@@ -30,7 +30,8 @@ _MAX_ERROR_PX = 4.0
 
 
 def as_fisheye(job: Job) -> Job | None:
-    """The job with cameras that start from a fisheye, where pairs of photos say so; None where none of them does.
+    """Return the job with cameras that start from a fisheye, where pairs of photos say so; None where none of them
+    does.
 
     Only cameras of which neither a file nor the user has said anything are asked.
     """
@@ -49,7 +50,9 @@ def _fisheye(group: CameraGroup, focal_px: float) -> CameraGroup:
 
 
 def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database) -> float | None:
-    """The focal length of the fisheye with which clearly more matches agree than without; None if there is none."""
+    """Return the focal length of the fisheye with which clearly more matches agree than without; None if there is
+    none.
+    """
     pairs = _strongest_pairs({job.image_ids[number] for number in group.photos}, database)
     if not pairs:
         return None
@@ -77,13 +80,13 @@ def _agreeing(
     pair: tuple[Array, Array],
     options: pycolmap.TwoViewGeometryOptions,
 ) -> int:
-    """How many of a pair's matches agree on one geometry."""
+    """Return how many of a pair's matches agree on one geometry."""
     matches = np.repeat(np.arange(len(pair[0]), dtype=np.uint32)[:, None], 2, axis=1)
     return len(estimate(camera, pair[0], camera, pair[1], matches=matches, options=options).inlier_matches)
 
 
 def _strongest_pairs(images: set[int], database: pycolmap.Database) -> list[tuple[Array, Array]]:
-    """Pixels (matches, 2) in both photos of the pairs with the most matches, each photo in one pair at the most.
+    """Return pixels (matches, 2) in both photos of the pairs with the most matches, each photo in one pair at the most.
 
     Of photos that were taken side by side all matches agree whatever the lens, so that a photo is asked once.
     """

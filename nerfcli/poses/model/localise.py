@@ -108,7 +108,8 @@ class _Placed:
 def localise(
     model: pycolmap.Reconstruction, job: Job, *, image_ids: Sequence[int]
 ) -> tuple[pycolmap.Reconstruction, list[Attempt]]:
-    """A copy of the model with those of the photos placed that its points tell the place of, adjusted; what was tried.
+    """Return a copy of the model with those of the photos placed that its points tell the place of, adjusted; what was
+    tried.
 
     Photos that a placed one makes possible are tried again, so that a chain of them is followed. One whose own matches
     with other photos, however few, contradict its place is not kept.
@@ -159,7 +160,7 @@ def left_out(model: pycolmap.Reconstruction, job: Job) -> list[int]:
 
 
 def shared_pairs(model: pycolmap.Reconstruction, image_ids: Sequence[int], *, min_matches: int) -> list[VerifiedPair]:
-    """The pairs of these photos with all others of a model, by the points that they both see."""
+    """Return the pairs of these photos with all others of a model, by the points that they both see."""
     pixels: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
     for image_id in image_ids:
         for seen in model.image(image_id).get_observation_points2D():
@@ -178,7 +179,7 @@ def shared_pairs(model: pycolmap.Reconstruction, image_ids: Sequence[int], *, mi
 
 
 def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[VerifiedPair]) -> str:
-    """What speaks against a photo's place after the adjustment, "" if nothing does."""
+    """Return what speaks against a photo's place after the adjustment, "" if nothing does."""
     observations = model.image(image_id).num_points3D
     if observations < _LEAST_KEPT * _LEAST_FOUND:
         return f"only {observations} of its points remain after the adjustment"
@@ -217,13 +218,13 @@ def _photo(model: pycolmap.Reconstruction, database: pycolmap.Database, image_id
 
 
 def _descriptors(database: pycolmap.Database, image_id: int) -> NDArray[np.float32]:
-    """Of length 1."""
+    """Return descriptors of length 1."""
     found = np.asarray(database.read_descriptors(image_id).data, dtype=np.float32)
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1.0)
 
 
 def _place(photo: _Photo, known: _Known, *, seed: int) -> tuple[_Placed | None, Attempt]:
-    """Where a photo was taken and what it sees, or None; and how that was found or why not."""
+    """Return where a photo was taken and what it sees, or None; and how that was found or why not."""
     features, points = _votes(photo, known)
     first = _pose(photo, known, features, points, seed=seed)
     agreeing = 0 if first is None else len(first.features)
@@ -278,7 +279,7 @@ def _votes(photo: _Photo, known: _Known) -> tuple[Indices, Indices]:
 
 
 def _pose(photo: _Photo, known: _Known, features: Indices, points: Indices, *, seed: int) -> _Placed | None:
-    """The pose that most of the features agree on, and which do."""
+    """Return the pose that most of the features agree on, and which do."""
     if len(features) < _LEAST_VOTES:
         return None
     options = pycolmap.AbsolutePoseEstimationOptions()
@@ -329,7 +330,7 @@ def _expected(
 
 
 def _steps() -> list[Array]:
-    """In eight directions to where no feature is expected, tolerances."""
+    """Return distances in eight directions to where no feature is expected, in tolerances."""
     angles = np.arange(8) * np.pi / 4
     return [_BESIDE[i % 2] * np.array([np.cos(angle), np.sin(angle)]) for i, angle in enumerate(angles)]
 
@@ -341,7 +342,7 @@ def _area(photo: _Photo, features: Indices) -> float:
 
 
 def _alike(one: _Placed, other: _Placed, known: _Known) -> bool:
-    """Whether two poses are the same but for noise."""
+    """Return whether two poses are the same but for noise."""
     turned = np.degrees((one.pose.rotation * other.pose.rotation.inverse()).angle())
     places = [np.asarray(placed.pose.inverse().translation) for placed in (one, other)]
     distance = np.median(np.linalg.norm(known.places[one.points] - places[0], axis=1))

@@ -47,7 +47,7 @@ def merge_models(
     threads: int,
     fixed: Sequence[int] = (),
 ) -> list[pycolmap.Reconstruction]:
-    """The models, largest first, each joined with the ones before where they have enough in common.
+    """Return the models, largest first, each joined with the ones before where they have enough in common.
 
     Of two models with the same photos, or one with some of the other's, the larger stays.
 
@@ -112,7 +112,9 @@ def common_points(
 
 
 def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) -> pycolmap.Sim3d | None:
-    """The similarity first_from_second that brings most common points to where the first's photos see them, or None."""
+    """Return the similarity first_from_second that brings most common points to where the first's photos see them, or
+    None.
+    """
     count = len(common.first)
     if count < _LEAST_COMMON:
         return None
@@ -155,7 +157,7 @@ def _joined(
     threads: int,
     fixed: Sequence[int],
 ) -> pycolmap.Reconstruction:
-    """All photos of both in the frame of the first; points found again from the matches of all, then adjusted."""
+    """Merge the photos of both in the frame of the first; points found again from the matches of all, then adjusted."""
     moved = pycolmap.Reconstruction(second)
     moved.transform(first_from_second)
     joined = pycolmap.Reconstruction(first)
@@ -189,7 +191,7 @@ def _joined(
 
 
 def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]) -> bool:
-    """Whether the matches between the old photos and the new ones agree with where they are now."""
+    """Return whether the matches between the old photos and the new ones agree with where they are now."""
     old = set(first.reg_image_ids())
     between = [pair for pair in pairs if (pair.one in old) != (pair.other in old)]
     found = agreements(joined, between)
@@ -198,7 +200,7 @@ def _holds(joined: pycolmap.Reconstruction, first: pycolmap.Reconstruction, pair
 
 
 def _matched_keypoints(database: pycolmap.Database) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """By pair of image ids, (matches, 2) numbers of the features that verified matches hold together."""
+    """Return by pair of image ids (matches, 2) numbers of the features that verified matches hold together."""
     pair_ids, counts = database.read_two_view_geometry_num_inliers()
     tracks = {}
     for pair_id, count in zip(pair_ids, counts, strict=True):

@@ -25,7 +25,7 @@ class Evidence:
 
 
 def reason(evidence: Evidence) -> str:
-    """One phrase: the first of the conditions that by itself explains that the photo was left out."""
+    """Return one phrase: the first of the conditions that by itself explains that the photo was left out."""
     if evidence.other_model_size:
         return f"in another model of {evidence.other_model_size} photos"
     if evidence.features < FEW_FEATURES:

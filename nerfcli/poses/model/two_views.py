@@ -59,7 +59,7 @@ class Agreement:
 
 
 def read_verified_pairs(database: pycolmap.Database, *, min_matches: int) -> list[VerifiedPair]:
-    """The pairs with at least `min_matches` verified matches, by image ids."""
+    """Read the pairs with at least `min_matches` verified matches, by image ids."""
     pair_ids, counts = database.read_two_view_geometry_num_inliers()
     keypoints: dict[int, Array] = {}
 
@@ -79,13 +79,13 @@ def read_verified_pairs(database: pycolmap.Database, *, min_matches: int) -> lis
 
 
 def placed_pairs(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[VerifiedPair]:
-    """The pairs of which a model places both photos."""
+    """Return the pairs of which a model places both photos."""
     placed = set(model.reg_image_ids())
     return [pair for pair in pairs if pair.one in placed and pair.other in placed]
 
 
 def agreements(model: pycolmap.Reconstruction, pairs: Iterable[VerifiedPair]) -> list[Agreement]:
-    """Each pair's matches against the model's poses and intrinsics; pairs without a finite ray are left out."""
+    """Return each pair's matches against the model's poses and intrinsics; pairs without a finite ray are left out."""
     found = []
     for pair in placed_pairs(model, pairs):
         first, second = model.image(pair.one), model.image(pair.other)
@@ -111,7 +111,8 @@ def rays(camera: pycolmap.Camera, pixels: Array) -> Array:
 
 
 def epipolar_angles(p: Array, q: Array, t: Array) -> Array:
-    """The angle, radians, by which the two rays of each match miss each other's epipolar plane, the larger of both.
+    """Return the angle, radians, by which the two rays of each match miss each other's epipolar plane, the larger of
+    both.
 
     p and q are in the same axes, t is the baseline in them; without a baseline it is the angle between the rays.
     """
@@ -165,7 +166,7 @@ def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair
 
 
 def strongest(pairs: Sequence[VerifiedPair], *, per_photo: int) -> list[VerifiedPair]:
-    """The pairs that are, for one of their photos, among the `per_photo` with the most matches."""
+    """Return the pairs that are, for one of their photos, among the `per_photo` with the most matches."""
     taken: dict[int, int] = {}
     kept = []
     for pair in sorted(pairs, key=lambda pair: (-pair.matches, pair.one, pair.other)):
@@ -182,7 +183,9 @@ def _angles(p: Array, q: Array) -> Array:
 
 
 def _in_front(p: Array, q: Array, t: Array) -> NDArray[np.bool_]:
-    """Whether rays a p + t and b q come nearest at positive a and b. True for parallel rays: they meet far away."""
+    """Return whether rays a p + t and b q come nearest at positive a and b. True for parallel rays: they meet far
+    away.
+    """
     cosine = np.einsum("ij,ij->i", p, q)
     along_p, along_q = p @ t, q @ t
     distance_p = cosine * along_q - along_p  # times 1 / (1 - cosine^2), which is positive

@@ -140,7 +140,7 @@ def _angles(geometry: ScanGeometry) -> np.ndarray | None:
 
 
 def _step(angles: np.ndarray) -> float:
-    """The usual angle between neighbours."""
+    """Return the usual angle between neighbours."""
     turned = np.sort(np.mod(angles, 2 * np.pi))
     gaps = np.diff(turned)
     gaps = gaps[gaps > 1e-9]
@@ -148,7 +148,7 @@ def _step(angles: np.ndarray) -> float:
 
 
 def _fan(geometry: ScanGeometry) -> float:
-    """The angle that the rays of a row open."""
+    """Return the angle that the rays of a row open."""
     if geometry.beam == "parallel":
         return 0.0
     _, directions = geometry.rays(np.array([0]))

@@ -96,7 +96,7 @@ def beam_hardening(sample: Sample) -> Finding | str:
 
 
 def _otsu(volume: np.ndarray) -> float:
-    """The threshold between two classes of values. Source: Otsu 1979, IEEE SMC 9(1)."""
+    """Return the threshold between two classes of values. Source: Otsu 1979, IEEE SMC 9(1)."""
     counts, edges = np.histogram(volume, bins=256)
     middles = (edges[:-1] + edges[1:]) / 2
     below = np.cumsum(counts)

@@ -33,7 +33,7 @@ def refuse_foreign(path: Path, source: Path) -> None:
 
 
 def scan_page_html(diagnosis: ScanDiagnosis, source: Path) -> str:
-    """The page's text."""
+    """Return the page's text."""
     order = sorted(diagnosis.findings, key=lambda finding: -VERDICTS.index(finding.verdict))
     sample = diagnosis.sample
     middle = sample.integrals.shape[1] // 2

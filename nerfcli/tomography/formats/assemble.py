@@ -109,7 +109,7 @@ def scan_of(found: Found, given: Given) -> Scan:
 
 
 def _checked(found: Found) -> np.ndarray:
-    """The values as float32, if they can be what they are said to be."""
+    """Return the values as float32, if they can be what they are said to be."""
     values = np.asarray(found.values, dtype=np.float32)
     if values.ndim != 3 or 0 in values.shape:
         raise UserError(
@@ -140,7 +140,7 @@ def _checked(found: Found) -> np.ndarray:
 
 
 def _in_millimetres(found: Found, given: Given) -> tuple[str, Circle | ScanGeometry]:
-    """The unit that lengths are in, and the geometry in it."""
+    """Return the unit that lengths are in, and the geometry in it."""
     if given.unit is None:
         return found.unit, found.geometry
     factor = MILLIMETRES.get(given.unit)
@@ -183,7 +183,7 @@ def axis_column(geometry: ScanGeometry) -> float:
 
 
 def _usable(found: Found, values: np.ndarray, notes: list[str]) -> tuple[np.ndarray, np.ndarray | None]:
-    """The values with neutral numbers where they are not finite, and which may be believed."""
+    """Return the values with neutral numbers where they are not finite, and which may be believed."""
     finite = np.isfinite(values)
     usable = None if found.beam is None or found.beam.usable.all() else found.beam.usable
     if usable is not None:

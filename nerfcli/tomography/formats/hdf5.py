@@ -29,7 +29,7 @@ _PROJECTION, _FLAT, _DARK = 0, 1, 2
 
 
 def read_data_exchange(path: Path, given: Given = Given()) -> Scan:
-    """A DataExchange file: exchange/data, data_white, data_dark and theta.
+    """Read a DataExchange file: exchange/data, data_white, data_dark and theta.
 
     Raises:
         UserError: it cannot be read, lacks something, or its parts do not fit together.
@@ -45,7 +45,7 @@ def read_data_exchange(path: Path, given: Given = Given()) -> Scan:
 
 
 def read_nxtomo(path: Path, given: Given = Given()) -> Scan:
-    """A NeXus file with an NXtomo entry: frames with an image_key (0 projections, 1 flats, 2 darks).
+    """Read a NeXus file with an NXtomo entry: frames with an image_key (0 projections, 1 flats, 2 darks).
 
     Raises:
         UserError: as for `read_data_exchange`.
@@ -84,7 +84,7 @@ def read_nxtomo(path: Path, given: Given = Given()) -> Scan:
 
 
 def hdf5_form(path: Path) -> str | None:
-    """ "data-exchange", "nxtomo", or None for other HDF5 files and what is none.
+    """Return "data-exchange", "nxtomo", or None for other HDF5 files and what is none.
 
     Raises:
         UserError: it has the name of an HDF5 file and cannot be opened.

@@ -19,7 +19,7 @@ _HINT = "expected a struct CtData with sinogram and parameters, as HelTomo write
 
 
 def read_heltomo(path: Path, given: Given = Given()) -> Scan:
-    """A .mat file with a struct of sinogram and parameters.
+    """Read a .mat file with a struct of sinogram and parameters.
 
     Raises:
         UserError: it cannot be read or is another .mat file.
@@ -71,7 +71,7 @@ def read_heltomo(path: Path, given: Given = Given()) -> Scan:
 
 
 def is_heltomo(path: Path) -> bool:
-    """Whether a .mat file holds such a struct."""
+    """Return whether a .mat file holds such a struct."""
     try:
         _struct(path)
     except UserError:

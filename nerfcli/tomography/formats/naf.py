@@ -55,7 +55,7 @@ def _latin(text: str, encoding: str = "latin1") -> bytes:
 
 
 def load_plain(path: Path) -> Any:
-    """The content of a pickle of arrays and plain containers; nothing in it is executed.
+    """Load the content of a pickle of arrays and plain containers; nothing in it is executed.
 
     Raises:
         UserError: it wants to run something, is damaged, or cannot be read.
@@ -76,7 +76,7 @@ def load_plain(path: Path) -> Any:
 
 
 def read_naf(path: Path, given: Given = Given()) -> Scan:
-    """A pickle with train and val projections; val is held out.
+    """Read a pickle with train and val projections; val is held out.
 
     Raises:
         UserError: see `load_plain`; or something is missing or does not fit together.
@@ -149,7 +149,7 @@ def _detector(
 
 
 def _truth(data: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Where the volume is that the projections were computed from, if it has cubic voxels."""
+    """Return where the volume is that the projections were computed from, if it has cubic voxels."""
     image = data.get("image")
     side = np.asarray(data.get("dVoxel", ()), dtype=np.float64).reshape(-1)
     if not isinstance(image, np.ndarray) or image.ndim != 3 or len(side) != 3 or np.ptp(side) > 1e-9 * side[0]:

@@ -23,7 +23,7 @@ _HINT = "a .xtekct file has SrcToObject, SrcToDetector, DetectorPixelsX, Detecto
 
 
 def read_nikon(path: Path, given: Given = Given()) -> Scan:
-    """A .xtekct file with its projections.
+    """Read a .xtekct file with its projections.
 
     Raises:
         UserError: it cannot be read, lacks something, or its projections are missing.

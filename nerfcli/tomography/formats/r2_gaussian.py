@@ -21,7 +21,7 @@ _HINT = "expected R2-Gaussian's meta_data.json: scanner, proj_train and proj_tes
 
 
 def read_r2_gaussian(path: Path, given: Given = Given()) -> Scan:
-    """A folder with meta_data.json, or that file; proj_test is held out.
+    """Read a folder with meta_data.json, or that file; proj_test is held out.
 
     Raises:
         UserError: it cannot be read, lacks something, or its parts do not fit together.
@@ -96,7 +96,7 @@ def _projection(file: Path, frame: dict[str, Any]) -> np.ndarray:
 
 
 def _truth(meta: Statement, scanner: Statement, file: Path) -> dict[str, Any]:
-    """Where the volume is, if it has cubic voxels."""
+    """Return where the volume is, if it has cubic voxels."""
     name = meta.value("vol", meta.value("ct"))
     if not isinstance(name, str) or not (file.parent / name).is_file():
         return {}

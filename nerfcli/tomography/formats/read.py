@@ -101,7 +101,7 @@ def _of_folder(path: Path) -> str | None:
 
 
 def _file_of(path: Path, form: str) -> Path:
-    """The file that describes the scan of a folder."""
+    """Return the file that describes the scan of a folder."""
     suffixes = {"nikon": nikon.SUFFIXES, "skyscan": skyscan.SUFFIXES}.get(form)
     return path if suffixes is None or path.is_file() else _with_suffix(path, suffixes)[0]
 
@@ -111,7 +111,7 @@ def _with_suffix(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def _has_transforms(folder: Path) -> bool:
-    """Whether the transforms of a folder are of transmissions; those of photos say nothing of a measurement."""
+    """Return whether the transforms of a folder are of transmissions; those of photos say nothing of a measurement."""
     file = folder / transmission_transforms.TRANSFORMS[0]
     if not file.is_file() or not (folder / transmission_transforms.NAME).is_file():
         return False

@@ -26,7 +26,7 @@ _PARALLEL = 1000.0
 
 
 def read_skyscan(path: Path, given: Given = Given()) -> Scan:
-    """A .log file with its projections.
+    """Read a .log file with its projections.
 
     Raises:
         UserError: it cannot be read, lacks something, or its projections are missing.
@@ -76,7 +76,7 @@ def read_skyscan(path: Path, given: Given = Given()) -> Scan:
 
 
 def _white(fields: Statement, values: np.ndarray, notes: list[str]) -> float:
-    """The value of the open beam."""
+    """Return the value of the open beam."""
     if "Reference Intensity" in fields:
         return fields.positive("Reference Intensity")
     depth = fields.number("Depth (bits)", 16 if float(values.max()) > 255 else 8)

@@ -51,7 +51,7 @@ _KEYS = (
 
 
 def read_stated_stack(path: Path, given: Given = Given()) -> Scan:
-    """A folder with scan.json, or that file.
+    """Read a folder with scan.json, or that file.
 
     Raises:
         UserError: it cannot be read, states something unknown, lacks something, or does not fit the pictures.
@@ -183,7 +183,7 @@ def _held_out(fields: Statement, views: int) -> list[int] | None:
 
 
 def _truth(fields: Statement, factor: float) -> dict[str, Any]:
-    """The true volume, attenuation in the inverse of the stated unit, with its middle at the origin."""
+    """Return the true volume, attenuation in the inverse of the stated unit, with its middle at the origin."""
     if "truth" not in fields:
         return {}
     given = fields.value("truth")

@@ -27,14 +27,14 @@ class Statement:
         return list(self._fields)
 
     def text(self, name: str, default: str | None = None) -> str:
-        """A field as it stands there."""
+        """Return a field as it stands there."""
         value = self._fields.get(name.lower(), default)
         if value is None:
             raise UserError(f"{self.path} has no {name}", self.hint)
         return str(value).strip()
 
     def number(self, name: str, default: float | None = None) -> float:
-        """A finite number; of a text, what it begins with."""
+        """Return a finite number; of a text, what it begins with."""
         if default is not None and name not in self:
             return default
         text = self.text(name)
@@ -44,14 +44,14 @@ class Statement:
         return float(found[0])
 
     def positive(self, name: str) -> float:
-        """A number above 0."""
+        """Return a number above 0."""
         value = self.number(name)
         if not (np.isfinite(value) and value > 0):
             raise UserError(f"{self.path}: {name} is {value:g}", "expected a number above 0")
         return value
 
     def whole(self, name: str) -> int:
-        """A count, above 0."""
+        """Return a count, above 0."""
         value = self.positive(name)
         if value != round(value):
             raise UserError(f"{self.path}: {name} is {value:g}", "expected a whole number")
@@ -63,7 +63,7 @@ class Statement:
 
 
 def read_lines(path: Path, *, hint: str) -> Statement:
-    """The "key = value" lines of a file in any 8-bit encoding; the first of equal keys counts.
+    """Read the "key = value" lines of a file in any 8-bit encoding; the first of equal keys counts.
 
     Raises:
         UserError: it cannot be read.
@@ -81,7 +81,7 @@ def read_lines(path: Path, *, hint: str) -> Statement:
 
 
 def read_object(path: Path, *, hint: str) -> Statement:
-    """A JSON object.
+    """Read a JSON object.
 
     Raises:
         UserError: it cannot be read or is something else.

@@ -27,7 +27,7 @@ _HINT = "expected geometry.json, transforms_train.json and transforms_test.json,
 
 
 def read_transmission_transforms(path: Path, given: Given = Given()) -> Scan:
-    """The folder, one of its JSON files, or a .npy in it with the projections in the order of their angles.
+    """Read the folder, one of its JSON files, or a .npy in it with the projections in the order of their angles.
 
     Raises:
         UserError: it cannot be read, lacks something, or its parts do not fit together.
@@ -112,7 +112,7 @@ def _pitch(stated: Statement) -> float:
 
 
 def _truth(folder: Path, stated: Statement) -> dict[str, Any]:
-    """Where the volume is that was measured, if it is there: 8-bit values, x fastest."""
+    """Return where the volume is that was measured, if it is there: 8-bit values, x fastest."""
     name = stated.value("volume")
     found = re.search(r"(\d+)x(\d+)x(\d+)_uint8", str(name))
     if not isinstance(name, str) or not found or not (folder / name).is_file() or "mu_per_unit_value" not in stated:
