@@ -19,9 +19,10 @@ from nerfcli.media.descriptions import depth_meta_of
 from nerfcli.media.exr import read_exr
 from nerfcli.media.float_tiff import read_tiff
 from nerfcli.media.images import read_image
+from nerfcli.runs.members import members_of
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.workflows.members import PHOTO_FRACTION, VARIED, member_settings, members_of
+from nerfcli.workflows.members import PHOTO_FRACTION, VARIED, member_settings
 
 QUICK = ("--steps", "1", "--downscale", "8", "--threads", "1", "--model", "default")
 

@@ -1,4 +1,4 @@
-"""The members of a run, RUN/members/1, 2, ...: further fields of the same scene whose differences show what varies."""
+"""Training and evaluation of the members of a run, RUN/members/1, 2, ...: further fields of the same scene."""
 
 from dataclasses import replace
 from typing import Any
@@ -14,19 +14,17 @@ from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.field.kinds import KINDS as FIELDS
 from nerfcli.render.pictures import render_picture
 from nerfcli.runs.files import MEMBERS, METRICS
+from nerfcli.runs.members import members_of
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 from nerfcli.workflows.train import train_again
 
 VARIED = ("seeds", "photos", "prior", "field")
-# Fewer have no standard deviation.
-FEWEST = 2
 # Of the training photos, what each member uses. A bootstrap draws 63 %, which costs each field more.
 PHOTO_FRACTION = 0.8
 # See `TrainSettings.random_start`; it costs 0.2 dB on the spheres, 0.3 would cost 1 dB.
 RANDOM_START = 0.1
-_VARIED_SETTINGS = ("seed", "photo_fraction", "random_start", "field", "device", "threads")
 
 
 def member_settings(first: TrainSettings, count: int, *, vary: str) -> list[TrainSettings]:
@@ -152,32 +150,3 @@ def evaluate_members(
     metrics = {"members": of_members, "mean_picture": of_mean, "checkpoints_sha256": checkpoints}
     write_json(path, metrics)
     return metrics
-
-
-def members_of(run: Run) -> list[Run]:
-    """Return the members of a run, at least `FEWEST`.
-
-    Raises:
-        UserError: there are too few complete ones, or they belong to another training than the run's.
-    """
-    folders = [path for path in (run.path / MEMBERS).glob("*") if path.name.isdigit()]
-    members = [Run(path) for path in sorted(folders, key=lambda path: int(path.name))]
-    hint = "train them: nerfcli train SCENE -o RUN --members 4, with the options of the run"
-    if len(members) < FEWEST:
-        raise UserError(f"{run.path} has {len(members)} members; {FEWEST} are needed at least", hint)
-    for member in members:
-        settings = member.config.settings
-        if not member.is_complete(settings):
-            raise UserError(f"the training of {member.path} was interrupted", hint)
-        if difference := _difference(settings, run.config.settings):
-            raise UserError(f"{member.path} belongs to another training than {run.path}: {difference}", hint)
-        if member.config.split_sha256 != run.config.split_sha256:
-            raise UserError(f"{member.path} has other held-out photos than {run.path}", hint)
-    return members
-
-
-def _difference(one: TrainSettings, other: TrainSettings) -> str | None:
-    """Return the first setting in which two trainings differ, of those that do not vary between members."""
-    there, wanted = one.to_json(), other.to_json()
-    names = [name for name in wanted if name not in _VARIED_SETTINGS and there[name] != wanted[name]]
-    return f"{names[0]} {there[names[0]]}, not {wanted[names[0]]}" if names else None

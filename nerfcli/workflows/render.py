@@ -12,9 +12,9 @@ from nerfcli.export.order import Order, refuse_foreign
 from nerfcli.export.settings import OUTPUTS, ExportSettings
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
+from nerfcli.runs.members import members_of
 from nerfcli.runs.run import Run
 from nerfcli.workflows.machine import device_name, thread_count
-from nerfcli.workflows.members import members_of
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 from nerfcli.workflows.photo_depths import depth_errors, photo_depths
 from nerfcli.workflows.views import Views, chosen_frames, refuse_z_all_around
