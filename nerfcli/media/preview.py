@@ -112,7 +112,7 @@ def _lines(meta: DepthMeta) -> tuple[str, ...]:
     """Return what the legend says of the values."""
     unit = {"arbitrary": "arbitrary units", "metre": "metres"}.get(meta.unit, meta.unit)
     if meta.quantity in UNIT_OF:
-        return meta.title, f"in {unit}; hatched: no surface"
+        return meta.title, f"in {unit}; hatched: no value"
     return f"{meta.title} in {unit}", f"{AXES[meta.axis]}; hatched: no value"
 
 
