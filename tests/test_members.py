@@ -135,7 +135,7 @@ def test_members_are_trained_into_the_run_and_kept(capture):
     assert [one.log[-1]["step"] for one in [Run(run), *members_of(Run(run))]] == [2, 2, 2]
     for arguments in (("info", run / "members" / "1"), ("evaluate", run / "members" / "1", "--threads", "1")):
         assert nerfcli(*arguments).exit_code == 0
-    # Another kind of member does not replace them without being told.
+    # Another kind of member replaces them only with --overwrite.
     result = nerfcli(*command[:-1], "seeds", "--steps", "2")
     assert result.exit_code == BAD_INPUT
     assert error_of(result)[0].endswith("members/1 exists")

@@ -397,9 +397,10 @@ def test_a_lost_context_is_told_and_comes_back(opened):
             "0 bytes, expected",
         ),
         (lambda text: text.replace('id="cuts"', 'id="cut"'), 'lacks "cuts"'),
+        (lambda text: text.replace("globalThis.DecompressionStream", "globalThis.Absent"), "lacks DecompressionStream"),
         (lambda text: re.sub(r'(id="scene">)', r"\1{", text), "not JSON"),
     ],
-    ids=["short", "letters", "empty", "missing", "json"],
+    ids=["short", "letters", "empty", "missing", "old browser", "json"],
 )
 def test_a_damaged_page_says_so(damage, told, browser, spheres_page, tmp_path):
     page = tmp_path / "damaged.html"

@@ -34,7 +34,7 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], Mapped]
     views = [*ring(10, [WIDE], seed=0, turn_deg=200), *ring(9, [WIDE], seed=1, at=FAR, turn_deg=180)]
     scene = synthetic.together(synthetic.boulder(800, seed=0), synthetic.boulder(800, seed=1, centre=FAR))
     synthetic.write_database(folder / "database.db", views, scene, noise=Noise(outliers=0.2), seed=0)
-    climbed = climb(synthetic.synthetic_job(folder, views, seed=0), lambda *told: None)
+    climbed = climb(synthetic.synthetic_job(folder, views, seed=0), lambda *progress: None)
     assert [sorted(model.reg_image_ids()) for model in climbed.models] == [FIRST, SECOND]
     return views, climbed
 
@@ -49,9 +49,9 @@ def misled(apart: tuple[list[View], Mapped], tmp_path: Path) -> Mapped:
 
 
 def choose(mapped: Mapped, component: int) -> tuple[Chosen, list[str]]:
-    told: list[str] = []
-    found = choose_component(mapped, lambda *progress: None, told.append, component=component, checks=Checks)
-    return found, told
+    notes: list[str] = []
+    found = choose_component(mapped, lambda *progress: None, notes.append, component=component, checks=Checks)
+    return found, notes
 
 
 def worst_rotation_deg(model: pycolmap.Reconstruction, views: list[View]) -> float:
@@ -73,9 +73,9 @@ def test_a_smaller_component_gets_a_second_chance_of_its_own(
     for name in failing:
         monkeypatch.setattr(second_chance, name, lambda *arguments: None)
     views, right = apart
-    found, told = choose(replace(misled, models=[right.models[0], misled.models[1]]), 2)
-    assert told[0] == "component 1 is checked first, as the others are numbered after it"
-    assert "mapping the photos of component 2 again, for at most 16 min" in told[1]
+    found, notes = choose(replace(misled, models=[right.models[0], misled.models[1]]), 2)
+    assert notes[0] == "component 1 is checked first, as the others are numbered after it"
+    assert "mapping the photos of component 2 again, for at most 16 min" in notes[1]
     assert found.examined.verdict.accepted
     assert found.examined.model is not None
     assert sorted(found.examined.model.reg_image_ids()) == SECOND
@@ -88,8 +88,8 @@ def test_a_smaller_component_gets_a_second_chance_of_its_own(
 def test_components_keep_the_numbers_that_were_reported(misled: Mapped):
     listed, _ = choose(misled, 1)
     assert [sorted(model.reg_image_ids()) for model in listed.mapped.models] == [FIRST, SECOND]
-    again, told = choose(misled, 2)
-    assert not any("component 1" in note for note in told)
+    again, notes = choose(misled, 2)
+    assert not any("component 1" in note for note in notes)
     assert [sorted(model.reg_image_ids()) for model in again.mapped.models] == [FIRST, SECOND]
     assert again.mapped.models[0].num_points3D() == listed.mapped.models[0].num_points3D()
 
@@ -103,7 +103,7 @@ def test_a_component_has_most_of_its_photos_for_itself(
     grown = synthetic.true_model(views)
     for image_id in range(taken + 1, 20):
         grown.deregister_frame(grown.image(image_id).frame_id)
-    accepted = examine(right.models[:1], right.job, lambda *told: None)
+    accepted = examine(right.models[:1], right.job, lambda *progress: None)
 
     def chance(mapped: Mapped, *arguments: object, **options: object) -> Chance:
         return Chance(replace(mapped, models=[grown]), accepted)

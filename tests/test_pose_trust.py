@@ -62,8 +62,8 @@ class Solved:
 def solve(folder: Path, views: Sequence[View], scene: Scene, noise: Noise = Noise(), **options) -> Solved:
     synthetic.write_database(folder / "database.db", views, scene, noise=noise, seed=0, **options)
     job = synthetic.synthetic_job(folder, views, seed=0)
-    climbed = climb(job, lambda *told: None)
-    examined = examine(climbed.models, climbed.job, lambda *told: None, localised=climbed.localised)
+    climbed = climb(job, lambda *progress: None)
+    examined = examine(climbed.models, climbed.job, lambda *progress: None, localised=climbed.localised)
     return Solved(views, job, climbed, examined)
 
 
@@ -137,15 +137,15 @@ def wrongly_mapped(solved: Solved, folder: Path) -> Mapped:
 def test_a_contradicted_model_is_mapped_again_from_its_sound_part(solved: Solved, tmp_path: Path):
     """Synthetic truth: the three photos that were off by 40 degrees come out within 0.4 degrees."""
     wrong = wrongly_mapped(solved, tmp_path / "again")
-    first = examine(wrong.models, wrong.job, lambda *told: None)
+    first = examine(wrong.models, wrong.job, lambda *progress: None)
     assert is_contradicted(first.verdict)
-    told: list[str] = []
-    chance = second_chance(wrong, first, lambda *progress: None, told.append, checks=Checks)
+    notes: list[str] = []
+    chance = second_chance(wrong, first, lambda *progress: None, notes.append, checks=Checks)
     assert chance.examined.verdict.accepted
     assert chance.examined.model is not None
     assert [attempt["models"] for attempt in chance.mapped.attempts] == [[10], [10]]
-    assert told[0].endswith("mapping again, for at most 33 min")
-    assert told[-1] == "from the largest consistent part: 10 of 10 photos registered, accepted"
+    assert notes[0].endswith("mapping again, for at most 33 min")
+    assert notes[-1] == "from the largest consistent part: 10 of 10 photos registered, accepted"
     truth = synthetic.true_model(solved.views)
     for image_id in range(2, 11):
         relative = [
@@ -161,7 +161,7 @@ def test_each_hypothesis_stands_in_for_the_one_before(
 ):
     """The first, the first two, or all that map again give nothing; the last one keeps what agrees with itself."""
     wrong = wrongly_mapped(solved, tmp_path / "again")
-    first = examine(wrong.models, wrong.job, lambda *told: None)
+    first = examine(wrong.models, wrong.job, lambda *progress: None)
     for name in ("_regrown", "_all_at_once", "_from_nothing")[:failing]:
         monkeypatch.setattr(chances, name, lambda *arguments: None)
     chance = second_chance(wrong, first, lambda *progress: None, lambda note: None, checks=Checks)
@@ -172,11 +172,11 @@ def test_each_hypothesis_stands_in_for_the_one_before(
 def test_a_second_chance_is_bounded_in_time(solved: Solved, tmp_path: Path):
     """Nothing is mapped again where the first mapping took no time; the sound part alone costs only its checks."""
     wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=0.0)
-    first = examine(wrong.models, wrong.job, lambda *told: None)
-    told: list[str] = []
-    chance = second_chance(wrong, first, lambda *progress: None, told.append, checks=Checks)
-    assert sum(note.startswith("skipped, would take too long") for note in told) == 4
-    assert "skipped, would take too long (0 s, with 0 s left): from scratch, with other initial pairs" in told
+    first = examine(wrong.models, wrong.job, lambda *progress: None)
+    notes: list[str] = []
+    chance = second_chance(wrong, first, lambda *progress: None, notes.append, checks=Checks)
+    assert sum(note.startswith("skipped, would take too long") for note in notes) == 4
+    assert "skipped, would take too long (0 s, with 0 s left): from scratch, with other initial pairs" in notes
     assert chance.examined.model is not None
     assert chance.examined.model.num_reg_images() == 7
 
@@ -186,7 +186,7 @@ def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
 ):
     """Of 200 s, the first two take 150: mapping from scratch, 100 s as the first time, does not fit; its part does."""
     wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=100.0)
-    first = examine(wrong.models, wrong.job, lambda *told: None)
+    first = examine(wrong.models, wrong.job, lambda *progress: None)
     now = [0.0]
 
     def late(*arguments) -> None:
@@ -195,10 +195,10 @@ def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
     monkeypatch.setattr(chances.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(chances, "_regrown", late)
     monkeypatch.setattr(chances, "_all_at_once", late)
-    told: list[str] = []
-    chance = second_chance(wrong, first, lambda *progress: None, told.append, checks=Checks)
-    assert "next: from the largest consistent part (about 30 s)" in told
-    assert "skipped, would take too long (2 min, with 50 s left): from scratch, with other initial pairs" in told
+    notes: list[str] = []
+    chance = second_chance(wrong, first, lambda *progress: None, notes.append, checks=Checks)
+    assert "next: from the largest consistent part (about 30 s)" in notes
+    assert "skipped, would take too long (2 min, with 50 s left): from scratch, with other initial pairs" in notes
     assert chance.mapped.attempts[-1]["what"] == "only the largest consistent part of the first model"
 
 
@@ -218,12 +218,12 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
 
     monkeypatch.setattr(ladder, "map_photos", without_two)
     monkeypatch.setattr(ladder, "_MANY_PHOTOS", 10)
-    told: list[str] = []
-    climbed = climb(job, lambda *progress: None, told.append)
+    notes: list[str] = []
+    climbed = climb(job, lambda *progress: None, notes.append)
     assert [attempt["what"] for attempt in climbed.attempts][:2] == ["default thresholds", "lower angles"]
     assert not any("start from" in attempt["what"] for attempt in climbed.attempts)
     # By the plan, 10 photos take 0.38 + 10 * 0.0025 s each.
-    assert "not trying other starts, which take about 4 s each: most photos are registered" in told
+    assert "not trying other starts, which take about 4 s each: most photos are registered" in notes
 
 
 def test_groups_hold_together_against_what_speaks_against_them():
@@ -306,7 +306,7 @@ def test_every_rung_is_written_down_with_its_result(tmp_path: Path):
 
 
 def test_a_photo_that_no_pair_holds_is_placed_by_what_the_model_knows(tmp_path: Path):
-    """It has no match with any photo; its place is right, and is told among the rungs."""
+    """It has no match with any photo; its place is right, and the rungs list it."""
     views = synthetic.ring(7, [WIDE], seed=0, turn_deg=140)
     weak = solve(tmp_path, views, synthetic.boulder(500, seed=0), pairs=lambda i, j: 3 not in (i, j))
     assert [(rung["what"], rung["models"]) for rung in weak.climbed.attempts] == [
@@ -326,7 +326,7 @@ def test_a_fisheye_of_which_nothing_is_known_is_recognised(tmp_path: Path):
     scene = synthetic.together(synthetic.boulder(250, seed=0), synthetic.room(300, seed=1))
     views = synthetic.ring(6, [UNKNOWN_FISHEYE], seed=0, radius=2.0, turn_deg=100)
     synthetic.write_database(tmp_path / "database.db", views, scene, noise=Noise(), seed=0)
-    climbed = climb(synthetic.synthetic_job(tmp_path, views, seed=0), lambda *told: None)
+    climbed = climb(synthetic.synthetic_job(tmp_path, views, seed=0), lambda *progress: None)
     assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "start from a fisheye lens"]
     assert climbed.models[0].num_reg_images() == 6
     (camera,) = climbed.models[0].cameras.values()
@@ -340,14 +340,14 @@ def test_a_focal_length_that_exif_tells_wrong_is_left_out(tmp_path: Path):
     synthetic.write_database(tmp_path / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
     job = synthetic.synthetic_job(tmp_path, views, seed=0)
     groups = tuple(replace(group, focal_px=6 * WIDE.params[0], focal_is_prior=True) for group in job.groups)
-    told: list[str] = []
+    notes: list[str] = []
     job = replace(job, groups=groups)
     register_photos(job)
-    match(job, job.pairs, lambda *told: None)
-    climbed = climb(job, lambda *told: None, told.append)
+    match(job, job.pairs, lambda *progress: None)
+    climbed = climb(job, lambda *progress: None, notes.append)
     assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "without EXIF's focal length"]
     assert climbed.attempts[0]["models"] == [] or max(climbed.attempts[0]["models"]) < 4
-    assert "next: without EXIF's focal length" in told
+    assert "next: without EXIF's focal length" in notes
     assert climbed.models[0].num_reg_images() == 8
     (camera,) = climbed.models[0].cameras.values()
     assert camera.mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.02)
@@ -376,15 +376,15 @@ def test_the_search_of_larger_pictures_is_worth_what_is_missing(
     for image_id in range(placed + 1, 11):
         model.deregister_frame(model.image(image_id).frame_id)
     searched: list[Job] = []
-    told: list[str] = []
+    notes: list[str] = []
     monkeypatch.setattr(ladder, "extract", lambda job, report: searched.append(job))
     for name in ("match", "start_matching"):
         monkeypatch.setattr(ladder, name, lambda *arguments: None)
     monkeypatch.setattr(ladder, "map_photos", lambda *arguments, **options: [model])
     monkeypatch.setattr(ladder, "localise", lambda model, job, **options: (model, []))
-    climb(job, lambda *told: None, told.append)
+    climb(job, lambda *progress: None, notes.append)
     assert [job.max_image_size for job in searched] == ([] if size is None else [size])
-    assert any(note.startswith(words) for note in told)
+    assert any(note.startswith(words) for note in notes)
 
 
 def test_pairs_of_perspective_photos_ask_for_no_fisheye(solved: Solved):

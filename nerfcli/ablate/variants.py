@@ -60,8 +60,8 @@ def variants(chosen: Components, capture: CaptureTraits, *, only: tuple[str, ...
 
 
 def _off(name: str, chosen: Components) -> Value:
-    """Return the value of a model without the component; what is behind the field is black where nothing else is
-    said.
+    """Return the value of a model without the component;
+    what is behind the field is black where nothing else is said.
     """
     if name == "background" and chosen.background in ("auto", "random"):
         return chosen.background

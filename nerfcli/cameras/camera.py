@@ -191,8 +191,8 @@ class Camera:
         return np.stack([by_x, by_y], axis=-1) * valid[:, None, None], valid
 
     def pixel_footprint(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the solid angle that a pixel covers, as large as at its centre: 1 / |a x b| with the rows of d pixel /
-        d d.
+        """Return the solid angle that a pixel covers, as large as at its centre:
+        1 / |a x b| with the rows of d pixel / d d.
 
         A cone of the same solid angle has the radius sqrt(footprint / pi) at distance 1.
 

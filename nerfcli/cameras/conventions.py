@@ -38,7 +38,7 @@ def opencv_from_llff_pose(world_from_llff_cam: np.ndarray) -> np.ndarray:
 
 
 def llff_from_opencv_pose(world_from_cam: np.ndarray) -> np.ndarray:
-    """Return the pose (..., 4, 4) whose columns are down, right, backward, centre, of `world_from_cam` with OpenCV
-    axes.
+    """Return the pose (..., 4, 4) whose columns are down, right, backward, centre,
+    of `world_from_cam` with OpenCV axes.
     """
     return world_from_cam @ OPENCV_FROM_LLFF

@@ -28,8 +28,8 @@ class Window:
 
 
 def sized(camera: Camera, width: int | None, height: int | None) -> Camera:
-    """Return the camera of the picture at another size; with one of the two given, the other follows the picture's
-    shape.
+    """Return the camera of the picture at another size;
+    with one of the two given, the other follows the picture's shape.
 
     Where the shape differs, the scaled picture covers the new one and is cut off evenly on two sides: scale
     s = max(W / w, H / h), and the principal point moves by (s w - W) / 2 and (s h - H) / 2.

@@ -114,8 +114,8 @@ def ellipse(
 def spiral(
     frames: Sequence[Frame], *, count: int, turns: int = 2, depth_hint: float | None = None
 ) -> tuple[Frame, ...]:
-    """Return a closed spiral about the mean camera, in the box that the cameras fill, looking at a point as deep as the
-    focus.
+    """Return a closed spiral about the mean camera, in the box that the cameras fill,
+    looking at a point as deep as the focus.
 
     For cameras that surround the scene, where the mean camera would stand amid it, the quarter of them
     nearest to the middle one is used.
@@ -156,8 +156,8 @@ def spiral(
 
 
 def interpolate(frames: Sequence[Frame], *, count: int) -> tuple[Frame, ...]:
-    """Return a smooth flight through the frames in their order, from the first to the last, at constant speed: see
-    `fly`.
+    """Return a smooth flight through the frames in their order, from the first to the last,
+    at constant speed: see `fly`.
 
     Raises:
         ValueError: no frame, or count below 1.
@@ -204,8 +204,8 @@ def _ellipse(azimuth: np.ndarray, distances: np.ndarray) -> Callable[[np.ndarray
 
 
 def _sway(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a small ellipse in azimuth and elevation about the focus, at the mean distance, within the cameras'
-    angles.
+    """Return a small ellipse in azimuth and elevation about the focus, at the mean distance,
+    within the cameras' angles.
     """
     towards = mean_direction(offsets / distances[:, None])
     # Azimuth and elevation are about `up`, unless the cameras look down so steeply that it is no axis.

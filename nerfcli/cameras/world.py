@@ -18,8 +18,8 @@ ORIGINS = ("centre-of-cameras", "focus")
 
 
 def transformed(capture: Capture, new_from_world: Similarity) -> Capture:
-    """Return the same capture in another world frame: poses and points are mapped, depths along the cameras' axes
-    scaled.
+    """Return the same capture in another world frame:
+    poses and points are mapped, depths along the cameras' axes scaled.
 
     Pictures, observations and cameras stay as they are, since a similarity changes no angle. The unit stays what it is
     under rotation and translation, and becomes "arbitrary" where lengths change.

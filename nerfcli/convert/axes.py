@@ -103,8 +103,8 @@ def expressed(capture: Capture, wanted: Convention, *, written_axes: str) -> Cap
 
 
 def reinterpreted_poses(world_from_cam: np.ndarray, meant: Convention, *, parsed_axes: str) -> np.ndarray:
-    """Return the poses (frames, 4, 4), OpenCV axes, that a file holds if it is meant in another convention than
-    parsed.
+    """Return the poses (frames, 4, 4), OpenCV axes,
+    that a file holds if it is meant in another convention than parsed.
     """
     in_file = world_from_cam @ opencv_from_axes(parsed_axes)
     if meant.inverted:

@@ -225,8 +225,8 @@ def _does_not_hold(path: Path, verification: Verification) -> UserError:
 
 
 def _loss_px(capture: Capture, left: Capture) -> float:
-    """Return how far apart a capture and what is left of it show the same points, at most, within the first one's
-    pictures.
+    """Return how far apart a capture and what is left of it show the same points, at most,
+    within the first one's pictures.
     """
     if all(one.camera == other.camera for one, other in zip(capture.frames, left.frames, strict=True)):
         return 0.0

@@ -143,8 +143,8 @@ def recording(form: Format, provenance: Mapping[str, Any]) -> Format:
 
 
 def with_photos(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with its photos looked up in another folder: under their names there, or under their file
-    names.
+    """Return the capture with its photos looked up in another folder:
+    under their names there, or under their file names.
     """
     frames = []
     for frame in capture.frames:
@@ -168,8 +168,8 @@ def _parse_scene(path: Path, given: Given) -> Capture:
 
 
 def _parse_model(path: Path, given: Given) -> Capture:
-    """Read a COLMAP model, with the photos where its names lead to one: below images/ beside it, or below its
-    project.
+    """Read a COLMAP model, with the photos where its names lead to one:
+    below images/ beside it, or below its project.
     """
     capture = parse_colmap(path)
     homes = (path, *path.resolve().parents[:3])

@@ -34,8 +34,8 @@ class FileLens:
 
 
 def project(lens: FileLens, points_cam: np.ndarray) -> np.ndarray:
-    """Return pixels (N, 2) of points (N, 3) in OpenCV camera axes; meaningless for points that the lens does not
-    see.
+    """Return pixels (N, 2) of points (N, 3) in OpenCV camera axes;
+    meaningless for points that the lens does not see.
     """
     if not len(points_cam):
         return np.zeros((0, 2))

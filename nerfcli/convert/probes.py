@@ -36,8 +36,8 @@ class Probes:
 
 
 def probes_of(capture: Capture) -> Probes:
-    """Return the capture's points that lie in front of its cameras and inside their pictures, and synthetic ones
-    besides.
+    """Return the capture's points that lie in front of its cameras and inside their pictures,
+    and synthetic ones besides.
 
     All pairs of a view and a point are tried, or `MOST_PAIRS` random ones, equally many for each view. The choice is
     the same at every call.

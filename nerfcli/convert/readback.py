@@ -314,8 +314,8 @@ def _views_from_world_from_cam(matrices: Any, axes: str) -> tuple[np.ndarray, np
 
 
 def _pointing(poses: np.ndarray, axes: str, along: str, against: str) -> np.ndarray:
-    """Return where in the world (views, 3) a direction of the camera points, of which the axes have it or its
-    opposite.
+    """Return where in the world (views, 3) a direction of the camera points,
+    of which the axes have it or its opposite.
     """
     if along in axes:
         return poses[:, :3, axes.index(along)]

@@ -192,8 +192,8 @@ def _size(capture: Capture) -> float:
 
 
 def _rounding_px(capture: Capture, probes: Probes) -> float:
-    """Return how far rounding alone may move a projection: by that of coordinates, seen from where the point is
-    nearest.
+    """Return how far rounding alone may move a projection:
+    by that of coordinates, seen from where the point is nearest.
     """
     if not len(probes.points):
         return 0.0

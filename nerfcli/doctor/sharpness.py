@@ -76,8 +76,8 @@ def measure(grey: np.ndarray) -> tuple[Sharpness, np.ndarray]:
 
 
 def _direction_ratio(fine: np.ndarray, coarse: np.ndarray, textured: np.ndarray) -> float:
-    """Return how much more the fine octave has kept of the coarse one's gradients in its best direction than in its
-    worst.
+    """Return how much more the fine octave has kept
+    of the coarse one's gradients in its best direction than in its worst.
 
     The square root of the ratio of the generalised eigenvalues of the two octaves' summed structure tensors: what the
     photo shows has its directions in both octaves alike, smear only in the fine one.

@@ -86,8 +86,8 @@ def surface_tracks(maps: Sequence[DepthMap]) -> Tracks:
 
 
 def _median_points(model: Model, frame: Frame, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (N, 3) at the median distances (N,) of pixels (N, 2), rendered at the size of the stereo
-    matching.
+    """Return the points (N, 3) at the median distances (N,) of pixels (N, 2),
+    rendered at the size of the stereo matching.
     """
     small = small_frame(frame, LONGER_SIDE_PX)
     picture = render_picture(model, small, background=model.background, depth=DepthRequest("median", "ray"))

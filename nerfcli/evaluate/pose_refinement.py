@@ -67,8 +67,8 @@ def align_pose(
     background: Background,
     log_gains: tuple[float, ...] = (0.0, 0.0, 0.0),
 ) -> RefinedPose | None:
-    """Return the pose at which the model comes closest to a photo, from the photo's own pose on; the model is not
-    changed.
+    """Return the pose at which the model comes closest to a photo, from the photo's own pose on;
+    the model is not changed.
 
     Levenberg-Marquardt on the squared error of 2048 random pixels, with derivatives by differences of renders. The six
     unknowns are counted in pixels: turns by one over the focal length, and moves that shift what is as far away as the

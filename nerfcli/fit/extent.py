@@ -64,8 +64,8 @@ class Extent:
 
 
 def lacks_depth(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -> bool:
-    """Return whether the scene gives no depth although these settings need it, so that points must be triangulated
-    first.
+    """Return whether the scene gives no depth although these settings need it,
+    so that points must be triangulated first.
 
     Args:
         scene: cameras, and points or depth bounds where it has them.

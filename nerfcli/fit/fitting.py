@@ -243,8 +243,8 @@ class Fitting:
 
     @torch.no_grad()
     def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
-        """Render pixels at the current step length: the model's and the photos' colours, both (N, 3) sRGB, alpha on
-        white.
+        """Render pixels at the current step length:
+        the model's and the photos' colours, both (N, 3) sRGB, alpha on white.
         """
         drawn = self.parts.refined(drawn)
         behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)

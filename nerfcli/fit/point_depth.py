@@ -135,7 +135,7 @@ def stereo_depths(dense: Sequence[DenseDepth], pool: PixelPool, training_from_sc
 
 
 def fading(fraction: float) -> float:
-    """Return the weight of the points at a fraction of the budget: 1 at the start, 0 from `LAST_SHARE` on, linear
-    between.
+    """Return the weight of the points at a fraction of the budget:
+    1 at the start, 0 from `LAST_SHARE` on, linear between.
     """
     return max(0.0, 1.0 - fraction / LAST_SHARE)

@@ -127,6 +127,7 @@ class Ranks(Alone):
 
 @contextmanager
 def lost_ranks_reported() -> Iterator[None]:
+    """Report a process that has ended, or does not answer, as a `UserError` with exit code `LOST_RANK`."""
     try:
         yield
     except RuntimeError as error:

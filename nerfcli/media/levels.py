@@ -21,8 +21,8 @@ MILLIMETRE = 1e-3
 
 
 def chosen_scale(largest: float, unit: str) -> float:
-    """Return the length of a level for a whole clip, in scene units: 1, 2 or 5 times a power of ten, the finest that
-    fits.
+    """Return the length of a level for a whole clip, in scene units:
+    1, 2 or 5 times a power of ten, the finest that fits.
 
     In metres it is never finer than a millimetre, so that files are in millimetres wherever that fits.
 

@@ -118,8 +118,8 @@ def read_ply_header(path: Path) -> tuple[dict[str, int], dict[str, str], list[st
 
 
 def read_ply_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the vertices (N, 3) and triangles (F, 3) int64 of a binary PLY whose faces hold nothing else than three
-    vertices.
+    """Read the vertices (N, 3) and triangles (F,
+    3) int64 of a binary PLY whose faces hold nothing else than three vertices.
 
     Raises:
         UserError: it is something else, or cut short.

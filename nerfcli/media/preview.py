@@ -46,8 +46,8 @@ def preview(depth: np.ndarray, meta: DepthMeta, *, lo: float, hi: float, colour_
 
 
 def coloured(depth: np.ndarray, *, lo: float, hi: float, colour_map: str) -> np.ndarray:
-    """Return the colours of `preview` without its legend, uint8 RGB (height, width, 3); arguments and errors as
-    there.
+    """Return the colours of `preview` without its legend, uint8 RGB (height, width, 3);
+    arguments and errors as there.
     """
     if not -math.inf < lo <= hi < math.inf:
         raise ValueError(f"lo <= hi must be finite, got {lo}, {hi}")

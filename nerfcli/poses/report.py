@@ -165,8 +165,8 @@ def _blur_summary(images: Iterable[ImageReport]) -> dict[str, Any] | None:
 
 
 def refusal(report: PosesReport, photos_dir: Path) -> UserError | None:
-    """Return why a result is refused, exit code 4: the contradicting evidence, or the most frequent reason of missing
-    photos.
+    """Return why a result is refused, exit code 4:
+    the contradicting evidence, or the most frequent reason of missing photos.
     """
     failures = report.verdict["failures"]
     # Who asks for a smaller model knows that it has few of the photos.

@@ -145,8 +145,8 @@ def plan_poses(
 def is_same_scene(
     scene_dir: Path, photos_dir: Path, settings: PoseSettings, *, given: GivenIntrinsics | None = None
 ) -> bool:
-    """Return whether `scene_dir` was made from the current photos in `photos_dir` with these settings, except
-    threads.
+    """Return whether `scene_dir` was made from the current photos in `photos_dir`
+    with these settings, except threads.
     """
     try:
         return _is_same(scene_dir, photos_dir, settings, given=given)

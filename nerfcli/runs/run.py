@@ -142,8 +142,8 @@ class Run:
         )
 
     def is_complete(self, settings: TrainSettings) -> bool:
-        """Return whether training reached the budget, by its last checkpoint: the log of a killed training is ahead of
-        it.
+        """Return whether training reached the budget, by its last checkpoint:
+        the log of a killed training is ahead of it.
         """
         if not self.is_trained:
             return False

@@ -140,8 +140,8 @@ def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bo
 
 
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
-    """Return the model with what photos tell before any training, where that is not decided; and the decisions about
-    it.
+    """Return the model with what photos tell before any training, where that is not decided;
+    and the decisions about it.
 
     Rays end at the points that photos share, and photos have the exposures that shared pixels tell. All of it is in
     the model from the first step on: later, light has ended elsewhere already.

@@ -121,8 +121,8 @@ class Row:
 
 
 def by_formula(rows: Sequence[Row]) -> list[Row]:
-    """Return one row for each textbook formula: where it is farthest beyond the bounds, in float32 if it has such
-    rows.
+    """Return one row for each textbook formula:
+    where it is farthest beyond the bounds, in float32 if it has such rows.
     """
     formulas: dict[str, list[Row]] = {}
     for row in rows:

@@ -103,8 +103,8 @@ def pixel_weights(view: DepthView, voxel_size: float) -> np.ndarray:
 
 
 def _blocks_near(views: Sequence[DepthView], grid: Grid) -> np.ndarray:
-    """Return which blocks come within the truncation of a surface, numbered in the order of memory; -1 for the
-    others.
+    """Return which blocks come within the truncation of a surface,
+    numbered in the order of memory; -1 for the others.
     """
     counts = tuple(-(-length // SIDE) for length in grid.shape)
     near = np.zeros(counts, dtype=bool)
@@ -185,8 +185,8 @@ def _sampled(maps: Tensor, places: Tensor, mode: str) -> Tensor:
 
 
 def _may_see(params: tuple[float, ...], size: tuple[int, int], middles: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Return whether blocks with middles (3, N) in the camera's axes may be in the picture: their balls against its
-    sides.
+    """Return whether blocks with middles (3, N) in the camera's axes may be in the picture:
+    their balls against its sides.
     """
     fx, fy, cx, cy = params
     radius = np.sqrt(3.0) * SIDE / 2 * voxel_size

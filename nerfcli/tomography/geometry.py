@@ -66,8 +66,8 @@ class ScanGeometry:
         )
 
     def binned(self, factor: int) -> "ScanGeometry":
-        """Return the detector with pixels `factor` times as large; pixels that fill no larger one are cut off at the
-        end.
+        """Return the detector with pixels `factor` times as large;
+        pixels that fill no larger one are cut off at the end.
 
         Rows are kept as they are where there are fewer of them than `factor`.
         """
@@ -86,8 +86,8 @@ class ScanGeometry:
         )
 
     def shifted(self, columns: float, rows: float = 0.0) -> "ScanGeometry":
-        """Return the detector moved by some pixels along its rows and columns, as a wrong centre of rotation moves
-        it.
+        """Return the detector moved by some pixels along its rows and columns,
+        as a wrong centre of rotation moves it.
         """
         return replace(self, centre=self.centre + columns * self.column_step + rows * self.row_step)
 

@@ -74,8 +74,8 @@ def grid_of_scan(geometry: ScanGeometry, size: float | None = None) -> VoxelGrid
 
 
 def layers_of_rays(grid: VoxelGrid, geometry: ScanGeometry) -> VoxelGrid:
-    """Return the layers of a grid that the rays of a scan pass, for a detector of fewer rows than the grid was made
-    for.
+    """Return the layers of a grid that the rays of a scan pass,
+    for a detector of fewer rows than the grid was made for.
     """
     origins, directions = geometry.rays()
     across = np.linalg.norm(directions[..., :2], axis=-1)

@@ -240,8 +240,8 @@ def _run(
 
 
 def _share(settings: TrainSettings, step: int, totals: Totals) -> float:
-    """Return how much of the budget is used: the larger of the shares of time, that of the search aside, and of
-    steps.
+    """Return how much of the budget is used:
+    the larger of the shares of time, that of the search aside, and of steps.
     """
     left = settings.budget_seconds - totals.searched if settings.budget_seconds else 0.0
     by_time = (totals.seconds - totals.searched) / left if left > 0 else 0.0

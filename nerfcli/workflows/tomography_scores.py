@@ -158,8 +158,8 @@ def corrected(geometry: ScanGeometry, result: Reconstruction) -> ScanGeometry:
 
 
 def _held_out_air(scan: Scan, result: Reconstruction) -> np.ndarray | None:
-    """Return the factor on the open beam of each held-out view, from its own pixels beside the object, as
-    everywhere.
+    """Return the factor on the open beam of each held-out view,
+    from its own pixels beside the object, as everywhere.
     """
     if result.used.get("air") is None:
         return None

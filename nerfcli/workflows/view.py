@@ -272,8 +272,8 @@ def _refusal(model: "Model") -> str | None:
 
 
 def _box(model: "Model", frames: Any, *, trained: bool) -> tuple[float, ...]:
-    """Return the box around what the photos are about; of a field in training, the cube around the training frame's
-    ball.
+    """Return the box around what the photos are about;
+    of a field in training, the cube around the training frame's ball.
     """
     import numpy as np
 

@@ -272,8 +272,8 @@ def _observations(arrays: _Arrays, num_frames: int, *, num_points: int) -> Obser
 
 
 def _relative(path: Path | None, folder: Path) -> str:
-    """Return a path as seen from a folder, with forward slashes, or empty; absolute where there is none (another
-    drive).
+    """Return a path as seen from a folder, with forward slashes, or empty;
+    absolute where there is none (another drive).
     """
     if path is None:
         return ""

@@ -111,8 +111,8 @@ def write_opensfm(capture: Capture, path: Path) -> None:
 
 
 def _lost_of(camera: Camera) -> list[str]:
-    """Return the distortion terms of a camera that OpenSfM has no key for, or its model where there is nothing like
-    it.
+    """Return the distortion terms of a camera that OpenSfM has no key for,
+    or its model where there is nothing like it.
     """
     if camera.model in _NO_WORDS:
         return [f"the {camera.model} lens"]

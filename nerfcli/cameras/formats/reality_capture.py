@@ -71,8 +71,8 @@ def parse_reality_capture(path: Path, measure: Measure, *, images: Path | None =
 
 
 def _table(path: Path) -> tuple[list[str], np.ndarray, list[str]]:
-    """Return the images' names, their numbers (images, 15) in the order of `_NUMBERS`, and the place in the file of
-    each.
+    """Return the images' names, their numbers (images, 15) in the order of `_NUMBERS`,
+    and the place in the file of each.
     """
     lines = read_text(path, _EXPECTED).splitlines()
     start = next((index for index, line in enumerate(lines) if line.lower().startswith(("#name,", "name,"))), None)

@@ -238,8 +238,8 @@ def listed_frames(
 
 
 def relative_path(frame: Frame, folder: Path) -> str:
-    """Return a frame's image as seen from a folder, with forward slashes; its name where the image's place is not
-    known.
+    """Return a frame's image as seen from a folder, with forward slashes;
+    its name where the image's place is not known.
     """
     return frame.name if frame.image is None else _seen_from(folder, frame.image)
 
@@ -285,8 +285,8 @@ def _listed_path(record: dict[str, Any], where: str) -> str:
 
 
 def _name_of(listed: str, where: str, *, suffix: str = "") -> str:
-    """Return a name with forward slashes and without "./"; of an absolute path, which is one machine's, the file
-    name.
+    """Return a name with forward slashes and without "./";
+    of an absolute path, which is one machine's, the file name.
     """
     pure = PurePosixPath(listed.replace("\\", "/"))
     if pure.is_absolute() or ":" in str(pure).split("/")[0]:

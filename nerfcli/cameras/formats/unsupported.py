@@ -54,8 +54,8 @@ def distortion(camera: Camera) -> dict[str, float]:
 
 
 def projection(camera: Camera) -> str:
-    """Return the projection of a model without its distortion: "perspective", "fisheye" (equidistant) or
-    "spherical".
+    """Return the projection of a model without its distortion:
+    "perspective", "fisheye" (equidistant) or "spherical".
     """
     return "spherical" if camera.is_spherical else "fisheye" if "FISHEYE" in camera.model else "perspective"
 

@@ -225,8 +225,8 @@ class _HashEncode(torch.autograd.Function):
 
 
 def can_hash_encode(points: Tensor, table: Tensor, resolutions: tuple[int, ...]) -> bool:
-    """Return whether this module's `hash_encode` supports these tensors; malformed ones go to the reference's
-    checks.
+    """Return whether this module's `hash_encode` supports these tensors;
+    malformed ones go to the reference's checks.
     """
     rows, features = table.shape[1:]
     return (

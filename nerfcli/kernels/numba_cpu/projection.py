@@ -20,8 +20,8 @@ SLAB = 16
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _enter(start: Any, slope: Any, count: Any, low: Any, high: Any) -> tuple[Any, Any]:
-    """Return the planes between `low` and `high` at which start + plane * slope is above -1 and below count, or all but
-    so.
+    """Return the planes between `low` and `high` at
+    which start + plane * slope is above -1 and below count, or all but so.
     """
     if slope == 0.0:
         if start <= -1.0 or start >= count:

@@ -65,8 +65,8 @@ def _cells(builder: Any, coordinates: list[Any], side: Any) -> Any:
 
 
 def _steps(cube_of: Callable[[Any, list[Any]], list[Any]]) -> Any:
-    """Return an intrinsic: (origins, directions, ray, edges, shift, first, side, places, cells), with arrays that are
-    flat.
+    """Return an intrinsic: (origins, directions, ray, edges, shift, first, side, places, cells),
+    with arrays that are flat.
 
     Edge k of the ray is edges[k] + shift * (edges[k + 1] - edges[k]). Writes the coordinates of the middles of 16
     intervals from number `first` on to places[axis * 16 + i], and their cells in a grid of `side` to cells[i].

@@ -98,8 +98,8 @@ def new_round() -> Any:
 
 @numba.njit(inline="always")
 def block_reach(side: Any, contraction: Any) -> Any:
-    """Return the longest interval of which `_may_hold_something` knows where it goes: a block is BLOCK_SIDE / side
-    wide.
+    """Return the longest interval of which `_may_hold_something` knows where it goes:
+    a block is BLOCK_SIDE / side wide.
     """
     return np.float32(BLOCK_SIDE / side * (4.0 if contraction == 0 else 7.8))
 

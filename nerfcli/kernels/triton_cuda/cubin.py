@@ -134,8 +134,8 @@ def folder() -> Path:
 
 
 def _formats(ptx: str, types: tuple[str, ...]) -> str:
-    """Return the parameters of the only entry, which are the arguments and at most `_MOST_EXTRA` pointers behind
-    them.
+    """Return the parameters of the only entry,
+    which are the arguments and at most `_MOST_EXTRA` pointers behind them.
     """
     entry = re.search(r"\.entry\s+\w+\s*\((.*?)\)", ptx, re.DOTALL)
     found = re.findall(r"\.param\s+\.(\w+)", entry[1]) if entry else []

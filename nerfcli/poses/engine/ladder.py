@@ -160,8 +160,8 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     still left out, the next ones start from a pair with a smaller baseline, from the strongest pair that was left out,
     and with low angles; of many photos, only if a quarter is left out. Then all pairs are compared that were not, and
     more features are sought in the photos' full size. Last, single photos are placed by the points that they show (see
-    `localise`). Where the camera only turned, nothing more is tried. If the first attempt is not the last, `tell` is
-    told each attempt and its result.
+    `localise`). Where the camera only turned, nothing more is tried. If the first attempt is not the last, `tell`
+    receives each attempt and its result.
     """
     ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, MapperOptions())

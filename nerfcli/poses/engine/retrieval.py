@@ -30,8 +30,8 @@ _VERSION = "256 coarsest"
 
 
 def with_neighbours(job: Job, report: Report) -> Job:
-    """Return the job with its pairs complete: each photo's look-alikes are among them. A complete stage is not done
-    again.
+    """Return the job with its pairs complete:
+    each photo's look-alikes are among them. A complete stage is not done again.
     """
     if job.neighbours == 0:
         return job
@@ -75,8 +75,8 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
 
 
 def alike(likeness: np.ndarray, count: int, *, known: Collection[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, sorted: for each photo the `count` most similar ones that are not in `known` with
-    it.
+    """Return pairs (i, j), i < j, sorted:
+    for each photo the `count` most similar ones that are not in `known` with it.
     """
     likeness = likeness.astype(np.float64)
     np.fill_diagonal(likeness, -np.inf)

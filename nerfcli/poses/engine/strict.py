@@ -37,8 +37,8 @@ class Placed:
 
 
 def held_out_last(job: Job) -> Job:
-    """Return the job with cameras that took only held-out photos behind the others, so that the others keep their
-    numbers.
+    """Return the job with cameras that took only held-out photos behind the others,
+    so that the others keep their numbers.
     """
     held_out = frozenset(job.held_out)
     return replace(job, groups=tuple(sorted(job.groups, key=lambda group: held_out.issuperset(group.photos))))
@@ -118,8 +118,8 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
 
 
 def fingerprint(model: pycolmap.Reconstruction, *, without: frozenset[str] = frozenset()) -> str:
-    """Return a hash of every bit of cameras, points with their tracks, and poses of the images that are not in
-    `without`.
+    """Return a hash of every bit of cameras, points with their tracks,
+    and poses of the images that are not in `without`.
     """
     cameras = [(number, camera.model.name, _bits(camera.params)) for number, camera in sorted(model.cameras.items())]
     points = [
@@ -172,8 +172,8 @@ def _place(model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[t
 def _seen_points(
     model: pycolmap.Reconstruction, job: Job, number: int, pairs: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (N, 2) of a photo and the points (N, 3) that its verified matches with placed photos say are
-    there.
+    """Return pixels (N, 2) of a photo and the points (N,
+    3) that its verified matches with placed photos say are there.
     """
     image_id = job.image_ids[number]
     seen: set[tuple[int, int]] = set()  # feature of the photo, point

@@ -66,8 +66,8 @@ def scene_masks(job: Job) -> Path:
 
 
 def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
-    """Return the job with the masks that an earlier call found, and what is to be reported; None if that is to be done
-    anew.
+    """Return the job with the masks that an earlier call found, and what is to be reported;
+    None if that is to be done anew.
 
     Masks that the user gave are not doubted.
     """
@@ -94,8 +94,8 @@ def recalled(job: Job) -> tuple[Job, dict[str, Any] | None] | None:
 
 
 def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[str, Any] | None]:
-    """Return the job with masks of the object, if one turns before a still background; and what is to be reported of
-    it.
+    """Return the job with masks of the object, if one turns before a still background;
+    and what is to be reported of it.
 
     Args:
         job: its photos get masks.

@@ -63,8 +63,8 @@ class MotionPicture:
         self._corners: np.ndarray | None = None
 
     def moved_to(self, other: "MotionPicture") -> float:
-        """Return the displacement of at least half of the corners to another frame, as a fraction of the longer
-        side.
+        """Return the displacement of at least half of the corners to another frame,
+        as a fraction of the longer side.
         """
         if self._corners is None:
             found = cv2.goodFeaturesToTrack(self._grey, maxCorners=200, qualityLevel=0.01, minDistance=8)

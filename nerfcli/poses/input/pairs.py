@@ -112,8 +112,8 @@ def looked_at_features(photos: int) -> int:
 
 
 def in_blocks(pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """Return the pairs in an order in which few photos are in use at a time, since the matcher keeps what it used
-    last.
+    """Return the pairs in an order in which few photos are in use at a time,
+    since the matcher keeps what it used last.
     """
     block = 16
     return tuple(sorted(pairs, key=lambda pair: (pair[0] // block, pair[1] // block, pair)))

@@ -93,8 +93,8 @@ def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
 
 
 def _same_as(focal: float | None, focals: list[float]) -> float | None:
-    """Return the first of the focal lengths so far that is the same as this one; if there is none, this one joins
-    them.
+    """Return the first of the focal lengths so far that is the same as this one;
+    if there is none, this one joins them.
     """
     if focal is None:
         return None

@@ -88,8 +88,8 @@ def background(pictures: Sequence[np.ndarray], places: np.ndarray) -> Background
 
 
 def differs(picture: np.ndarray, behind: Background) -> np.ndarray:
-    """Return where a picture (h, w, 3) shows something else than the background, (h, w) bool: the object, a little
-    wider.
+    """Return where a picture (h, w, 3) shows something else than the background, (h, w) bool:
+    the object, a little wider.
     """
     raw = ((cv2.medianBlur(_distances(picture, behind), 5) > 1) | behind.covered).astype(np.uint8)
     raw = cv2.morphologyEx(raw, cv2.MORPH_OPEN, _disc(1))

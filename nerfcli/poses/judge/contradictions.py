@@ -44,8 +44,8 @@ class Contradiction:
 def leave_out_contradicting(
     model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair]
 ) -> tuple[pycolmap.Reconstruction, dict[int, str]]:
-    """Return the model without the photos that its strongest evidence contradicts, and why each was left out, by image
-    id.
+    """Return the model without the photos that its strongest evidence contradicts,
+    and why each was left out, by image id.
 
     Photos are held together by their pairs. Where the strongest chain of pairs runs over one that contradicts the
     model, the smaller side may be anywhere. If all such sides together are few, they are left out; if they are many,

@@ -221,8 +221,8 @@ def _held(camera: pycolmap.Camera, focal_px: float) -> pycolmap.Camera:
 def has_open_distortion(
     model: pycolmap.Reconstruction, camera_id: int, *, seed: int, fixed: Sequence[int] = ()
 ) -> bool:
-    """Return whether the one distortion term of a camera is neither sure nor harmless, its focal length being as it
-    is.
+    """Return whether the one distortion term of a camera is neither sure nor harmless,
+    its focal length being as it is.
     """
     camera = model.cameras[camera_id]
     try:

@@ -116,8 +116,8 @@ def adjust(
 
 
 def loss_scale_px(errors: Array) -> float:
-    """Return where a robust adjustment begins to count observations less, from their errors (distances in the
-    picture).
+    """Return where a robust adjustment begins to count observations less,
+    from their errors (distances in the picture).
     """
     finite = errors[np.isfinite(errors)]
     if len(finite) == 0:

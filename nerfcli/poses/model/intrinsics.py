@@ -222,8 +222,8 @@ def _by_trials(
     fixed: Sequence[int],
     named: Sequence[int],
 ) -> tuple[bool, list[Candidate]]:
-    """Return whether the principal point is free after trials with held-out observations, and these; sets the
-    camera.
+    """Return whether the principal point is free after trials with held-out observations,
+    and these; sets the camera.
     """
     training, held = held_out.split(result, seed=seed)
     choice = _Choice(held, camera_id, threads=threads, fixed=fixed)
@@ -251,8 +251,8 @@ def settle(
 
 
 def converted(camera: pycolmap.Camera, name: str) -> pycolmap.Camera:
-    """Return a camera of another COLMAP model that sees each ray at nearly the same pixel, the principal point
-    unchanged.
+    """Return a camera of another COLMAP model that sees each ray at nearly the same pixel,
+    the principal point unchanged.
     """
     start = pycolmap.Camera.create_from_model_name(
         camera.camera_id, name, camera.mean_focal_length(), camera.width, camera.height

@@ -114,8 +114,8 @@ class Estimate:
         return float(self.values[self.names.index(name)])
 
     def distance(self, names: Sequence[str]) -> float:
-        """Return how far some parameters are from zero, squared and in units of their covariance; the least of all
-        ways.
+        """Return how far some parameters are from zero,
+        squared and in units of their covariance; the least of all ways.
         """
         index = [self.names.index(name) for name in names]
         values = self.values[index]

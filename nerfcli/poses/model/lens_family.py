@@ -30,8 +30,8 @@ _MAX_ERROR_PX = 4.0
 
 
 def as_fisheye(job: Job) -> Job | None:
-    """Return the job with cameras that start from a fisheye, where pairs of photos say so; None where none of them
-    does.
+    """Return the job with cameras that start from a fisheye, where pairs of photos say so;
+    None where none of them does.
 
     Only cameras of which neither a file nor the user has said anything are asked.
     """
@@ -50,8 +50,8 @@ def _fisheye(group: CameraGroup, focal_px: float) -> CameraGroup:
 
 
 def _fisheye_focal_px(group: CameraGroup, job: Job, database: pycolmap.Database) -> float | None:
-    """Return the focal length of the fisheye with which clearly more matches agree than without; None if there is
-    none.
+    """Return the focal length of the fisheye with
+    which clearly more matches agree than without; None if there is none.
     """
     pairs = _strongest_pairs({job.image_ids[number] for number in group.photos}, database)
     if not pairs:

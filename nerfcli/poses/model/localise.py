@@ -108,8 +108,8 @@ class _Placed:
 def localise(
     model: pycolmap.Reconstruction, job: Job, *, image_ids: Sequence[int]
 ) -> tuple[pycolmap.Reconstruction, list[Attempt]]:
-    """Return a copy of the model with those of the photos placed that its points tell the place of, adjusted; what was
-    tried.
+    """Return a copy of the model with those of the photos placed that its points tell the place of,
+    adjusted; what was tried.
 
     Photos that a placed one makes possible are tried again, so that a chain of them is followed. One whose own matches
     with other photos, however few, contradict its place is not kept.

@@ -112,8 +112,8 @@ def common_points(
 
 
 def align(first: pycolmap.Reconstruction, common: CommonPoints, *, seed: int) -> pycolmap.Sim3d | None:
-    """Return the similarity first_from_second that brings most common points to where the first's photos see them, or
-    None.
+    """Return the similarity first_from_second that brings most common points to
+    where the first's photos see them, or None.
     """
     count = len(common.first)
     if count < _LEAST_COMMON:

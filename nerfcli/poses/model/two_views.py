@@ -111,8 +111,8 @@ def rays(camera: pycolmap.Camera, pixels: Array) -> Array:
 
 
 def epipolar_angles(p: Array, q: Array, t: Array) -> Array:
-    """Return the angle, radians, by which the two rays of each match miss each other's epipolar plane, the larger of
-    both.
+    """Return the angle, radians, by
+    which the two rays of each match miss each other's epipolar plane, the larger of both.
 
     p and q are in the same axes, t is the baseline in them; without a baseline it is the angle between the rays.
     """
@@ -183,8 +183,8 @@ def _angles(p: Array, q: Array) -> Array:
 
 
 def _in_front(p: Array, q: Array, t: Array) -> NDArray[np.bool_]:
-    """Return whether rays a p + t and b q come nearest at positive a and b. True for parallel rays: they meet far
-    away.
+    """Return whether rays a p + t and b q come nearest at positive a
+    and b. True for parallel rays: they meet far away.
     """
     cosine = np.einsum("ij,ij->i", p, q)
     along_p, along_q = p @ t, q @ t
