@@ -60,7 +60,7 @@ def estimate_poses(
         notify: told what the user should know, one sentence at a time.
         progress: told (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few features,
             "features" (per photo, of those that were asked for), "pair" where look-alikes are sought, "match",
-            "map" and "check", in this order.
+            "map", "merge" where the mapper leaves several models, and "check", in this order.
         limits: see `Limits`.
         planned: told the plan before the long work starts.
         given: intrinsics that are known beforehand.

@@ -24,6 +24,7 @@ _STAGES = {
     "pair": "choosing pairs",
     "match": "matching photos",
     "map": "placing photos",
+    "merge": "merging sub-models",
     "check": "checking the poses",
 }
 _GO_ON = "completed work is kept; run the same command again to continue"
