@@ -54,11 +54,11 @@ def run_worker(
     Args:
         job_path: the job's JSON file; the worker's log is written beside it.
         threads: for OpenMP inside pycolmap, -1 for all.
-        progress: told (stage, done, total).
+        progress: receives (stage, done, total).
         limits: the worker is ended when it goes beyond one of them.
         since: the time of `time.monotonic` from which the limit of time counts; None for now.
         lock: a descriptor that the worker inherits.
-        notify: told what the user should know, one sentence at a time.
+        notify: receives messages for the user, one sentence at a time.
 
     Raises:
         WorkerDiedError: the worker died; the text says while doing what, and its last words.
