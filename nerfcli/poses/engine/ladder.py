@@ -63,7 +63,7 @@ class _Ladder:
         self._report = report
         self._tell = tell
         self._photos = len(job.files)
-        self._announced = 0
+        self._results_reported = 0
         self._announced = ""
 
     def announce(self, what: str, *, takes: float = 0.0) -> None:
@@ -76,11 +76,11 @@ class _Ladder:
 
     def tell_results(self) -> None:
         """Report the results that have not been reported yet."""
-        for rung in self.rungs[self._announced :]:
+        for rung in self.rungs[self._results_reported :]:
             largest, *others = rung["models"] or ["none"]
             also = f" (and {len(others)} smaller models)" if len(others) > 1 else f" + {others[0]}" if others else ""
             self._tell(f"{rung['what']}: {largest}{also} of {self._photos} photos registered")
-        self._announced = len(self.rungs)
+        self._results_reported = len(self.rungs)
 
     def attempt(self, what: str, job: Job, start: MapperOptions) -> None:
         """Map once; the result counts if it places more photos than the best so far."""
