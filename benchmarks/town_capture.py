@@ -103,7 +103,7 @@ def _rendered(world_from_cam: Array, width: int, height: int, focal_px: float) -
         for column in range(width):
             x, y = (column + 0.5 - width / 2) / focal_px, (row + 0.5 - height / 2) / focal_px
             direction = world_from_cam[:, 0] * x + world_from_cam[:, 1] * y + world_from_cam[:, 2]
-            distance, wall = _hit(origin, direction)
+            distance, wall = hit(origin, direction)
             if wall < 0:
                 picture[row, column] = 200
                 continue
@@ -121,7 +121,7 @@ def _rendered(world_from_cam: Array, width: int, height: int, focal_px: float) -
 
 
 @njit
-def _hit(origin: Array, direction: Array) -> tuple[float, int]:
+def hit(origin: Array, direction: Array) -> tuple[float, int]:
     """Distance, in lengths of `direction`, to what a ray hits first, and its number; -1 for the sky.
 
     Number % 5 is the face: 0 the ground, 1 and 2 walls across x, 3 and 4 walls across y.

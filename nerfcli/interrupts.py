@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-# Long enough to be out of the callback, short enough to go unnoticed.
+# Long enough to be out of the callback, short enough that nobody waits.
 _AGAIN_SECONDS = 0.05
 
 

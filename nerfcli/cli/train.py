@@ -27,6 +27,7 @@ from nerfcli.cli.options import (
     Seed,
     Threads,
     VoxelSize,
+    block_choice,
     bytes_from_text,
     contraction_name,
     device_name,
@@ -93,6 +94,14 @@ def train(
         str,
         typer.Option(help="What differs between --members: seeds, photos (80 % each), prior or field."),
     ] = "seeds",
+    blocks: Annotated[
+        str | None,
+        typer.Option(
+            help="Divide a large scene into N blocks of ground, each trained with the whole budget; K/N trains one.",
+            metavar="N|K/N",
+            show_default=False,
+        ),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue from the last checkpoint to the new total.")
     ] = False,
@@ -145,6 +154,10 @@ def train(
     They differ in --vary: seeds; photos, of which each has 80 %; prior, a smooth random field that each starts from; or
     field, where hash, voxels and mlp take turns. The same command resumes an interrupted one.
 
+    --blocks 4 divides the ground of a scene with 3D points into four cells and trains a field for each, on the photos
+    that see it, into RUN/blocks/; RUN renders them as one field. On a cluster, train --blocks 1/4, --blocks 2/4, ...
+    in parallel, as tasks of an array job; the last one to finish joins them.
+
     An X-ray scan, as `nerfcli convert` writes it, is reconstructed as a volume: Poisson likelihood and total variation,
     --field voxels (of --voxel-size; the default, and better) or hash. Its components are tv (the weight of total
     variation), centre (columns between the centre of rotation and where the scan says), tilt (degrees of the detector
@@ -163,6 +176,7 @@ def train(
       nerfcli train photos-scene --without view --with distortion=0.01
       nerfcli train photos-scene --with cameras=poses
       nerfcli train photos-scene --budget 60s --members 4 --vary photos
+      nerfcli train town-scene --budget 10m --blocks 4
       nerfcli train photos-scene --field voxels --field-memory 16MB
       nerfcli train tooth-scene --budget 2m --with tv=1 --with centre=0
     """
@@ -173,6 +187,7 @@ def train(
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
     from nerfcli.torchrun import is_first, is_one_of_several, place_on_machine
+    from nerfcli.workflows.blocks import block_settings, train_blocks
     from nerfcli.workflows.members import VARIED, member_settings, train_members
     from nerfcli.workflows.train import train_scene
     from nerfcli.workflows.train_plan import plan_training
@@ -185,7 +200,11 @@ def train(
         raise typer.BadParameter(
             f"it cannot be combined with {option}, which is about one field", param_hint="--members"
         )
-    if is_one_of_several() and (dry_run or members is not None or scene == STDIN or is_scan(Path(scene))):
+    only, count = (None, 0) if blocks is None else block_choice(blocks)
+    if count and (members is not None or view):
+        option = "--members" if members is not None else "--view"
+        raise typer.BadParameter(f"it cannot be combined with {option}", param_hint="--blocks")
+    if is_one_of_several() and (dry_run or members is not None or count or scene == STDIN or is_scan(Path(scene))):
         raise UserError("processes of torchrun train one field of photos", "use this command without torchrun", 2)
     console = Console(quiet=quiet or not is_first(), json_lines=json)
     budget_seconds = None if budget is None else seconds_from_text(budget)
@@ -248,6 +267,23 @@ def train(
         on_gpu = photo_settings().device != "cpu"
         return shared if shared is None or on_gpu else shared // place_on_machine()[1]
 
+    def train_in_blocks(folder: Path, run: Path) -> Path:
+        with console.progress(f"train {folder.name}") as update:
+            return train_blocks(
+                folder,
+                run,
+                photo_settings(),
+                count=count,
+                only=only,
+                memory_bytes=memory_of_process(),
+                resume=resume,
+                overwrite=overwrite,
+                holdout=rule,
+                notify=console.note,
+                warn=console.warn,
+                progress=update,
+            )
+
     def train_one_scene(folder: Path, run: Path) -> None:
         with console.progress(f"train {folder.name}") as update:
             trained = train_scene(
@@ -283,17 +319,19 @@ def train(
     def plan_one_scene(folder: Path) -> None:
         on_host = photo_settings().device == "cpu"  # --memory is the GPU's otherwise
         resident = (limit or default_memory_limit()) if on_host else None
-        plan = plan_training(folder, photo_settings(), memory_bytes=resident, holdout=rule)
-        if json:
-            console.result(folder, plan.to_json())
-        else:
-            typer.echo(f"{folder}: {plan.describe()}")
+        for number in [only] if only else range(1, count + 1) if count else [0]:
+            settings = block_settings(photo_settings(), number, count) if count else photo_settings()
+            plan = plan_training(folder, settings, memory_bytes=resident, holdout=rule)
+            if json:
+                console.result(folder, {**({"block": number} if number else {}), **plan.to_json()})
+            else:
+                typer.echo(f"{folder}{f', block {number} of {count}' if number else ''}: {plan.describe()}")
 
     def work(folder: Path, one_of_many: bool) -> None:
         run = result_path(folder, suffix="-run", output=output, one_of_many=one_of_many)
         if is_scan(folder):
-            if dry_run or members:
-                option = "--dry-run" if dry_run else "--members"
+            if dry_run or members or count:
+                option = "--dry-run" if dry_run else "--members" if members else "--blocks"
                 raise UserError(f"{folder} is a scan; {option} is for photos", f"remove {option}")
             train_one_scan(folder, run)
         elif recognise(folder):
@@ -303,6 +341,8 @@ def train(
         elif dry_run:
             plan_one_scene(folder)
             return
+        elif count:
+            run = train_in_blocks(folder, run)
         else:
             train_one_scene(folder, run)
         if is_first():
@@ -311,4 +351,5 @@ def train(
     if scene == STDIN or not is_scan(Path(scene)):
         # A wrong option is refused before anything is read.
         member_settings(photo_settings(), members or 0, vary=vary)
+        block_settings(photo_settings(), 0, count)
     for_each_input(scene, work)

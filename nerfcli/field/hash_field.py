@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from nerfcli.field.interface import Field, FieldSettings
-from nerfcli.kernels import HashGrid
+from nerfcli.kernels import HashGrid, reference, spherical_harmonics
 
 # Outputs of the density network, the logarithm of the density first; all of them go on to the colour network.
 GEOMETRY = 16
@@ -94,6 +94,18 @@ class HashField(Field):
             self.settings.view_degree,
             self.settings.antialias,
         )
+
+    def density(self, coordinates: Tensor) -> Tensor:
+        """See `kernels.Medium`; without gradients."""
+        return self.backend.density(coordinates, self.medium())
+
+    def radiance(
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """See `kernels.Medium`. Backends render the `HashGrid` itself faster."""
+        grid = self.medium()
+        encoded = self.backend.hash_encode(coordinates, grid.table, grid.resolutions, sink=sink)
+        return reference.radiance(encoded, spherical_harmonics(directions, grid.view_degree), rays, grid.layers)
 
     @torch.no_grad()
     def forget_directions(self, degree: int) -> None:

@@ -85,3 +85,13 @@ class Field(nn.Module, abc.ABC):
             detail: the share of a training's budget whose details are in it; 1 for all, below 0 for fewer than at
                 first. Those that are not are as they were made: nothing that can be seen.
         """
+
+    @abc.abstractmethod
+    def density(self, coordinates: Tensor) -> Tensor:
+        """Return the density of points; see `kernels.Medium`."""
+
+    @abc.abstractmethod
+    def radiance(
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return density and colour of points; see `kernels.Medium`."""

@@ -1,13 +1,18 @@
 """The kinds of fields, by the names that checkpoints and the command line give them."""
 
+import math
 from typing import Any
 
+import torch
+
 from nerfcli.errors import UserError
+from nerfcli.field.blocks_field import Block, BlocksField, BlocksFieldSettings, cell_end
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field, FieldSettings
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
 
+# That can be trained.
 KINDS = (HashFieldSettings.kind, VoxelFieldSettings.kind, FourierFieldSettings.kind)
 
 
@@ -20,6 +25,10 @@ def fresh_field(settings: FieldSettings) -> Field:
             return VoxelField(settings)
         case FourierFieldSettings():
             return FourierField(settings)
+        case BlocksFieldSettings():
+            fields = [fresh_field(block.field) for block in settings.blocks]
+            shape = (len(fields), *[settings.occupancy_side] * 3)
+            return BlocksField(settings, fields, torch.zeros(shape, dtype=torch.bool))
         case _:
             raise ValueError(f"no field has settings of type {type(settings).__name__}")
 
@@ -38,5 +47,18 @@ def settings_from_json(content: dict[str, Any]) -> FieldSettings:
             return VoxelFieldSettings(**sizes)
         case FourierFieldSettings.kind:
             return FourierFieldSettings(**sizes)
+        case BlocksFieldSettings.kind:
+            ground, blocks = tuple(map(tuple, sizes["ground"])), tuple(map(_block, sizes["blocks"]))
+            return BlocksFieldSettings(**{**sizes, "ground": ground, "blocks": blocks})
         case kind:
             raise UserError(f"unknown type of field: {kind!r}", "use the version of nerfcli that trained it")
+
+
+def _block(content: dict[str, Any]) -> Block:
+    return Block(
+        field=settings_from_json(content["field"]),
+        centre=tuple(content["centre"]),
+        radius=content["radius"],
+        low=cell_end(content["low"], -math.inf),
+        high=cell_end(content["high"], math.inf),
+    )

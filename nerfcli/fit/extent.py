@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.fit.normalisation import box_frame, contracted_frame, object_frame
+from nerfcli.fit.normalisation import block_frame, box_frame, contracted_frame, object_frame
 from nerfcli.render.model import Marching
 from nerfcli.runs.components import LEARNED_BACKGROUNDS
 from nerfcli.runs.settings import TrainSettings
@@ -86,17 +86,17 @@ def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -
         fills_frame: whether there is more in the photos than an object cut out by alpha.
 
     Raises:
-        UserError: "none" is requested as the contraction, and there are too few points to see where the scene ends.
+        UserError: no contraction is asked for, and there are too few points to see where the scene ends.
     """
     contraction = _contraction(settings, fills_frame)
     if contraction == "none" and not fills_frame:
         return Extent(contraction, *object_frame(scene))
     if contraction == "none":
         return Extent(contraction, *box_frame(scene))
-    similarity, marching = contracted_frame(scene)
+    similarity, marching = block_frame(scene) if settings.block else contracted_frame(scene)
     farthest = max(float(np.linalg.norm(similarity.apply(frame.centre))) for frame in scene.frames)
     return Extent(contraction, similarity, marching, farthest + BALLS_BEFORE_BACKGROUND)
 
 
 def _contraction(settings: TrainSettings, fills_frame: bool) -> str:
-    return settings.contraction or ("l2" if fills_frame else "none")
+    return settings.contraction or ("l2" if fills_frame or settings.block else "none")

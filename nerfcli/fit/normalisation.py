@@ -26,6 +26,8 @@ LEAST_POINTS = 50
 # A box holds all points but these per cent at either end, where wrong ones are, and reaches beyond by this share.
 BOX_PERCENTILE = 0.5
 BOX_MARGIN = 0.1
+# The points of a block at the edge of the scene reach as far as one can see: its ball leaves so many per cent out.
+BLOCK_PERCENTILE = 5.0
 
 
 def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
@@ -43,10 +45,15 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
     radius = max(float(np.median(_distances(scene, centre))), 1e-12)
     if depths is not None:
         radius = max(radius, BALL_PER_DEPTH * float(np.median(depths[:, 1])))
-    similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
-    near = NEAREST * 5 if depths is None else 0.5 * float(depths[:, 0].min()) / radius
-    near = min(max(near, NEAREST), 0.5)
-    return similarity, Marching(near=near, far=FARTHEST, shortest_step=1 / 256, growth=1 / 128)
+    return _ball(centre, radius, depths)
+
+
+def block_frame(scene: Scene) -> tuple[Similarity, Marching]:
+    """Return the same for a block: the unit ball is in the middle of its points and as wide as the box around them.
+
+    Cameras may stand outside, and space beyond the ball is contracted: there is the rest of the scene.
+    """
+    return _ball(*_box(scene, BLOCK_PERCENTILE), _typical_depths(scene))
 
 
 def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
@@ -78,14 +85,29 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
             f"the extent of {scene.root} cannot be estimated from its {len(scene.points)} points",
             "use --contraction l2",
         )
-    low, high = np.percentile(scene.points, (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
-    centre, radius = (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)
+    centre, radius = _box(scene, BOX_PERCENTILE)
     reach = math.sqrt(3.0)  # the cube's corners
     depths = _typical_depths(scene)
     near = NEAREST if depths is None else max(0.5 * float(depths[:, 0].min()) / radius, NEAREST)
     far = float(_distances(scene, centre).max()) / radius + reach
     similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
     return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
+
+
+def _ball(centre: np.ndarray, radius: float, depths: np.ndarray | None) -> tuple[Similarity, Marching]:
+    """Return the frame of a unit ball with contracted space around it, and its steps; `depths` of `_typical_depths`."""
+    near = NEAREST * 5 if depths is None else 0.5 * float(depths[:, 0].min()) / radius
+    near = min(max(near, NEAREST), 0.5)
+    similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
+    return similarity, Marching(near=near, far=FARTHEST, shortest_step=1 / 256, growth=1 / 128)
+
+
+def _box(scene: Scene, percentile: float) -> tuple[np.ndarray, float]:
+    """Return the middle of the box around the scene's points, without so many per cent of them at either end, and half
+    of its longest side with the margin.
+    """
+    low, high = np.percentile(scene.points, (percentile, 100 - percentile), axis=0)
+    return (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)
 
 
 def _focus(scene: Scene, depths: np.ndarray | None) -> np.ndarray:

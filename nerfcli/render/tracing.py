@@ -1,7 +1,7 @@
 """Trace rays: colour, distribution of depth, and the error of early stopping.
 
 Two things are left out for speed. A ray ends where little light is left (the stop), and samples whose weights are
-negligible have their colour taken as grey, without evaluating it. Together they change a colour by at most the
+negligible are not asked for their colour, which is taken as grey. Together they change a colour by at most the
 tolerance, and `RaysSeen.truncation_error` bounds by how much they changed each one. The bound is one on the rendering
 of the field with its steps, not on the field.
 """
@@ -12,9 +12,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from nerfcli.field.blocks_field import BlocksField
 from nerfcli.kernels import March, Rays, RaysSeen
 from nerfcli.kernels.interface import UNSEEN
 from nerfcli.render.model import Marching, Model
+from nerfcli.render.spans import trace_in_spans
 
 # The default: a quarter of a grey level.
 TOLERANCE = 1 / 1020
@@ -85,13 +87,18 @@ def render_cut_rays(
     """`render_rays` with all rays cut at the same distances `cuts` (S + 1,)."""
     field = model.field
     edges = torch.cat([cuts, cuts[-1:]])  # the last is never used: there is no jitter
+    rays = Rays(origins, directions, torch.zeros_like(directions[:, 0]), cones)
+    march = March(edges, model.occupied, model.contraction, deepest(tolerance))
+    # All negligible samples of a ray together weigh no more than their share of the tolerance allows.
+    negligible = (1.0 - STOP_SHARE) * tolerance / UNSEEN
+    if isinstance(field, BlocksField):
+        return trace_in_spans(field, rays, march, background=background, shares=shares, negligible=negligible)
     return field.backend.trace_rays(
-        Rays(origins, directions, torch.zeros_like(directions[:, 0]), cones),
-        March(edges, model.occupied, model.contraction, deepest(tolerance)),
+        rays,
+        march,
         field.medium(),
         background=background,
         shares=shares,
-        # All negligible samples of a ray together weigh no more than their share of the tolerance allows.
-        negligible=(1.0 - STOP_SHARE) * tolerance / UNSEEN,
+        negligible=negligible,
         keep_intervals=keep_intervals,
     )

@@ -14,7 +14,7 @@ from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.errors import UserError
 from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
-from nerfcli.runs.files import CONFIG, RECONSTRUCTION
+from nerfcli.runs.files import BLOCKS, CONFIG, RECONSTRUCTION
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene, fingerprint, is_scene
 from nerfcli.sealed import read_sealed, write_sealed
@@ -25,7 +25,7 @@ class RunConfig:
     """Source and settings of a run; entries missing in files of earlier versions have their defaults.
 
     Args:
-        settings: as requested, with the downscale and contraction that were chosen.
+        settings: as they were asked for, with the downscale and contraction that were chosen.
         scene: the folder of the scene, relative to where the user then was, or absolute.
         scene_kind: the format of the scene, see `Scene`.
         unit, unit_source: of length, see `Scene`.
@@ -67,7 +67,7 @@ class RunConfig:
 
         Args:
             scene: what is trained on.
-            settings: as requested.
+            settings: as they were asked for.
             factor: by which photos are made smaller.
             contraction: of the field.
             selection: how the components were chosen, where the scene decided.
@@ -178,6 +178,11 @@ def no_run(path: Path) -> UserError:
         return UserError(
             f"{path} is the reconstruction of an X-ray scan, not a run of photos",
             "evaluate, render, export and info work with it",
+        )
+    if (path / BLOCKS).is_dir():
+        return UserError(
+            f"the blocks of {path} are not complete",
+            f"train them: nerfcli train SCENE --blocks N -o {path}, with the options that they were begun with",
         )
     return UserError(f"{path} is not a run folder: it has no {CONFIG}", hint)
 

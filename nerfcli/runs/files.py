@@ -8,6 +8,7 @@ STATE = "state.safetensors"
 LOG = "log.jsonl"
 METRICS = "metrics.json"
 MEMBERS = "members"
+BLOCKS = "blocks"
 DEPTH_ERRORS = "depth_errors.json"
 PHOTO_DEPTHS = "photo_depths.npz"
 REPORT = "report.html"
@@ -17,6 +18,7 @@ LIVE = ".live"
 RECONSTRUCTION = "reconstruction.json"
 
 __all__ = [
+    "BLOCKS",
     "CAMERAS",
     "CONFIG",
     "DEPTH_ERRORS",

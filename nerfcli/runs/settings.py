@@ -9,7 +9,7 @@ from nerfcli.errors import UserError
 from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.kinds import KINDS
 from nerfcli.kernels import CONTRACTIONS
-from nerfcli.runs.components import Components
+from nerfcli.runs.components import LEARNED_BACKGROUNDS, Components
 
 DOWNSCALES = (1, 2, 4, 8)
 # `--downscale auto` takes the largest pictures whose longer side is within this many pixels.
@@ -55,6 +55,8 @@ class TrainSettings:
         photo_fraction: of the training photos, drawn by the seed without replacement, in (0, 1]; 1 for all.
         random_start: standard deviation of the numbers in the coarsest levels of a hash grid at the start, see
             `HashField.start_randomly`; 0 for a field that starts as fog of density 1 everywhere.
+        blocks: that the scene is divided into, see `runs.blocks`; 0 for none.
+        block: the one that is trained, from 1 on; 0 for the whole scene.
 
     Raises:
         UserError: neither or a non-positive limit, an unknown downscale or kind of field.
@@ -82,6 +84,8 @@ class TrainSettings:
     fixed: tuple[str, ...] = ()
     photo_fraction: float = 1.0
     random_start: float = 0.0
+    blocks: int = 0
+    block: int = 0
 
     def __post_init__(self) -> None:
         if min(self.levels, self.width) < 1 or not 4 <= (self.log2_rows or 4) <= 24:
@@ -114,6 +118,18 @@ class TrainSettings:
         if self.components.stereo and not self.components.points and (self.model != "auto" or "points" in self.fixed):
             raise UserError(
                 "--with stereo needs points: it adds to their pixels", "add --with points, or remove --with stereo", 2
+            )
+        refused = {
+            "--contraction none": self.contraction == "none",
+            "--with antialias": self.components.antialias,
+            "--with exposure": self.components.exposure != "none",
+            "--with cameras": self.components.cameras != "fixed",
+            f"--with background={self.components.background}": self.components.background in LEARNED_BACKGROUNDS,
+        }
+        if self.blocks and any(refused.values()):
+            option = next(name for name in refused if refused[name])
+            raise UserError(
+                f"{option} does not work with --blocks: each block is trained without the others", f"remove {option}", 2
             )
         if self.contraction not in (None, *CONTRACTIONS):
             raise UserError(f"unknown contraction {self.contraction!r}", f"choose auto, {', '.join(CONTRACTIONS)}")

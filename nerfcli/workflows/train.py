@@ -10,8 +10,9 @@ from nerfcli.atomic import clear_leftovers
 from nerfcli.cameras.orientation import describe_rescaling
 from nerfcli.errors import UserError
 from nerfcli.exclusive import exclusive
+from nerfcli.runs.blocks import divide
 from nerfcli.runs.config import split_hash
-from nerfcli.runs.files import CONFIG, LOCK, METRICS, STATE
+from nerfcli.runs.files import BLOCKS, CONFIG, LOCK, METRICS, STATE
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
@@ -191,24 +192,61 @@ def train_again(
     loaded = _load(folder, config.settings, config.holdout)
     if scenes.fingerprint(loaded) != config.scene_fingerprint:
         raise UserError(f"{folder} has changed since {run.path} was trained on it", "train again with --overwrite")
+    if config.settings.blocks and not config.settings.block:
+        raise UserError(
+            f"{run.path} joins blocks, which are trained one by one", f"give a block: {run.path / BLOCKS / '1'}"
+        )
     for path, settings in others.items():
-        interrupted = was_interrupted(folder, path, settings, holdout=config.holdout)
-        try:
-            _trained(
-                folder,
-                path,
-                settings,
-                memory_bytes=memory_bytes,
-                resume=interrupted or (resume and Run(path).is_trained),
-                overwrite=overwrite,
-                holdout=config.holdout,
-                notify=notify,
-                warn=warn,
-                progress=progress,
-            )
-        except KeyboardInterrupt:
-            notify("what is complete is kept; the same command continues")
-            raise
+        train_or_continue(
+            folder,
+            path,
+            settings,
+            memory_bytes=memory_bytes,
+            resume=resume,
+            overwrite=overwrite,
+            holdout=config.holdout,
+            notify=notify,
+            warn=warn,
+            progress=progress,
+        )
+
+
+def train_or_continue(
+    folder: Path,
+    path: Path,
+    settings: TrainSettings,
+    *,
+    memory_bytes: int | None,
+    resume: bool,
+    overwrite: bool,
+    holdout: str | None,
+    notify: Notify,
+    warn: Notify,
+    progress: Progress,
+) -> None:
+    """Train one of several runs: keep a complete one, resume an interrupted one, else start; see `train_scene`.
+
+    Args:
+        folder, path: of the scene and of the run.
+        resume: go on with a complete run, too, if the settings have a larger budget.
+    """
+    interrupted = was_interrupted(folder, path, settings, holdout=holdout)
+    try:
+        _trained(
+            folder,
+            path,
+            settings,
+            memory_bytes=memory_bytes,
+            resume=interrupted or (resume and Run(path).is_trained),
+            overwrite=overwrite,
+            holdout=holdout,
+            notify=notify,
+            warn=warn,
+            progress=progress,
+        )
+    except KeyboardInterrupt:
+        notify("what is complete is kept; the same command continues")
+        raise
 
 
 def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path, TrainSettings]:
@@ -227,6 +265,8 @@ def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path
 def _load(folder: Path, settings: TrainSettings, holdout: str | None) -> Scene:
     """Load the scene with the training photos that these settings use."""
     loaded = scenes.load(folder, holdout=holdout)
+    if settings.block:
+        loaded = divide(loaded, settings.blocks).scenes[settings.block - 1]
     return scenes.with_fraction_of_photos(loaded, settings.photo_fraction, seed=settings.seed)
 
 

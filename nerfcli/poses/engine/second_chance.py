@@ -104,8 +104,7 @@ def second_chance(
     for number, (what, takes, make) in enumerate(hypotheses):
         left = max(most - (time.perf_counter() - start), 0.0)
         if number < len(hypotheses) - 1 and takes >= left:
-            why = f"it takes about {duration(takes)}, and {duration(left)} are left" if left > 0 else "no time is left"
-            tell(f"{what}: skipped, since {why}")
+            tell(f"skipped, would take too long ({duration(takes)}, with {duration(left)} left): {what}")
             continue
         tell(f"next: {what}" + (f" (about {duration(takes)})" if takes else ""))
         runner = checks()

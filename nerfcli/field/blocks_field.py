@@ -1,0 +1,135 @@
+"""A field of several blocks: cells of ground, in each of which another field is asked.
+
+Letters as in `kernels.interface`; blocks B; ground coordinates are distances along two horizontal directions.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from nerfcli.field.contraction import training_points
+from nerfcli.field.interface import Field, FieldSettings
+from nerfcli.kernels import Medium, grid_coordinates
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block, in units of the joined field's training frame.
+
+    Args:
+        field: kind and size of its field.
+        centre, radius: of its own training frame, whose points are (point - centre) / radius.
+        low, high: (2,) ground coordinates of its cell, which is half open; infinite at the edge of the scene.
+    """
+
+    field: FieldSettings
+    centre: tuple[float, ...]
+    radius: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; where the cell has no end, None."""
+        ends = {name: [v if math.isfinite(v) else None for v in getattr(self, name)] for name in ("low", "high")}
+        return {**asdict(self), **ends, "field": self.field.to_json()}
+
+
+def cell_end(values: Sequence[float | None], unbounded: float) -> tuple[float, ...]:
+    """Read `low` or `high` of `Block.to_json`; `unbounded` stands where there is no end."""
+    return tuple(unbounded if value is None else value for value in values)
+
+
+@dataclass(frozen=True)
+class BlocksFieldSettings(FieldSettings):
+    """The blocks of a field; each point of space is in the cell of exactly one.
+
+    Args:
+        ground: (2, 3) horizontal unit directions.
+        occupancy_side: cells per axis of the occupancy grid of each block.
+        blocks: one at least.
+    """
+
+    kind: ClassVar[str] = "blocks"
+
+    ground: tuple[tuple[float, ...], ...] = ()
+    occupancy_side: int = 1
+    blocks: tuple[Block, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        return {**super().to_json(), "blocks": [block.to_json() for block in self.blocks]}
+
+
+class BlocksField(Field):
+    """The fields of blocks side by side; a point is asked of the one whose cell it is in.
+
+    Rays go through it as through any other field, so that colours, opacity and all definitions of depth need no rules
+    of their own. It is not trained: its blocks are, each by itself.
+
+    Args:
+        settings: of the blocks.
+        fields: of the blocks, in this order.
+        occupancy: (B, G, G, G) bool of each over its own cube; nothing is where it is False.
+    """
+
+    occupancy: Tensor
+
+    def __init__(self, settings: BlocksFieldSettings, fields: Sequence[Field], occupancy: Tensor):
+        super().__init__()
+        self._settings = settings
+        self.fields = nn.ModuleList(fields)
+        self.register_buffer("occupancy", occupancy)
+
+    @property
+    def settings(self) -> BlocksFieldSettings:
+        return self._settings
+
+    def rows(self) -> None:
+        return None
+
+    def medium(self, detail: float = 1.0) -> Medium:
+        return self
+
+    def density(self, coordinates: Tensor) -> Tensor:
+        """See `kernels.Medium`."""
+        density = coordinates.new_zeros(len(coordinates))
+        for field, radius, own, inside in self._divided(coordinates):
+            density[own] = field.density(inside) / radius
+        return density
+
+    def radiance(
+        self, coordinates: Tensor, directions: Tensor, rays: Tensor, *, sink: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """See `kernels.Medium`."""
+        density, rgb = coordinates.new_zeros(len(coordinates)), coordinates.new_zeros(len(coordinates), 3)
+        for field, radius, own, inside in self._divided(coordinates):
+            per_radius, rgb[own] = field.radiance(inside, directions, rays[own])
+            density[own] = per_radius / radius
+        return density, rgb
+
+    def is_occupied(self, coordinates: Tensor) -> Tensor:
+        """Return whether there is something at coordinates (N, 3), (N,) bool."""
+        found = torch.zeros(len(coordinates), dtype=torch.bool, device=coordinates.device)
+        for _, _, own, _ in self._divided(coordinates):
+            found[own] = True
+        return found
+
+    def _divided(self, coordinates: Tensor) -> Iterator[tuple[Field, float, Tensor, Tensor]]:
+        """Yield, for each block, its field and radius, which of the points (N, 3) are in its cell and occupied (M,),
+        and their coordinates (M, 3) in its own unit cube.
+        """
+        settings, side = self.settings, self.settings.occupancy_side
+        points = training_points(coordinates, settings.contraction)
+        places = points @ points.new_tensor(settings.ground).T
+        for block, field, occupied in zip(settings.blocks, self.fields, self.occupancy, strict=True):
+            assert isinstance(field, Field)
+            low, high = places.new_tensor(block.low), places.new_tensor(block.high)
+            own = ((places >= low) & (places < high)).all(-1).nonzero()[:, 0]
+            centred = (points[own] - points.new_tensor(block.centre)) / block.radius
+            inside = grid_coordinates(centred, block.field.contraction)
+            x, y, z = (inside.clamp(0, 1) * side).long().clamp_max(side - 1).unbind(-1)
+            kept = occupied[z, y, x] & ((inside >= 0) & (inside <= 1)).all(-1)
+            yield field, block.radius, own[kept], inside[kept]
