@@ -83,22 +83,26 @@ def replicates() -> list[Replicate]:
 def train(
     output: Out,
     kinds: str = ",".join(KINDS),
-    scenes: str = ",".join(REPLICATES),
+    only: Annotated[str, typer.Option(help="Names of replicates, as desk-sector-0; all by default.")] = "",
+    members: Annotated[int, typer.Option(help="Of each kind; the tables are of the first five.")] = MEMBERS,
     longer: Annotated[int, typer.Option(help="Times the usual number of steps; give another folder, too.")] = 1,
 ) -> None:
     """Train what is missing, kind by kind, and keep the distances that the fields show."""
     torch.set_num_threads(1)
     for kind in ("deployed", *kinds.split(",")):
         for one in replicates():
-            if one.scene in scenes.split(","):
-                train_kind(one, kind, output, longer=longer)
+            if not only or one.name in only.split(","):
+                train_kind(one, kind, output, members=members, longer=longer)
 
 
-def train_kind(one: Replicate, kind: str, output: Path, *, longer: int) -> None:
-    """Train the members of a kind for a replicate; fields are deleted when their distances are kept."""
+def train_kind(one: Replicate, kind: str, output: Path, *, members: int, longer: int) -> None:
+    """Train the members of a kind that a replicate lacks; fields are deleted when their distances are kept."""
     folder, capture = output / one.name, output / "captures" / one.scene
-    kept = folder / f"{kind}.npz"
+    kept, columns, seconds = folder / f"{kind}.npz", [], 0.0
     if kept.exists():
+        before = np.load(kept)
+        columns, seconds = list(before["distances"]), float(before["seconds"])
+    if len(columns) >= (1 if kind == "deployed" else members):
         return
     if not (capture / "transforms.json").exists():
         write_capture(one.scene, capture)
@@ -108,9 +112,9 @@ def train_kind(one: Replicate, kind: str, output: Path, *, longer: int) -> None:
         true = true_pixels(truth_of(one.scene), views, scene.train_frames)
         np.savez_compressed(folder / "truth.npz", allow_pickle=False, **vars(true))
     first = one.settings(longer)
-    wanted = [first] if kind == "deployed" else member_settings(first, MEMBERS, vary=kind)
-    columns, began = [], time.process_time()
-    for number, settings in enumerate(wanted, start=1):
+    wanted = [first] if kind == "deployed" else member_settings(first, members, vary=kind)
+    began = time.process_time()
+    for number, settings in list(enumerate(wanted, start=1))[len(columns) :]:
         path = folder / kind / str(number)
         resume = was_interrupted(capture, path, settings, holdout=holdout)
         run = train_scene(capture, path, settings, holdout=holdout, resume=resume)
@@ -124,7 +128,7 @@ def train_kind(one: Replicate, kind: str, output: Path, *, longer: int) -> None:
             extras = deployed_maps(model, run, views, [picture.rgb for picture in pictures])
             extras["opacity"] = np.concatenate([picture.opacity.ravel() for picture in pictures])
             np.savez_compressed(folder / "maps.npz", allow_pickle=False, **extras)
-    seconds = time.process_time() - began
+    seconds += time.process_time() - began
     np.savez_compressed(kept, distances=np.stack(columns), seconds=np.array(seconds))
     shutil.rmtree(folder / kind)
     print(f"{one.name} {kind}: {len(wanted)} fields, {seconds:.0f} CPU s", flush=True)

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import uncertainty
+import uncertainty_laplace as laplace
 import uncertainty_statistics as statistics
 import uncertainty_tomography as tomography
 from make_spheres import Ball, Box
@@ -17,6 +19,9 @@ from uncertainty_scenes import STRATA, Solids, looks, sees, stratum_of, true_pix
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.rigid import Similarity
+from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.render.model import Marching, Model
 
 
 def ball(x: float, y: float, z: float, radius: float) -> Ball:
@@ -316,3 +321,51 @@ def test_ensembles_of_known_quality_get_their_verdicts(tmp_path, bias, verdict):
         for name in ("random", "coverage", "another replicate"):
             assert abs(float(row[f"AURG {name}"])) < 0.1 * float(row["mean error"])
     assert (tmp_path / "uncertainty.png").stat().st_size > 10_000
+
+
+def small_model() -> Model:
+    """A hash field with random rows, which is opaque in places."""
+    torch.manual_seed(0)
+    field = HashField(HashFieldSettings(contraction="l2", levels=2, log2_rows=8, coarsest=3, finest=6, width=8))
+    with torch.no_grad():
+        field.table.normal_(std=0.5)
+    march = Marching(near=0.1, far=6.0, shortest_step=0.1, growth=0.0)
+    return Model(
+        field, torch.ones(4, 4, 4, dtype=torch.bool), march, (0.2, 0.4, 0.6), Similarity.identity(), "arbitrary"
+    )
+
+
+def test_squared_jacobians_are_those_of_a_grid_of_offsets():
+    """Against autograd with respect to all vertices of a grid of 3^3 cells that is interpolated by SciPy's weights."""
+    side, model = 3, small_model()
+    origins = torch.tensor([[-1.5, 0.1, 0.2], [0.3, -1.4, 0.0], [0.2, 0.1, 1.6]])
+    directions = torch.nn.functional.normalize(-origins + 0.1, dim=1)
+    grid, samples = laplace.marched(model, origins, directions)
+    vertices = np.indices((side + 1,) * 3).reshape(3, -1).T / side  # z, y, x
+    places = samples.coordinates.flip(1).double().numpy()
+    weights = np.maximum(0, 1 - side * np.abs(places[:, None] - vertices)).prod(axis=2)  # (N, vertices)
+
+    def colours(theta: torch.Tensor) -> torch.Tensor:
+        offsets = (torch.from_numpy(weights) @ theta).float()
+        return laplace.colours(model, origins, directions, samples, grid, offsets).double()
+
+    jacobian = torch.autograd.functional.jacobian(colours, torch.zeros((len(vertices), 3), dtype=torch.float64))
+    expected = jacobian.square().sum(dim=(0, 1, 3))
+    found = laplace.squared_jacobians(model, origins, directions, side)
+    assert float(expected.max()) > 1e-4
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-6 * float(expected.max()))
+
+
+def test_what_no_ray_meets_has_the_deviation_of_the_prior():
+    """The inverse of lambda alone; where rays see a colour change, less."""
+    side, model = 3, small_model()
+    prior = laplace.PRIOR / side**3
+    variance = torch.full(((side + 1) ** 3,), 1.0 / prior, dtype=torch.float64)
+    origins, directions = torch.tensor([[-1.5, 0.1, 0.2]]), torch.tensor([[1.0, 0.0, 0.0]])
+    _, samples = laplace.marched(model, origins, directions)
+    opacity = 1 - float(torch.exp(-(samples.density * (samples.ends - samples.starts)).sum()))
+    expected = opacity * -0.5 * math.log10(prior) + (1 - opacity) * laplace.LEAST
+    assert float(laplace.logarithms(model, origins, directions, variance, side)) == pytest.approx(expected, rel=1e-4)
+    seen = laplace.squared_jacobians(model, origins, directions, side)
+    known = 1.0 / (seen + prior)
+    assert float(laplace.logarithms(model, origins, directions, known, side)) < expected
