@@ -1,14 +1,18 @@
-"""What the views that `nerfcli doctor RUN` suggests gain in dB, beside random ones: the desk with a sector withheld.
+"""What the views that `nerfcli doctor RUN` suggests gain, in surface and in dB, beside random ones.
 
-    python benchmarks/next_views.py -o next-views
+    python benchmarks/next_views.py desk -o next-views-desk
+    python benchmarks/next_views.py path/to/fox -o next-views-fox --downscale 8
 
-A third of the ring is withheld. Every fourth of these photos measures, the others are candidates. A field is trained on
-the rest, four candidates are chosen by the rule of `doctor`, or at random, and a field is trained with them. Held-out
-PSNR is the mean over the photos that measure. Everything that is there already is kept; writes OUT/table.csv.
+Photos are sorted by their direction from the middle; a third of them, side by side, is withheld. Every fourth of these
+measures, the others are candidates. A field is trained on the rest, four candidates are chosen by the rule of `doctor`,
+or at random, and a field is trained with them. Held-out PSNR is the mean over the photos that measure. The surface is
+what any photo sees, by a field that is trained on all photos but a few; counted is what two of those used see.
+Everything that is there already is kept; writes OUT/table.csv.
 """
 
 import csv
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -17,10 +21,11 @@ import torch
 import typer
 from rich.console import Console
 from rich.table import Table
-from uncertainty_scenes import withheld, write_capture
+from uncertainty_scenes import write_capture
 
 from nerfcli import scene as scenes
 from nerfcli.cameras.frame import Frame
+from nerfcli.cameras.layout import focus_point, up_direction
 from nerfcli.render.visibility import coverage_and_parallax, depth_maps, sees
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
@@ -32,8 +37,18 @@ from nerfcli.workflows.next_views import CANDIDATE_PX, CELLS
 from nerfcli.workflows.photo_depths import photo_depths
 from nerfcli.workflows.train import train_scene, was_interrupted
 
-SECTORS, ADDED, DRAWS, MEASURES_EVERY = (0, 1, 2), 4, 3, 4
-SETTINGS = TrainSettings(budget_seconds=None, steps=800, downscale=4, threads=1)
+THIRDS, ADDED, DRAWS, MEASURES_EVERY, STEPS = 3, 4, 3, 4, 800
+
+
+def around(frames: Sequence[Frame]) -> list[Frame]:
+    """Return frames in the order of their directions from the point they look at, from the largest gap on."""
+    middle, up = focus_point(frames), up_direction(frames)
+    right = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    offsets = np.array([frame.centre for frame in frames]) - middle
+    angles = np.arctan2(offsets @ np.cross(up, right), offsets @ right)
+    order = np.argsort(angles)
+    gaps = np.diff(angles[order], append=angles[order[0]] + 2 * np.pi)
+    return [frames[index] for index in np.roll(order, -1 - int(gaps.argmax()))]
 
 
 def suggested(run: Run, candidates: Sequence[Frame]) -> list[str]:
@@ -49,13 +64,27 @@ def suggested(run: Run, candidates: Sequence[Frame]) -> list[str]:
     return [candidates[index].name for index, _ in next_views(seen, coverage, count=ADDED)]
 
 
-def field_of(capture: Path, folder: Path, held_out: Sequence[str]) -> Run:
+def surface_of(run: Run, frames: Sequence[Frame]) -> dict[str, np.ndarray]:
+    """Return which points (N,) of the surface each photo sees, by name, by the depths of one field."""
+    model = run.model()
+    views = depth_maps(model, frames, max_size=CANDIDATE_PX)
+    low, high = np.array(scene_box(model, frames)).reshape(2, 3)
+    points = surface_points(views, Grid.over((*low, *high), float((high - low).max()) / CELLS))
+    return {frame.name: sees(view, points) for frame, view in zip(frames, views, strict=True)}
+
+
+def seen_twice(surface: dict[str, np.ndarray], without: Sequence[str]) -> float:
+    """Return which part of the surface two photos or more see, without some."""
+    return float((np.sum([seen for name, seen in surface.items() if name not in without], axis=0) >= 2).mean())
+
+
+def field_of(capture: Path, folder: Path, held_out: Sequence[str], settings: TrainSettings) -> Run:
     """Train on all photos but those held out, or return the run that is there."""
     names = folder.with_suffix(".txt")
     names.parent.mkdir(parents=True, exist_ok=True)
     names.write_text("\n".join(held_out), encoding="utf-8")
-    resume = was_interrupted(capture, folder, SETTINGS, holdout=str(names))
-    return train_scene(capture, folder, SETTINGS, holdout=str(names), resume=resume, notify=lambda text: None)
+    resume = was_interrupted(capture, folder, settings, holdout=str(names))
+    return train_scene(capture, folder, settings, holdout=str(names), resume=resume, notify=lambda text: None)
 
 
 def measured(run: Run, names: Sequence[str]) -> float:
@@ -64,40 +93,50 @@ def measured(run: Run, names: Sequence[str]) -> float:
     return float(np.mean([image["psnr"] for image in images if image["name"] in names]))
 
 
-def main(output: Annotated[Path, typer.Option("--output", "-o", help="Folder for captures, runs and table.")]) -> None:
+def main(
+    capture: Annotated[str, typer.Argument(help="desk, or the folder of a capture with poses.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for captures, runs and table.")],
+    downscale: Annotated[int, typer.Option(help="Of the training.")] = 4,
+    thirds: Annotated[int, typer.Option(help="Of the photos that are withheld, one after the other.", max=3)] = THIRDS,
+) -> None:
     """Train, choose, train again; print and write the gains."""
     torch.set_num_threads(1)
-    capture, rows = output / "desk", []
-    if not (capture / "transforms.json").exists():
-        write_capture("desk", capture)
-    frames = scenes.load(capture).frames
-    for sector in SECTORS:
-        inside, _ = withheld(frames, sector=sector)
+    settings = TrainSettings(budget_seconds=None, steps=STEPS, downscale=downscale, threads=1)
+    place, rows = output / "desk" if capture == "desk" else Path(capture), []
+    if capture == "desk" and not (place / "transforms.json").exists():
+        write_capture("desk", place)
+    frames = around(scenes.load(place).frames)
+    bounds = np.linspace(0, len(frames), THIRDS + 1).astype(int)
+    parts = [frames[low:high] for low, high in pairwise(bounds)]
+    every = field_of(place, output / "all", [frame.name for frame in parts[0][1::MEASURES_EVERY]], settings)
+    surface = surface_of(every, frames)
+    for number, part in enumerate(parts[:thirds]):
+        inside = [frame.name for frame in part]
         measures = inside[1::MEASURES_EVERY]
-        candidates = [frame for frame in frames if frame.name in inside and frame.name not in measures]
-        base = field_of(capture, output / f"sector-{sector}-base", inside)
-        before, rng = measured(base, measures), np.random.default_rng(sector)
+        candidates = [frame for frame in part if frame.name not in measures]
+        base = field_of(place, output / f"third-{number}-base", inside, settings)
+        before, rng = measured(base, measures), np.random.default_rng(number)
         names = [frame.name for frame in candidates]
         choices = {"suggested": suggested(base, candidates)}
         choices |= {f"random {n}": rng.choice(names, ADDED, replace=False).tolist() for n in range(1, DRAWS + 1)}
         for choice, added in choices.items():
-            run = field_of(
-                capture,
-                output / f"sector-{sector}-{choice.replace(' ', '-')}",
-                [name for name in inside if name not in added],
-            )
+            left = [name for name in inside if name not in added]
+            run = field_of(place, output / f"third-{number}-{choice.replace(' ', '-')}", left, settings)
             after = measured(run, measures)
-            rows.append({"sector": sector, "choice": choice, "before": before, "after": after, "gain": after - before})
-            print(sector, choice, added, f"{before:.2f} -> {after:.2f} dB", flush=True)
+            seen = [seen_twice(surface, without) for without in (inside, left)]
+            row = {"third": number, "choice": choice, "before": before, "after": after, "gain": after - before}
+            rows.append({**row, "seen before": seen[0], "seen after": seen[1]})
+            print(number, choice, added, f"{before:.2f} -> {after:.2f} dB, {seen[0]:.1%} -> {seen[1]:.1%}", flush=True)
     with (output / "table.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
         writer.writerows(rows)
-    table = Table("sector", "before, dB", "suggested", *(f"random {n}" for n in range(1, DRAWS + 1)))
-    for sector in SECTORS:
-        of = [row for row in rows if row["sector"] == sector]
-        table.add_row(str(sector), f"{of[0]['before']:.2f}", *(f"{row['gain']:+.2f}" for row in of))
-    Console().print(table)
+    table = Table("third", "before", "suggested", *(f"random {n}" for n in range(1, DRAWS + 1)))
+    for number in range(thirds):
+        of = [row for row in rows if row["third"] == number]
+        gains = [f"{row['gain']:+.2f} dB, {100 * (row['seen after'] - row['seen before']):+.1f} %" for row in of]
+        table.add_row(str(number), f"{of[0]['before']:.2f} dB, {of[0]['seen before']:.1%}", *gains)
+    Console(width=140).print(table)
 
 
 if __name__ == "__main__":

@@ -121,6 +121,8 @@ def test_members_are_trained_into_the_run_and_kept(capture):
     before = listing(run)
     assert nerfcli(*command).stderr.count("is kept") == 3
     assert listing(run) == before
+    described = json.loads(nerfcli("info", run, "--json").stdout)["members"]
+    assert described == [f"{number}: seed {number}, photo_fraction 0.8, complete" for number in (1, 2)]
     # One member is lost, and no other is touched.
     (run / "members" / "2" / "field.safetensors").unlink()
     (run / "members" / "2" / "state.safetensors").unlink()

@@ -109,6 +109,14 @@ def test_doctor_tells_what_photos_of_a_run_have_seen(spheres_run, tmp_path):
     assert found["next_views"][0]["gain"] >= found["next_views"][1]["gain"] > 0
     folder = Path(found["path"])
     assert folder == tmp_path / "spheres-run-next-views"
+    text = (folder / "next_views.html").read_text(encoding="utf-8")
+    assert f"Two photos or more see {100 * found['seen_twice'][0]:.1f} % of the surface" in text
+    for view in found["next_views"]:
+        position = ", ".join(f"{row[3]:.3g}" for row in view["world_from_cam"][:3])
+        assert f"<b>{view['name']}</b> at {position}; first or second to see {100 * view['gain']:.1f} %" in text
+    assert text.count('alt="coverage"') == text.count('alt="rendered"') == 2
+    assert text.count('class="train" x1') == 21
+    assert text.count('class="test" x1') == 2
     rendered = nerfcli("render", run, "--cameras", folder / "cameras.json", "--cameras-only", "-o", tmp_path / "again")
     assert rendered.exit_code == 0, rendered.stderr
     written = json.loads((tmp_path / "again/cameras.json").read_text())["frames"]

@@ -20,6 +20,7 @@ from nerfcli.evaluate.protocol import HeldOutPhoto
 from nerfcli.export.settings import depth_meta
 from nerfcli.media.colour_maps import levels_of
 from nerfcli.render.depth import DepthRequest
+from nerfcli.render.visibility import depth_maps
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.page import page_html
 from nerfcli.report.run_facts import RunFacts, captures_of, labels_of, mismatches_of, warnings_of
@@ -83,7 +84,8 @@ def seen() -> tuple[list[Seen], np.ndarray]:
     photo = np.full((8, 10, 3), 128, np.uint8)
     shares: list[float] = []
     held_out = [HeldOutPhoto(camera_at(name, (0.0, 0.0, -2.0)), photo, None) for name in ("a.png", EVIL)]
-    look = look_through(model, held_out, depth=DEPTH, on_progress=shares.append)
+    photos = depth_maps(model, [camera_at("c.png", (0.0, 0.0, -2.0)), camera_at("d.png", (0.0, 0.0, 2.0))])
+    look = look_through(model, held_out, depth=DEPTH, photo_depths=photos, on_progress=shares.append)
     assert shares == [0.5, 1.0]
     return look, photo
 
@@ -100,6 +102,9 @@ def test_views_hold_the_photo_and_what_the_field_shows_of_it(seen):
     assert view.with_depth == np.isfinite(view.depth).mean()
     low, high = depth_range(look)
     assert 1.5 <= low < high <= 2.5  # between the cube's front and back
+    # The photo from the same side sees it, the one from behind does not.
+    np.testing.assert_array_equal(view.coverage[3:5, 4:6], 1.0)
+    assert np.isnan(view.coverage[0, 0])
 
 
 def test_errors_have_the_colours_of_their_size_and_what_does_not_count_is_grey():
@@ -155,7 +160,7 @@ def test_the_page_tells_the_numbers_and_embeds_the_pictures(seen):
     data = re.search(r'<script type="application/json" id="views">(.*?)</script>', text, re.DOTALL)
     assert data is not None
     layers = json.loads(data[1])
-    assert [layer["label"] for layer in layers[0]] == ["photo", "rendered", "error", "depth"]
+    assert [layer["label"] for layer in layers[0]] == ["photo", "rendered", "error", "depth", "coverage"]
     assert all(layer["uri"].startswith("data:image/jpeg;base64,") for view in layers for layer in view)
 
 
@@ -222,6 +227,11 @@ def test_runs_stand_side_by_side_and_what_differs_comes_first(seen):
     assert f"&gt;= {highest:.3g}" in page_html(
         [facts(), other], [look, farther], depths=[_meta(), _meta()]
     )  # one range for a scene
+    # A member that was trained on a part of the photos is of the same scene.
+    part = replace(
+        other, config=replace(other.config, scene_fingerprint="y", settings=TrainSettings(photo_fraction=0.8))
+    )
+    assert f"&gt;= {highest:.3g}" in page_html([facts(), part], [look, farther], depths=[_meta(), _meta()])
     foreign = replace(other, config=RunConfig(scene_fingerprint="x"))
     assert f"&gt;= {high:.3g}" in page_html([facts(), foreign], [look, farther], depths=[_meta(), _meta()])
     assert low < high < highest

@@ -11,8 +11,10 @@ import pytest
 import tifffile
 from commands import error_of, nerfcli
 from fog import fog, foggy_cells
+from PIL import Image
 
 from nerfcli.cameras.camera import Camera
+from nerfcli.cameras.formats.run_cameras import RunCameras
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at
 from nerfcli.media.descriptions import depth_meta_of
@@ -262,6 +264,34 @@ def test_depths_of_photos_are_kept_for_the_field_they_belong_to(run, monkeypatch
     (run / PHOTO_DEPTHS).write_bytes(content[: len(content) // 2])
     photo_depths(trained, trained.model(), on_progress=shares.append, notify=pytest.fail)
     assert len(shares) == 42
+
+
+def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
+    """The left half of a photo is masked: of the points there it sees none, and the others see as many as before."""
+    trained, masked = Run(run), Run(run)
+    train = list(trained.cameras.train)
+    first = train[0]
+    assert first.image is not None
+    mask = np.full((first.camera.height, first.camera.width), 255, np.uint8)
+    mask[:, : first.camera.width // 2] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    train[0] = replace(first, mask=tmp_path / "mask.png")
+    masked.__dict__["cameras"] = RunCameras(tuple(train), trained.cameras.test)
+    whole, *others = photo_depths(trained, trained.model(), on_progress=lambda share: None, notify=pytest.fail)
+    (run / PHOTO_DEPTHS).unlink()  # kept for the photos of the run, whose masks do not change
+    part, *same = photo_depths(masked, masked.model(), on_progress=lambda share: None, notify=pytest.fail)
+    half = whole.distances.shape[1] // 2
+    assert np.isfinite(whole.distances[:, :half]).any()
+    assert np.isnan(part.distances[:, :half]).all()
+    np.testing.assert_array_equal(part.distances[:, half:], whole.distances[:, half:])
+    for one, other in zip(others, same, strict=True):
+        np.testing.assert_array_equal(one.distances, other.distances)
+    points = whole.points()
+    columns = np.argwhere(np.isfinite(whole.distances))[:, 1]
+    before, after = (coverage_and_parallax(maps, points)[0] for maps in ((whole, *others), (part, *same)))
+    # A pixel beside the border is seen by its neighbour across it.
+    np.testing.assert_array_equal((before - after)[columns < half - 1], 1.0)
+    np.testing.assert_array_equal((before - after)[columns > half], 0.0)
 
 
 def test_a_mesh_says_how_many_photos_see_its_points(run, tmp_path):

@@ -43,7 +43,7 @@ def doctor(
     finding is good, look or bad, with its number, its threshold and advice.
 
     Of a run: the percentage of the surface that no, one, two or more training photos have seen, and the positions from
-    which further photos would see most of what fewer than two have, as a camera path in RUN-next-views/.
+    which further photos would see most of what fewer than two have, as a page and a camera path in RUN-next-views/.
 
     Of a scan by X-rays: I > I0, drift, rings, counts, truncation, directions and number of views, the centre of
     rotation, beam hardening.

@@ -30,9 +30,9 @@ def report(
 ) -> None:
     """Write a self-contained HTML page about one or more runs.
 
-    Shows metrics, warnings, held-out photos next to their renderings (with a slider, error maps and depth), training
-    curves, capture, poses, speed, settings and versions. Writes RUN/report.html, or report.html next to the first of
-    several runs.
+    Shows metrics, warnings, held-out photos next to their renderings (with a slider, error maps, depth and coverage:
+    how many training photos see the surface), training curves, capture, poses, speed, settings and versions. Writes
+    RUN/report.html, or report.html next to the first of several runs.
 
     \b
     Examples:

@@ -17,7 +17,7 @@ from nerfcli.pages.embedded_pictures import data_uri, jpeg_bytes
 from nerfcli.render.depth import DepthRequest
 from nerfcli.report.drawings import Curve, curves, from_above
 from nerfcli.report.overview import overview_html
-from nerfcli.report.run_facts import RunFacts, captures_of, mismatches_of, warnings_of
+from nerfcli.report.run_facts import RunFacts, captures_of, mismatches_of, scenes_of, warnings_of
 from nerfcli.report.tables import (
     capture_html,
     ledger_html,
@@ -26,7 +26,15 @@ from nerfcli.report.tables import (
     selection_html,
     settings_html,
 )
-from nerfcli.report.views import ERROR_COLOURS, ERROR_RANGE, Seen, depth_range
+from nerfcli.report.views import (
+    COVERAGE_COLOURS,
+    COVERAGE_RANGE,
+    ERROR_COLOURS,
+    ERROR_RANGE,
+    Seen,
+    coverage_picture,
+    depth_range,
+)
 from nerfcli.sealed import digest
 
 # Curves of more runs than these share colours.
@@ -82,7 +90,7 @@ def page_html(
         ledger=ledger_html(runs),
         settings=settings_html(runs),
     )
-    style = page.asset("compare.css") + _STYLE
+    style = page.asset("compare.css") + _STYLE + LEGEND_STYLE + ABOVE_STYLE
     script = page.asset("compare.js") + page.asset("sort.js")
     mark = mark_of([run.path for run in runs])
     return page.page_html(title=title, mark=mark, style=style, body=body, script=script, origin=origin)
@@ -103,7 +111,7 @@ def _structure(view: Seen) -> str:
 
 def _depth_ranges(runs: Sequence[RunFacts], looks: Sequence[Sequence[Seen]]) -> list[tuple[float, float]]:
     """Return the range of colours of each run's depths: the same for all runs of a scene."""
-    scenes = [run.config.scene_fingerprint for run in runs]
+    scenes = scenes_of(runs)
     return [
         depth_range([view for other, look in zip(scenes, looks, strict=True) if other == scene for view in look])
         for scene in scenes
@@ -145,7 +153,7 @@ def _views_html(
 def _layers(
     first: Seen, seen: Sequence[tuple[RunFacts, Seen, tuple[float, float]]], *, alone: bool
 ) -> list[dict[str, str]]:
-    """Return what can be shown of a photo: itself, then pictures, errors and depths of all runs."""
+    """Return what can be shown of a photo: itself, then pictures, errors, depths and coverage of all runs."""
 
     def layer(kind: str, run: RunFacts, picture: np.ndarray) -> dict[str, str]:
         return _layer(kind if alone else f"{run.label}: {kind}", picture)
@@ -156,6 +164,7 @@ def _layers(
         *(layer("rendered", run, view.picture) for run, view, _ in seen),
         *(layer("error", run, view.error) for run, view, _ in seen),
         *(layer("depth", run, picture) for run, picture in depths),
+        *(layer("coverage", run, coverage_picture(view.coverage)) for run, view, _ in seen),
     ]
 
 
@@ -170,7 +179,14 @@ def _legends_html(runs: Sequence[RunFacts], ranges: Sequence[tuple[float, float]
         of = [run.label for run, meaning in zip(runs, meanings, strict=True) if meaning == ((low, high), words)]
         name = "depth" if len(of) == len(runs) else f"depth, {', '.join(of)}"
         rows.append(_legend(name, DEPTH_COLOURS, f"<= {low:.3g}", f">= {high:.3g}", words))
+    rows.append(coverage_legend())
     return "".join(rows)
+
+
+def coverage_legend() -> str:
+    """Return the legend of maps of coverage."""
+    words = "training photos that see the surface; hatched: no surface"
+    return _legend("coverage", COVERAGE_COLOURS, "0", f">= {COVERAGE_RANGE}", words)
 
 
 def _legend(name: str, colour_map: str, low: str, high: str, text: str) -> str:
@@ -208,12 +224,18 @@ def _curves_html(runs: Sequence[RunFacts]) -> str:
 def _cameras_html(runs: Sequence[RunFacts]) -> str:
     """Return the cameras of every scene, once."""
     drawn: dict[str, str] = {}
-    for run in runs:
-        scene = run.config.scene_fingerprint or str(run.path)
+    for run, scene in zip(runs, scenes_of(runs), strict=True):
         drawn.setdefault(scene, from_above(run.frames.train, run.frames.test))
     return "".join(f'<section class="chart">{drawing}</section>' for drawing in drawn.values() if drawing)
 
 
+LEGEND_STYLE = """\
+.legend{font-size:13px;color:var(--soft);margin:8px 0}.legend b{color:var(--ink)}
+.legend span{display:inline-block;width:140px;height:10px;border-radius:3px;vertical-align:middle;margin:0 4px}
+"""
+ABOVE_STYLE = """\
+.above{max-width:420px}.above .train{stroke:var(--bar);fill:var(--bar)}.above .test{stroke:var(--look);fill:var(--look)}
+"""
 _STYLE = """\
 .sortable button{all:unset;cursor:pointer}.sortable button:focus-visible{outline:2px solid var(--bar)}
 [aria-sort=ascending] button::after{content:" \\2191"}[aria-sort=descending] button::after{content:" \\2193"}
@@ -225,9 +247,6 @@ _STYLE = """\
 .s2{stroke:#2c9a66;fill:#2c9a66;background:#2c9a66}.s3{stroke:#b6479b;fill:#b6479b;background:#b6479b}
 .s4{stroke:#7b61c9;fill:#7b61c9;background:#7b61c9}.s5{stroke:#8c8c35;fill:#8c8c35;background:#8c8c35}
 .key span{margin-right:18px}.key i{display:inline-block;width:12px;height:12px;border-radius:3px;margin-right:6px}
-.legend{font-size:13px;color:var(--soft);margin:8px 0}.legend b{color:var(--ink)}
-.legend span{display:inline-block;width:140px;height:10px;border-radius:3px;vertical-align:middle;margin:0 4px}
-.above{max-width:420px}.above .train{stroke:var(--bar);fill:var(--bar)}.above .test{stroke:var(--look);fill:var(--look)}
 """
 
 _BODY = Template("""\
@@ -255,5 +274,5 @@ $capture
 <div class="charts pairs">$cameras</div>
 <h2>Settings and versions</h2>
 $settings
-<footer>Pictures are compared as sRGB in 8 bit. Depth and error maps were rendered for
+<footer>Pictures are compared as sRGB in 8 bit. Maps of depth, error and coverage were rendered for
 this page.</footer>""")

@@ -114,6 +114,19 @@ def captures_of(runs: Sequence[RunFacts]) -> list[list[int]]:
     return [indices for _, indices in captures]
 
 
+def scenes_of(runs: Sequence[RunFacts]) -> list[str]:
+    """Return what is the same for runs of the same scene, and for those trained on a part of its photos."""
+    places = [(run.config.scene, run.config.split_sha256) for run in runs]
+    whole = {
+        place: run.config.scene_fingerprint
+        for run, place in zip(runs, places, strict=True)
+        if run.config.settings.photo_fraction == 1.0
+    }
+    return [
+        whole.get(place, run.config.scene_fingerprint) or str(run.path) for run, place in zip(runs, places, strict=True)
+    ]
+
+
 def mismatches_of(runs: Sequence[RunFacts]) -> Iterator[str]:
     """List the reasons why metrics of these runs must not be compared."""
     measured = [run for run in runs if run.metrics is not None]

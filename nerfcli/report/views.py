@@ -1,21 +1,29 @@
-"""Held-out photos beside what runs render of them: picture, error and depth."""
+"""Held-out photos beside what runs render of them: picture, error, depth, and how many photos see the surface."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from nerfcli.cameras.frame import Frame
 from nerfcli.evaluate.metrics import psnr, ssim, to_8_bit
 from nerfcli.evaluate.protocol import WHITE, HeldOutPhoto, compare
+from nerfcli.export.visibility import with_visibility
 from nerfcli.media.colour_maps import levels_of
+from nerfcli.media.preview import coloured
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
+from nerfcli.render.visibility import DepthMap, small_frame
 from nerfcli.report.run_facts import RunFacts
 
 # Mean absolute difference of the channels that has the last colour of error maps, sRGB in [0, 1].
 ERROR_RANGE = 0.2
 ERROR_COLOURS = "viridis"
+# Longer side in pixels of the maps of coverage, and the number of photos from which on they have the last colour.
+COVERAGE_PX, COVERAGE_RANGE = 320, 8
+COVERAGE_COLOURS = "viridis"
+_COVERAGE = DepthRequest("median", "ray")
 # Of all depths, those at the ends of the range of colours.
 _RANGE_PERCENT = (1, 99)
 
@@ -28,6 +36,7 @@ class Seen:
         name: of the photo.
         photo, picture, error: (H, W, 3) uint8 sRGB; RGBA photos on white.
         depth: (H, W) in the unit of the scene, NaN where there is none.
+        coverage: (h, w) number of training photos that see the surface, in a smaller picture; NaN where there is none.
         psnr, ssim: between picture and photo over the pixels that count, as in `evaluate`; SSIM may not be known.
     """
 
@@ -36,6 +45,7 @@ class Seen:
     picture: np.ndarray
     error: np.ndarray
     depth: np.ndarray
+    coverage: np.ndarray
     psnr: float
     ssim: float | None
 
@@ -57,7 +67,12 @@ def common_names(runs: Sequence[RunFacts], count: int) -> list[str]:
 
 
 def look_at(
-    model: Model, held_out: Sequence[HeldOutPhoto], *, depth: DepthRequest, on_progress: Callable[[float], None]
+    model: Model,
+    held_out: Sequence[HeldOutPhoto],
+    *,
+    depth: DepthRequest,
+    photo_depths: Sequence[DepthMap],
+    on_progress: Callable[[float], None],
 ) -> list[Seen]:
     """Render held-out photos of a run.
 
@@ -65,6 +80,7 @@ def look_at(
         model: the trained model.
         held_out: the photos, whose masks leave pixels to compare.
         depth: which depth to show.
+        photo_depths: of all training photos.
         on_progress: called with how much of it is done, in [0, 1].
     """
     views = []
@@ -81,12 +97,27 @@ def look_at(
                 picture=rendered,
                 error=error_map(rendered, compared.photo, used=used),
                 depth=picture.depth,
+                coverage=coverage_map(model, photo.frame, photo_depths),
                 psnr=psnr(rendered, compared.photo, used=used),
                 ssim=ssim(rendered, compared.photo, used=used),
             )
         )
         on_progress(len(views) / len(held_out))
     return views
+
+
+def coverage_map(model: Model, frame: Frame, photo_depths: Sequence[DepthMap]) -> np.ndarray:
+    """Return how many training photos see the surface in each pixel of a small picture (h, w), see `Seen`."""
+    small = small_frame(frame, COVERAGE_PX)
+    picture = render_picture(model, small, background=model.background, depth=_COVERAGE)
+    seen = with_visibility(picture, small, axis=_COVERAGE.axis, photo_depths=photo_depths)
+    assert seen.coverage is not None
+    return seen.coverage
+
+
+def coverage_picture(coverage: np.ndarray) -> np.ndarray:
+    """Return a map of `coverage_map` in colours, uint8 RGB; hatched where there is no surface."""
+    return coloured(coverage, lo=0.0, hi=float(COVERAGE_RANGE), colour_map=COVERAGE_COLOURS)
 
 
 def depth_range(views: Sequence[Seen]) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """Examine a run: how much of the surface its photos have seen, and where further photos would see most of the rest."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,13 @@ import numpy as np
 import torch
 
 from nerfcli.cameras.frame import Frame
-from nerfcli.render.visibility import coverage_and_parallax, depth_maps, sees
+from nerfcli.evaluate.metrics import to_8_bit
+from nerfcli.pages.page import write_page
+from nerfcli.render.model import Model
+from nerfcli.render.pictures import render_picture
+from nerfcli.render.visibility import DepthMap, coverage_and_parallax, depth_maps, sees, small_frame
+from nerfcli.report.next_views import NextView, next_views_html
+from nerfcli.report.views import coverage_map
 from nerfcli.runs.run import Run
 from nerfcli.surface.extent import scene_box
 from nerfcli.surface.grid import Grid
@@ -20,6 +27,8 @@ from nerfcli.workflows.views import refuse_frames, write_frames
 
 # Longer side of the candidates' depth maps in pixels, and voxels along the longest side of the box.
 CANDIDATE_PX, CELLS = 96, 128
+# The page, and the longer side of its pictures in pixels.
+PAGE, PICTURE_PX = "next_views.html", 480
 # Coverage from which each part of the surface begins.
 STRATA = {"none": 0, "one": 1, "two or three": 2, "four or more": 4}
 
@@ -69,11 +78,12 @@ def examine_run(
     notify: Notify = silent,
     progress: Progress = no_progress,
 ) -> RunCoverage:
-    """Measure the coverage of a run's surface, and write the suggested views as a camera path.
+    """Measure the coverage of a run's surface, and write the suggested views as a page and as a camera path.
 
     Args:
         run: the folder that training wrote.
-        target: the folder to write, cameras.json and camera_path.json.
+        target: the folder to write: next_views.html, cameras.json and camera_path.json; the page alone where there is
+            no view to suggest.
         count: how many views to suggest.
         threads: of the CPU; 0 for all.
         overwrite: replace the files at `target`.
@@ -107,10 +117,8 @@ def examine_run(
         replace(by_name[views[index].frame.name], name=f"next_{place:02d}")
         for place, (index, _) in enumerate(chosen, start=1)
     ]
-    if found:
-        write_frames(found, target, fps=1.0, overwrite=overwrite)
     bounds = [*STRATA.values(), np.inf]
-    return RunCoverage(
+    examined = RunCoverage(
         photos=len(frames),
         box=box,
         shares={
@@ -121,3 +129,20 @@ def examine_run(
         gains=tuple(gain / len(points) for _, gain in chosen),
         seen_twice=(float((coverage >= 2).mean()), float((after >= 2).mean())),
     )
+    if found:
+        write_frames(found, target, fps=1.0, overwrite=overwrite)
+    _write_page(examined, target / PAGE, trained, model, photos)
+    return examined
+
+
+def _write_page(found: RunCoverage, path: Path, run: Run, model: Model, photos: Sequence[DepthMap]) -> None:
+    """Write the page about the coverage of a run, with what the field shows from each of the views."""
+    views = []
+    for frame, gain in zip(found.views, found.gains, strict=True):
+        picture = render_picture(model, small_frame(frame, PICTURE_PX), background=model.background)
+        views.append(NextView(frame, gain, to_8_bit(picture.rgb), coverage_map(model, frame, photos)))
+    text = next_views_html(
+        run.path, photos=run.cameras.train, shares=found.shares, seen_twice=found.seen_twice, views=views
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_page(text, path)

@@ -17,6 +17,7 @@ from nerfcli.runs.files import REPORT
 from nerfcli.runs.run import load_run
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.photo_depths import photo_depths
 
 # Held-out photos on a page, unless somebody says how many.
 VIEWS = 8
@@ -89,7 +90,8 @@ def report_runs(
         frames = [frame for frame in run.cameras.test if frame.name in names[index]]
         held_out = held_out_photos_of(run.config, frames, model, threads=thread_count(threads))
         compared = [photo for photo in held_out if photo.used is None or photo.used.any()]
-        looks.append(look_at(model, compared, depth=depth, on_progress=on_progress))
+        photos = photo_depths(run, model, on_progress=lambda share: None, notify=notify)
+        looks.append(look_at(model, compared, depth=depth, photo_depths=photos, on_progress=on_progress))
         meanings.append(depth_meta(model, depth))
     write_page(page_html(facts, looks, depths=meanings, origin=origin), target)
     return target
