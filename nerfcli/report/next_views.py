@@ -89,7 +89,8 @@ def _view_html(view: NextView) -> str:
 
 
 _STYLE = """\
-figure{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:12px;margin:0 0 16px}
+.views{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,420px),1fr));gap:16px}
+figure{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:12px;margin:0}
 figcaption{font-size:13px;color:var(--soft);margin-bottom:8px}figcaption b{color:var(--ink)}
 .pair{display:grid;grid-template-columns:1fr 1fr;gap:8px}.pair img{width:100%;border-radius:4px}
 .narrow{max-width:420px}
@@ -103,7 +104,7 @@ _BODY = Template("""\
 <p>$seen</p>
 <h2>Next views</h2>
 $legend
-$views
+<div class="views">$views</div>
 <h2>Cameras</h2>
 <p>Projected onto their best-fitting plane; lines show viewing directions. The next views are marked.</p>
 <div class="chart narrow">$above</div>
