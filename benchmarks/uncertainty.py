@@ -13,6 +13,7 @@ import csv
 import json
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -47,7 +48,12 @@ KINDS = ("seeds", "photos", "prior", "field")
 MEMBERS = 5
 # All captures are four by three.
 PIXELS_PER_VIEW = VIEW_PX * VIEW_PX * 3 // 4
-CONTROLS = ("coverage", "parallax", "true coverage", "opacity", "gradient", "distance", "random", "another replicate")
+CONTROLS = (
+    *("coverage", "parallax", "true coverage", "opacity", "gradient", "distance", "random", "another replicate"),
+    *("Laplace", "combined", "combined, free"),
+)
+# What is combined: with the spread, and what costs no further training.
+COMBINED = {"combined": ("spread", "coverage", "parallax"), "combined, free": ("coverage", "parallax", "opacity")}
 
 # By kind, all numbers of each replicate.
 Numbers = dict[str, list[dict[str, float | str]]]
@@ -218,6 +224,8 @@ def read_pixels(folder: Path, kind: str, members: int = MEMBERS) -> Pixels:
         "distance": deployed[used],
         "random": rng.random(used.sum()),
     }
+    if (folder / "laplace.npz").exists():
+        uncertainty["Laplace"] = np.load(folder / "laplace.npz")["deviation"][used]
     return Pixels(
         members=distances,
         true=true.distance[used],
@@ -278,6 +286,24 @@ def widened(one: Replicate, pixels: Pixels, replicates: list[Replicate], every: 
     return {"factor": factor, **held}
 
 
+def combined(
+    one: Replicate, pixels: Pixels, replicates: list[Replicate], every: list[Pixels], names: Sequence[str]
+) -> np.ndarray:
+    """Return the sum of the ranks of some predictors that comes nearest to the rank of the error in the other scenes.
+
+    Ranks are those inside a replicate, from 0 to 1; replicates count equally in the least squares.
+    """
+
+    def rows(of: Pixels) -> np.ndarray:
+        return np.stack([statistics.ranks(of.uncertainty[name]) for name in names] + [np.ones(len(of.true))], axis=1)
+
+    others = [of for other, of in zip(replicates, every, strict=True) if other.scene != one.scene]
+    equally = [len(of.true) ** -0.5 for of in others]
+    left = np.concatenate([weight * rows(of) for weight, of in zip(equally, others, strict=True)])
+    right = np.concatenate([weight * statistics.ranks(of.error) for weight, of in zip(equally, others, strict=True)])
+    return rows(pixels) @ np.linalg.lstsq(left, right)[0]
+
+
 def trained(output: Path, kind: str) -> list[Replicate]:
     """The replicates whose members of a kind are there."""
     return [one for one in replicates() if (output / one.name / f"{kind}.npz").exists()]
@@ -293,6 +319,8 @@ def judge(output: Out) -> None:
         spreads = [pixels.spread for pixels in every]
         for index, pixels in enumerate(every):
             pixels.uncertainty["another replicate"] = statistics.permuted(spreads, index)
+            for name, parts in COMBINED.items() if len({one.scene for one in there}) > 1 else ():
+                pixels.uncertainty[name] = combined(there[index], pixels, there, every, parts)
         if every:
             table[kind] = [
                 {"replicate": one.name, **measures(pixels), **widened(one, pixels, there, every)}
@@ -368,6 +396,13 @@ def print_tables(table: Numbers, found: dict[str, statistics.Summary]) -> None:
                 means = [mean_of(column(of_scene, f"AUSE of views {name}")) for name in names]
                 of_views.add_row(kind, scene, *(f"{value:.3f}" for value in means))
     console.print(of_views)
+    for kind, rows in table.items():
+        for name in (*COMBINED, "Laplace"):
+            over = column(rows, f"AUSE {name}") - column(rows, "AUSE coverage")
+            p = statistics.sign_flip(over)
+            console.print(
+                f"{kind}: AUSE {name} - coverage {mean_of(over):+.4f}, {np.isfinite(over).sum()} replicates, p {p:.3f}"
+            )
 
 
 def print_by_members(output: Path) -> None:

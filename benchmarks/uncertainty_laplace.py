@@ -17,7 +17,7 @@ import torch
 import typer
 from torch import Tensor
 from uncertainty import replicates
-from uncertainty_scenes import load_replicate, looks
+from uncertainty_scenes import load_replicate, looks, write_capture
 
 from nerfcli.cameras.frame import Frame
 from nerfcli.field.background import colours_behind
@@ -142,6 +142,8 @@ def main(
         folder, capture = output / one.name, output / "captures" / one.scene
         if (only and one.name not in only.split(",")) or (folder / "laplace.npz").exists():
             continue
+        if not (capture / "transforms.json").exists():
+            write_capture(one.scene, capture)
         scene = load_replicate(capture, folder, sector=one.sector)
         settings, path, holdout = one.settings(1), folder / "laplace-run", str(folder / "held_out.txt")
         resume = was_interrupted(capture, path, settings, holdout=holdout)

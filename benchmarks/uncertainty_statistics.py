@@ -101,6 +101,11 @@ def area_under_roc(values: np.ndarray, positive: np.ndarray) -> float:
     return float((stats.rankdata(values)[positive].mean() - 0.5 * (ones + 1)) / zeros)
 
 
+def ranks(values: np.ndarray) -> np.ndarray:
+    """Return the ranks of values from 0 to 1, ties in the middle of theirs."""
+    return (stats.rankdata(values) - 0.5) / len(values)
+
+
 def rank_correlation(one: np.ndarray, other: np.ndarray) -> float:
     """Return Spearman's correlation; NaN for few pixels or constant values."""
     if len(one) < LEAST_PIXELS or np.ptp(one) == 0 or np.ptp(other) == 0:
