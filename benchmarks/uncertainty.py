@@ -102,25 +102,43 @@ def train(
 
 
 def train_kind(one: Replicate, kind: str, output: Path, *, members: int, longer: int) -> None:
-    """Train the members of a kind that a replicate lacks; fields are deleted when their distances are kept."""
+    """Train the members of a kind that a replicate lacks."""
     folder, capture = output / one.name, output / "captures" / one.scene
-    kept, columns, seconds = folder / f"{kind}.npz", [], 0.0
-    if kept.exists():
-        before = np.load(kept)
-        columns, seconds = list(before["distances"]), float(before["seconds"])
-    if len(columns) >= (1 if kind == "deployed" else members):
-        return
     if not (capture / "transforms.json").exists():
         write_capture(one.scene, capture)
     scene = load_replicate(capture, folder, sector=one.sector)
-    views, holdout = looks(scene.test_frames), str(folder / "held_out.txt")
-    if kind == "deployed":
+    views = looks(scene.test_frames)
+    if not (folder / "truth.npz").exists():
         true = true_pixels(truth_of(one.scene), views, scene.train_frames)
         np.savez_compressed(folder / "truth.npz", allow_pickle=False, **vars(true))
-    first = one.settings(longer)
+    keep_distances(folder, kind, capture, views, first=one.settings(longer), members=members)
+
+
+def keep_distances(
+    folder: Path, kind: str, capture: Path, views: list[Frame], *, first: TrainSettings, members: int
+) -> None:
+    """Train the fields of a kind that are missing, and keep the distances that they show in views: FOLDER/KIND.npz.
+
+    Fields are deleted afterwards. FOLDER/held_out.txt lists the photos that are withheld.
+
+    Args:
+        folder: of the replicate.
+        kind: "deployed", which is one field of these settings, or one of `KINDS`.
+        capture: to train on.
+        views: in which depth is compared.
+        first: settings of the deployed field.
+        members: of the kind.
+    """
+    kept, holdout, columns, seconds = folder / f"{kind}.npz", str(folder / "held_out.txt"), [], 0.0
+    if kept.exists():
+        before = np.load(kept)
+        columns, seconds = list(before["distances"]), float(before["seconds"])
     wanted = [first] if kind == "deployed" else member_settings(first, members, vary=kind)
+    missing = list(enumerate(wanted, start=1))[len(columns) :]
+    if not missing:
+        return
     began = time.process_time()
-    for number, settings in list(enumerate(wanted, start=1))[len(columns) :]:
+    for number, settings in missing:
         path = folder / kind / str(number)
         resume = was_interrupted(capture, path, settings, holdout=holdout)
         run = train_scene(capture, path, settings, holdout=holdout, resume=resume)
@@ -137,7 +155,7 @@ def train_kind(one: Replicate, kind: str, output: Path, *, members: int, longer:
     seconds += time.process_time() - began
     np.savez_compressed(kept, distances=np.stack(columns), seconds=np.array(seconds))
     shutil.rmtree(folder / kind)
-    print(f"{one.name} {kind}: {len(wanted)} fields, {seconds:.0f} CPU s", flush=True)
+    print(f"{folder.name} {kind}: {len(wanted)} fields, {seconds:.0f} CPU s", flush=True)
 
 
 def depth_of(picture: RenderedPicture) -> np.ndarray:

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import torch
 import uncertainty
+import uncertainty_kitchen as kitchen
 import uncertainty_laplace as laplace
 import uncertainty_statistics as statistics
 import uncertainty_tomography as tomography
+from depth import COLOUR_FOCAL_PX, DEPTH_FROM_COLOUR
 from make_spheres import Ball, Box
+from PIL import Image
 from scipy import stats
 from uncertainty_scenes import STRATA, Solids, looks, sees, stratum_of, true_pixels, withheld
 
@@ -369,3 +372,37 @@ def test_what_no_ray_meets_has_the_deviation_of_the_prior():
     seen = laplace.squared_jacobians(model, origins, directions, side)
     known = 1.0 / (seen + prior)
     assert float(laplace.logarithms(model, origins, directions, known, side)) < expected
+
+
+def test_predictors_are_combined_as_in_the_other_scenes():
+    """Errors that fall with a sum of two predictors' ranks are ranked by a combination learned on another scene."""
+    rng, scenes = np.random.default_rng(0), [uncertainty.Replicate(name, 0) for name in ("spheres", "desk")]
+    every = []
+    for _ in scenes:
+        one, other, count = rng.random(4000), rng.random(4000), 4000
+        pixels = uncertainty.Pixels(
+            members=np.zeros((2, count)),
+            true=np.ones(count),
+            error=np.exp(3 * one + other),
+            stratum=np.zeros(count, int),
+            views=np.zeros(count, int),
+            uncertainty={"one": one, "other": other**3},
+            abstained={},
+        )
+        every.append(pixels)
+    found = uncertainty.combined(scenes[0], every[0], scenes, every, ("one", "other"))
+    worst = statistics.ause(every[0].error, every[0].uncertainty["one"])
+    assert statistics.ause(every[0].error, found) < 0.05 * worst
+
+
+def test_a_depth_camera_sees_the_points_at_its_depth(tmp_path):
+    """A wall 2 m in front of the depth camera, with a hole; the colour camera stands beside it."""
+    (tmp_path / "depth").mkdir()
+    depth = np.full((480, 640), 2000, np.uint16)
+    depth[:, 320:] = 0
+    Image.fromarray(depth).save(tmp_path / "depth" / "frame.png")
+    np.savetxt(tmp_path / "camera-intrinsics.txt", np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]]))
+    photo = Frame("frame.jpg", Camera.pinhole(640, 480, COLOUR_FOCAL_PX), DEPTH_FROM_COLOUR)
+    points = np.array([[-0.1, 0, 2.0], [-0.1, 0, 2.04], [-0.1, 0, 2.06], [0.1, 0, 2.0], [-0.1, 0, -2.0], [-5, 0, 2.0]])
+    seen = kitchen.sensor_sees(photo, points, tmp_path)
+    assert seen.tolist() == [True, True, False, False, False, False]
