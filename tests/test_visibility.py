@@ -271,11 +271,11 @@ def test_a_photo_sees_nothing_where_its_mask_covers_it(run, tmp_path):
     trained, masked = Run(run), Run(run)
     train = list(trained.cameras.train)
     first = train[0]
-    assert first.image is not None
     mask = np.full((first.camera.height, first.camera.width), 255, np.uint8)
     mask[:, : first.camera.width // 2] = 0
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    train[0] = replace(first, mask=tmp_path / "mask.png")
+    for name in ("photo.png", "mask.png"):
+        Image.fromarray(mask).save(tmp_path / name)
+    train[0] = replace(first, image=tmp_path / "photo.png", mask=tmp_path / "mask.png")
     masked.__dict__["cameras"] = RunCameras(tuple(train), trained.cameras.test)
     whole, *others = photo_depths(trained, trained.model(), on_progress=lambda share: None, notify=pytest.fail)
     (run / PHOTO_DEPTHS).unlink()  # kept for the photos of the run, whose masks do not change
