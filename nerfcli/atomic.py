@@ -29,7 +29,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         UserError: the folder cannot be made or written, or the disk is full.
     """
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
-    with _write_errors_told(path):
+    with _write_errors_explained(path):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             yield partial
@@ -49,7 +49,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         UserError: as for `atomic_path`.
     """
     partial = path.with_name(f".{path.name}.partial-{os.getpid()}")
-    with _write_errors_told(path):
+    with _write_errors_explained(path):
         try:
             clear_leftovers(path.parent)
             partial.mkdir(parents=True)
@@ -66,7 +66,7 @@ def replace_folder(complete: Path, path: Path) -> None:
         UserError: it cannot be moved.
     """
     old = path.with_name(f".{path.name}.old-{os.getpid()}")
-    with _write_errors_told(path):
+    with _write_errors_explained(path):
         try:
             clear_leftovers(path.parent)
             if path.exists():
@@ -87,7 +87,7 @@ def clear_leftovers(folder: Path) -> None:
     found = [match for match in map(_LEFTOVER.fullmatch, _names(folder)) if match and not _lives(int(match["process"]))]
     for match in found:
         path, place = folder / match.string, folder / match["name"]
-        with suppress(OSError):  # another command is doing the same, or it is in nobody's way
+        with suppress(OSError):  # another command is doing the same, or the file does no harm
             if match["kind"] == "old" and not place.exists():
                 os.replace(path, place)
             elif path.is_dir():
@@ -153,7 +153,7 @@ def cannot_write(path: Path, error: OSError) -> UserError:
 
 
 @contextmanager
-def _write_errors_told(path: Path) -> Iterator[None]:
+def _write_errors_explained(path: Path) -> Iterator[None]:
     """Tell the user about errors of writing `path`; errors of reading something else meanwhile pass through."""
     try:
         yield

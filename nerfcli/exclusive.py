@@ -15,7 +15,7 @@ def exclusive(path: Path, holder: str) -> Iterator[int]:
     """Hold the lock of a file, which is made if need be, with its folder.
 
     Args:
-        path: the file; its content is nobody's.
+        path: the file; its content is unused.
         holder: who holds it, for those that come too late: "nerfcli poses is at work on photos-scene".
 
     Yields:

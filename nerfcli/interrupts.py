@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 
-# Long enough to be out of the callback, short enough that nobody waits.
+# Long enough to be out of the callback, short enough to go unnoticed.
 _AGAIN_SECONDS = 0.05
 
 

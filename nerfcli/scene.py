@@ -50,7 +50,7 @@ class Scene:
         missing: names of images that the capture lists and that are not on disk.
         unit: of length: "arbitrary" or "metre".
         depth_bounds: (frames, 2) nearest and farthest z per frame, in scene units, where the format has them.
-        unit_source: how a metre is known; None where the unit is arbitrary, or nobody said.
+        unit_source: how a metre is known; None where the unit is arbitrary, or unknown.
         rescaled: for how many photos the intrinsics were given for another size, see `Capture.rescaled`.
         history: how cameras and points were found: the provenance of `save`, or {"from": the format}.
         holdout: the rule that chose the held-out frames; None where the capture itself says, or is split as usual.

@@ -14,6 +14,7 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import look_at
 from nerfcli.render.visibility import DepthMap, coverage_and_parallax, sees, without_steep
+from nerfcli.surface import next_views as candidates
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.next_views import ENOUGH, candidate_frames, in_free_space, next_views, surface_points
 
@@ -97,7 +98,8 @@ def test_photos_from_one_place_have_only_their_flight_as_candidates():
     assert {frame.name.split("_")[0] for frame in found} == {"flight"}
 
 
-def test_doctor_tells_what_photos_of_a_run_have_seen(spheres_run, tmp_path):
+def test_doctor_tells_what_photos_of_a_run_have_seen(spheres_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(candidates, "PER_PATH", 10)  # 60 on each path take 18 CPU seconds
     run = shutil.copytree(spheres_run, tmp_path / "spheres-run")
     result = nerfcli("doctor", run, "--views", "2", "--threads", "2", "--json")
     assert result.exit_code == 0, result.stderr

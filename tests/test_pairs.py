@@ -294,6 +294,21 @@ def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_fro
     assert outlook.update("match", 0, 45)[1] == pytest.approx(10.0)
 
 
+def test_merging_sub_models_adds_to_what_is_left_and_takes_nothing_from_the_share():
+    """A fifth of the plan's time for mapping, on a machine as fast as planned; it is done before the checks begin."""
+    now = 0.0
+    outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, {"map": 100.0, "check": 20.0}), clock=lambda: now)
+    outlook.update("map", 0, 10)
+    now = 100.0
+    assert outlook.update("map", 10, 10) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0))
+    assert outlook.update("merge", 0, 4) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0 + 20.0))
+    now = 105.0
+    assert outlook.update("merge", 1, 4)[1] == pytest.approx(15.0 + 20.0)
+    now = 120.0
+    outlook.update("merge", 4, 4)
+    assert outlook.update("check", 0, 4) == (pytest.approx(120.0 / 140.0), pytest.approx(20.0))
+
+
 @pytest.mark.parametrize(
     ("planned", "taken"),
     [

@@ -175,8 +175,8 @@ def test_a_second_chance_is_bounded_in_time(solved: Solved, tmp_path: Path):
     first = examine(wrong.models, wrong.job, lambda *progress: None)
     notes: list[str] = []
     chance = second_chance(wrong, first, lambda *progress: None, notes.append, checks=Checks)
-    assert sum(note.startswith("skipped, would take too long") for note in notes) == 4
-    assert "skipped, would take too long (0 s, with 0 s left): from scratch, with other initial pairs" in notes
+    assert sum(note.endswith(": skipped, since no time is left") for note in notes) == 4
+    assert "from scratch, with other initial pairs: skipped, since no time is left" in notes
     assert chance.examined.model is not None
     assert chance.examined.model.num_reg_images() == 7
 
@@ -198,7 +198,7 @@ def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
     notes: list[str] = []
     chance = second_chance(wrong, first, lambda *progress: None, notes.append, checks=Checks)
     assert "next: from the largest consistent part (about 30 s)" in notes
-    assert "skipped, would take too long (2 min, with 50 s left): from scratch, with other initial pairs" in notes
+    assert "from scratch, with other initial pairs: skipped, since it takes about 2 min, and 50 s are left" in notes
     assert chance.mapped.attempts[-1]["what"] == "only the largest consistent part of the first model"
 
 
@@ -401,7 +401,16 @@ def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path
             second.deregister_frame(second.image(image_id).frame_id)
     turn = pycolmap.Rotation3d(np.array([0.3, -0.4, 1.2]))
     second.transform(pycolmap.Sim3d(3.0, turn, np.array([5.0, -2.0, 1.0])))
-    merged = merging.merge_models([first, second], solved.job.database, output=tmp_path / "merged", seed=0, threads=1)
+    told: list[tuple[str, int, int]] = []
+    merged = merging.merge_models(
+        [first, second],
+        solved.job.database,
+        output=tmp_path / "merged",
+        seed=0,
+        threads=1,
+        report=lambda *progress: told.append(progress),
+    )
+    assert told == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
     assert [model.num_reg_images() for model in merged] == [10]
     for image_id in range(2, 11):
         poses = [model.image(image_id).cam_from_world() for model in (merged[0], solved.model)]

@@ -548,7 +548,7 @@ def test_corners_through_distorted_lenses_and_how_well_their_error_is_told():
         return scale_from_corners(frames, sightings, sides, pattern="markers")
 
     assert estimate(0.0).metres_per_unit == pytest.approx(0.1, rel=1e-9)
-    found = [estimate(0.2) for _ in range(60)]
+    found = [estimate(0.2) for _ in range(30)]
     scatter = np.std([one.metres_per_unit for one in found])
     told = np.sqrt(np.mean([(one.standard_error or 0) ** 2 for one in found]))
     assert 0.6 < told / scatter < 1.7

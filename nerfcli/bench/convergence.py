@@ -22,7 +22,7 @@ FINER = 8
 
 @torch.no_grad()
 def quadrature(sample: SampledPixels, model: Model) -> float:
-    """Root mean square of what steps `FINER` times as fine change of a colour in [0, 1], on some of the pixels."""
+    """Return the rms change of a colour in [0, 1] with steps `FINER` times as fine, on some of the pixels."""
     cuts = uniform_cuts(model.marching)
     squares = []
     for photo, pixels in zip(sample.photos, sample.pixels, strict=True):

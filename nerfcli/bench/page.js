@@ -120,8 +120,8 @@ function draw(name) {
       again();
     });
   }
-  const [at, asked] = decodeURIComponent(location.hash.slice(1)).split(/:(.*)/s);
-  const start = (at === name && part.points.find((p) => p.name === asked)) || part.points.find((p) => p.name === "default") || part.points[0];
+  const [at, wanted] = decodeURIComponent(location.hash.slice(1)).split(/:(.*)/s);
+  const start = (at === name && part.points.find((p) => p.name === wanted)) || part.points.find((p) => p.name === "default") || part.points[0];
   state.picked = start.name;
   again();
   behind(name, start);

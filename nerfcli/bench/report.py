@@ -20,7 +20,7 @@ JSON, CSV, PAGE = "bench.json", "bench.csv", "bench.html"
 
 
 def write_report(records: Records) -> tuple[Path, dict[str, Any]]:
-    """Write bench.json, bench.csv and bench.html of what was measured so far; when all is measured, pictures that are
+    """Write bench.json, bench.csv and bench.html of the measurements so far; when all is measured, pictures that are
     not on the page go, those of an earlier bench.
 
     Returns:

@@ -87,12 +87,12 @@ def _train_and_measure(job: dict[str, Any], send: Callable[[dict[str, Any]], Non
     began = time.perf_counter()
     scene, run = scenes.load(Path(job["scene"])), Path(job["run"])
     settings = TrainSettings.from_json(job["settings"])
-    told = 0.0
+    reported_at = 0.0
 
     def on_progress(progress: Progress) -> None:
-        nonlocal told
-        if time.monotonic() - told > 1.0:
-            told = time.monotonic()
+        nonlocal reported_at
+        if time.monotonic() - reported_at > 1.0:
+            reported_at = time.monotonic()
             send({"share": progress.share, "detail": f"step {progress.step}"})
 
     train(scene, run, settings, resume=False, notify=lambda text: None, on_progress=on_progress)

@@ -66,7 +66,7 @@ class Capture:
         colours: (N, 3) uint8 sRGB of the points, or None.
         observations: where the points were seen, or None.
         unit: of length: "arbitrary" or "metre".
-        unit_source: how a metre is known, for people; None where nobody said.
+        unit_source: how a metre is known, for people; None where unknown.
         pixels: which pixels of a photo with an EXIF orientation its camera refers to: "stored", as nearly all programs
             read them, or "upright", as it is shown.
         rescaled: for how many photos the intrinsics were given for another size: counts by that size and the photo's,

@@ -84,7 +84,7 @@ def main_options(version: bool = typer.Option(False, "--version", help="Show the
 
 def main() -> None:
     """Run the console script."""
-    # OpenMP's threads wait for work in a busy loop, for long if nobody says otherwise. Two commands of a pipeline on
+    # OpenMP's threads wait for work in a busy loop, for long by default. Two commands of a pipeline on
     # the same cores then wait for each other's waiting: 58 training steps in 10 s, where there are 245 with this.
     # libgomp reads it when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")

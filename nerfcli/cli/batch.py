@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from nerfcli.cli.console import out_of_memory_told, report_error
+from nerfcli.cli.console import out_of_memory_explained, report_error
 from nerfcli.errors import UserError
 
 STDIN = "-"
@@ -32,7 +32,7 @@ def for_each_input(source: str, work: Callable[[Path, bool], None]) -> None:
     for path in stdin_paths():
         count += 1
         try:
-            with out_of_memory_told():
+            with out_of_memory_explained():
                 work(path, True)
         except UserError as error:
             report_error(error, about=str(path))

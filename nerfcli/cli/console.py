@@ -152,7 +152,7 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def guarded(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
-            with out_of_memory_told():
+            with out_of_memory_explained():
                 return function(*args, **kwargs)
         except UserError as error:
             report_error(error)
@@ -172,7 +172,7 @@ def command(function: Callable[P, R]) -> Callable[P, R]:
 
 
 @contextmanager
-def out_of_memory_told() -> Iterator[None]:
+def out_of_memory_explained() -> Iterator[None]:
     """Turn the ways in which memory runs out into a UserError.
 
     Torch says it in a RuntimeError's text on the CPU, and in a subclass of RuntimeError on a GPU.

@@ -193,7 +193,7 @@ def requirements_of(text: str | None) -> "tuple[Requirement, ...]":
 
 
 def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None:
-    """Print what was measured in a few lines and a table; nothing of what was kept."""
+    """Print what was measured in a few lines and a table, leaving out results of earlier calls."""
     from nerfcli.evaluate.billboards import Shape
     from nerfcli.evaluate.ledger import Entry, summary_line
 

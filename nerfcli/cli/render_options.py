@@ -60,7 +60,7 @@ def depth_formats(text: str, *, outputs: tuple[str, ...], convention: str) -> tu
     """Return the formats in a comma-separated list.
 
     Raises:
-        typer.BadParameter: an unknown one, or one that cannot hold what is asked for.
+        typer.BadParameter: an unknown one, or one that cannot hold the requested outputs.
     """
     from nerfcli.export.settings import FORMATS
 
@@ -159,7 +159,7 @@ def colour_range_of(text: str | None, *, outputs: tuple[str, ...]) -> tuple[floa
     """Parse LOW:HIGH; None if not given.
 
     Raises:
-        typer.BadParameter: anything else, or no depth is asked for.
+        typer.BadParameter: anything else, or no depth is requested.
     """
     if text is None:
         return None

@@ -11,7 +11,7 @@ from nerfcli.convert.stored_pixels import UPRIGHT
 from nerfcli.errors import UserError
 from nerfcli.scene import MODEL_FOLDER, SCENE_FILE
 
-# Formats of poses alone: their cameras were given, or are those of views that nobody photographed.
+# Formats of poses alone: their cameras were given, or belong to views without a photo.
 _WITHOUT_CAMERAS = ("tum", "kitti", "camera-path")
 _CAMERAS_FILES = ("cameras.bin", "cameras.txt")
 

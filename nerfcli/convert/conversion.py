@@ -67,7 +67,7 @@ class Conversion:
         capture: what was to be written.
         losses: what of it the format cannot hold; left out.
         loss_px: how far the lost terms of lenses move a pixel at most.
-        verification: of the written file; None if it was not asked for.
+        verification: of the written file; None if not requested.
         notes: what else the user should know.
     """
 

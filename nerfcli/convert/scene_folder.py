@@ -18,7 +18,7 @@ def losses_scene(capture: Capture) -> tuple[str, ...]:
     """List what a scene folder cannot hold of a capture.
 
     The names of photos lead to them from one folder; where they do not, photos get other names. Photos that the capture
-    lists and that have no file are told when the scene is loaded.
+    lists and that have no file are reported when the scene is loaded.
     """
     _, names = _named(capture)
     renamed = sum(frame.name != name for frame, name in zip(capture.frames, names, strict=True))

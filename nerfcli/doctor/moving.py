@@ -2,7 +2,7 @@
 
 Sought with care, since a false alarm costs more trust than a miss: a patch counts only if its matches move together,
 if hardly any match in it follows the camera, and if no single geometry of two views explains it together with the rest.
-What moves along the epipolar lines cannot be told from what stands nearer, and is missed.
+What moves along the epipolar lines cannot be distinguished from something nearer, and is missed.
 """
 
 from dataclasses import dataclass

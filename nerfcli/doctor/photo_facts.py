@@ -159,7 +159,7 @@ def _opaque(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _features(rgb: np.ndarray, seen: np.ndarray, *, local_detail: np.ndarray, most_features: int) -> PhotoFeatures:
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     found = find_features(grey, longer_side_px=max(grey.shape), most=most_features, used=seen)
-    # At equal response there may be a few more than were asked for.
+    # At equal response there may be a few more than were requested.
     clearest = np.argsort(-found.responses, kind="stable")[:most_features]
     height, width = grey.shape
     pixels = found.pixels[clearest].astype(np.float32)

@@ -3,7 +3,7 @@
 predictions/color/NAME.png         the rendered picture, 8 bit sRGB
 predictions/gt-color/NAME.png      the photo as it was compared: upright, averaged to the size of the training
 predictions/mask/NAME.png          255 where pixels count; only where some do not
-predictions/color-float/NAME.npy   the rendered picture before rounding, float32; only if it is asked for
+predictions/color-float/NAME.npy   the rendered picture before rounding, float32; only on request
 """
 
 import json
@@ -17,7 +17,7 @@ from nerfcli.media.images import write_png
 
 PREDICTIONS = "predictions"
 INFO = "info.json"
-# What may be asked for: 8-bit pictures, or unrounded ones besides.
+# Choices: 8-bit pictures, or unrounded ones besides.
 KINDS = ("png", "float")
 
 

@@ -10,7 +10,7 @@ from nerfcli.runs.config import RunConfig
 
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 _ALIGNED = ("", "_colour_aligned", "_pose_aligned")
-# What may be asked for: the means of metrics.json, the share of photos with a pose, and what the run cost.
+# What may be required: the means of metrics.json, the share of photos with a pose, and what the run cost.
 NAMES = (
     *(f"{measure}{aligned}" for measure in ("psnr", "ssim") for aligned in (*_ALIGNED, "_float", "_right_half")),
     *("lpips", "lpips_colour_aligned", "registered", "training_seconds", "seconds_per_image"),

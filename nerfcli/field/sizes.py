@@ -11,7 +11,7 @@ from nerfcli.field.hash_field import HashFieldSettings
 from nerfcli.field.interface import FieldSettings
 from nerfcli.field.voxel_field import VoxelFieldSettings
 
-# A field may be larger than asked for by this share: a hash grid of 2^20 bytes and its networks are 1 MB, too.
+# A field may be larger than requested by this fraction: a hash grid of 2^20 bytes and its networks are 1 MB, too.
 SLACK = 0.07
 # What the kinds take when nothing is said.
 VOXEL_BYTES, NETWORK_BYTES = 2**26, 2**18

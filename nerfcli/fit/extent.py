@@ -86,7 +86,7 @@ def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -
         fills_frame: whether there is more in the photos than an object cut out by alpha.
 
     Raises:
-        UserError: no contraction is asked for, and there are too few points to see where the scene ends.
+        UserError: "none" is requested as the contraction, and there are too few points to see where the scene ends.
     """
     contraction = _contraction(settings, fills_frame)
     if contraction == "none" and not fills_frame:

@@ -55,9 +55,9 @@ class NewtonSteps(nn.Module):
 
             (H + damping diag(H) + L)^-1 (slope + L so_far),  L = holding diag(mean H) / spread^2, in square pixels
 
-        L holds moves and turns back, each as one kind, by how little all photos have moved or turned so far: what was
-        wrong with the cameras is told by what the photos are sure of, and that kind of change is preferred where they
-        are not. Centres that were right stay so, and so do cameras.
+        L holds moves and turns back, each as one kind, by how little all photos have moved or turned so far: errors
+        of the cameras show in directions that the photos determine, and that kind of change is preferred in those that
+        they do not. Centres that were right stay so, and so do cameras.
 
         Args:
             slope: (P, 6) the sum of the gradients of a step's rays.

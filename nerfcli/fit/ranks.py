@@ -18,7 +18,7 @@ from nerfcli.errors import LOST_RANK, UserError
 
 
 class Alone:
-    """One process, which has nothing to add up and nobody to talk to."""
+    """One process, alone: sums are its own, and nothing is sent."""
 
     rank, count = 0, 1
 

@@ -86,7 +86,7 @@ class FirstBad:
 
 
 def that_must_be_finite(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors of a state that must be finite; cells that nobody has looked into yet are infinitely full."""
+    """Return the tensors of a state that must be finite; cells that no step has evaluated yet have infinite density."""
     return {name: tensor for name, tensor in state.items() if name != "optical_depth"}
 
 

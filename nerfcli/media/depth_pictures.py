@@ -72,7 +72,7 @@ class DepthMeta:
         background_distance: what a ray that hits nothing counts as, where the convention needs that.
         min_views, min_parallax_deg: coverage and parallax below which a pixel has no depth.
         quantity: one of `QUANTITIES`.
-        unit_source: how the unit is known ("gps", "distances", ...); None where nobody wrote it down.
+        unit_source: how the unit is known ("gps", "distances", ...); None where unknown.
         units_per_level: of files of whole numbers: value = level * units_per_level.
         error_bounds: what rendering states about its own error, by name; plain numbers and text. They bound the
             rendering of the field, not the field.

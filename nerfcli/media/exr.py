@@ -1,7 +1,7 @@
 """The maps of a picture as one float32 OpenEXR file, under the channel names that compositing programs look for.
 
     R, G, B (, A)     colour in linear light, primaries of sRGB; with A premultiplied, as OpenEXR defines it
-    Z                 the depth that was asked for: Nuke's depth.Z, the Depth pass of Blender
+    Z                 the requested depth: Nuke's depth.Z, the Depth pass of Blender
     Y                 the depth once more where there is no colour: OpenCV and imageio look for Y, R, G, B alone, and
                       give zeros without a word where a file has none of them
     opacity.V         1 - transmittance

@@ -1,6 +1,6 @@
 """Facts about a depth, picture or video file: its description, size, and range of values.
 
-A file of another program is described as what it is: numbers whose convention nobody states.
+A file of another program is described as what it is: numbers without a stated convention.
 """
 
 import json

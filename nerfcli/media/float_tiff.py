@@ -62,7 +62,7 @@ def read_tiff(path: Path) -> tuple[np.ndarray, DepthMeta]:
 
 
 def read_any_tiff(path: Path) -> tuple[np.ndarray, str]:
-    """Read the first page of a TIFF and its ImageDescription, whoever wrote it.
+    """Read the first page of a TIFF and its ImageDescription, written by any program.
 
     Raises:
         UserError: missing or damaged.

@@ -138,7 +138,7 @@ def dense_depths(
 
 
 def _points_shown(photos: Sequence[LoadedPhoto], tracks: Tracks) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangulated points (P, 3), and whether each photo shows them (photos, P), whoever found them."""
+    """Return the triangulated points (P, 3), and whether each photo shows them (photos, P)."""
     surface = triangulate([photo.frame for photo in photos], tracks)
     found = np.isfinite(surface.misses_px)
     count = tracks.count

@@ -29,7 +29,7 @@ def match(photos: Sequence[LoadedPhoto], *, threads: int) -> tuple[Matches, ...]
     pairs = chosen_pairs(photos)
     wanted = sorted({index for pair in pairs for index in pair})
     own_threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # a photo per thread, and no more threads than were asked for
+    cv2.setNumThreads(1)  # a photo per thread, and no more threads than requested
     try:
         with ThreadPoolExecutor(max(1, threads)) as pool:
             features = dict(zip(wanted, pool.map(lambda index: _features(photos[index]), wanted), strict=True))

@@ -23,8 +23,8 @@ def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray)
     """
     if len(places) < 3:
         return np.zeros((len(wanted), 3))
-    told = _left_out(lambda o: _interpolated(places[o], log_gains[o], places[~o])[0], log_gains)
-    if told >= _left_out(lambda o: log_gains[o].mean(0), log_gains):
+    by_place = _left_out(lambda o: _interpolated(places[o], log_gains[o], places[~o])[0], log_gains)
+    if by_place >= _left_out(lambda o: log_gains[o].mean(0), log_gains):
         return np.zeros((len(wanted), 3))
     return _interpolated(places, log_gains, wanted)
 

@@ -25,7 +25,7 @@ from nerfcli.runs.settings import TrainSettings
 _BYTES_PER_SAMPLE = 6000
 # The field, its gradient, two moments, and those but the gradient once more in the sentinel's copy.
 _COPIES_OF_FIELD = 7
-# What other kinds than the hash grid take where nobody says how much.
+# Default size of other kinds than the hash grid.
 _LARGEST_FIELD_BYTES = 64 * 2**20
 # A photo that is being decoded: Pillow's picture, the array, and what is made on the way to the smaller one.
 _BYTES_PER_DECODED_PIXEL = 12

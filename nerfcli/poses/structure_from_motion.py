@@ -51,18 +51,18 @@ def estimate_poses(
 
     Writes sparse/0 (the model with the most photos), poses_report.json and, last, scene.json; the database of features
     and matches stays beside them. A scene that stands at `scene_dir` is replaced. What an earlier call left there,
-    complete or not, is gone on from: only what depends on photos or settings that have changed is done again.
+    complete or not, is continued: only what depends on photos or settings that have changed is done again.
 
     Args:
         photos_dir: the folder with the photos.
         scene_dir: the folder to write.
         settings: see `PoseSettings`.
-        notify: told what the user should know, one sentence at a time.
-        progress: told (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few features,
-            "features" (per photo, of those that were asked for), "pair" where look-alikes are sought, "match",
-            "map" and "check", in this order.
+        notify: receives messages for the user, one sentence at a time.
+        progress: receives (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few
+            features, "features" (per photo, of those requested), "pair" where look-alikes are sought, "match",
+            "map", "merge" where the mapper leaves several models, and "check", in this order.
         limits: see `Limits`.
-        planned: told the plan before the long work starts.
+        planned: receives the plan before the long work starts.
         given: intrinsics that are known beforehand.
 
     Raises:

@@ -48,7 +48,7 @@ class MeasuredError:
     Args:
         colour: of the largest channel, sRGB in [0, 1], between intervals as they are and cut into 4.
         colour_halved: the same between intervals cut into 2 and into 4: where it is much smaller, the steps converge.
-        depth, depth_halved: the same of the depth that was asked for, in the unit of the scene; None without depth.
+        depth, depth_halved: the same for the requested depth, in the unit of the scene; None without depth.
         depth_stop: what the tolerance changed of depth, which has no bound of its own: the light that was left out may
             end anywhere; None without depth.
     """

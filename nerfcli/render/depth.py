@@ -25,7 +25,7 @@ from nerfcli.kernels import LightEnds
 CONVENTIONS = ("conditional", "moment", "background", "max-weight", "median")
 AXES = ("ray", "z")
 QUANTILE = "quantile:"
-# `LightEnds.quantiles` of a picture: the median for the disagreement, then the one that was asked for.
+# `LightEnds.quantiles` of a picture: the median for the disagreement, then the requested one.
 MEDIAN = 0.5
 
 

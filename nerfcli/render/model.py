@@ -54,7 +54,7 @@ class Model:
         background: sRGB behind everything, for pictures without alpha.
         training_from_scene: the invertible normalisation.
         unit: unit of length of the scene's own frame, "arbitrary" or "metre".
-        unit_source: how a metre is known; None where nobody wrote it down.
+        unit_source: how a metre is known; None where unknown.
         log_exposure: the mean of the training photos by EXIF, if the model knows photos of different exposures; see
             `photos.exif_exposure`.
         exif_slope: by how much gains follow the exposures that EXIF tells, see `held_out_exposure.exif_slope`.

@@ -52,7 +52,7 @@ class RenderedPicture:
     Args:
         rgb: (H, W, 3) sRGB in [0, 1], composited on the background; on black, it is premultiplied by the opacity.
         opacity: (H, W) in [0, 1].
-        depth: (H, W) as requested; None when not asked for.
+        depth: (H, W) as requested; None when not requested.
         spread: (H, W) standard deviation of where light ends, along the axis of depth; None without depth.
         disagreement: (H, W) |median - conditional| along that axis; None without depth.
         median: (H, W) along that axis, where half of all light is absorbed; None without depth.

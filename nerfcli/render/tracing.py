@@ -1,7 +1,7 @@
 """Trace rays: colour, distribution of depth, and the error of early stopping.
 
 Two things are left out for speed. A ray ends where little light is left (the stop), and samples whose weights are
-negligible are not asked for their colour, which is taken as grey. Together they change a colour by at most the
+negligible have their colour taken as grey, without evaluating it. Together they change a colour by at most the
 tolerance, and `RaysSeen.truncation_error` bounds by how much they changed each one. The bound is one on the rendering
 of the field with its steps, not on the field.
 """

@@ -33,10 +33,10 @@ class Components:
         background: behind the field: "black"; a learned colour, "constant" or by direction ("sphere"); "random" colours
             in training, for photos with alpha; "auto" is random for photos with alpha and black for all others.
         view: how colours depend on the direction they are seen from: the highest degree of the spherical harmonics
-            that the colour network is told, 0 to 3. 0: not at all.
-        exposure: gains of the photos, see `field.exposure`: "none", those that "exif" tells, or "learned" from there.
-        cameras: what of the training photos' cameras learns with the field: "poses"; "focal", the focal length of each
-            lens; "all", both and radial distortion; or nothing, "fixed". See `refinement`.
+            that the colour network takes, 0 to 3. 0: not at all.
+        exposure: gains of the photos, see `field.exposure`: "none", those in "exif", or "learned" from there.
+        cameras: which camera parameters of the training photos are trained with the field: "poses"; "focal", the focal
+            length of each lens; "all", both and radial distortion; or nothing, "fixed". See `refinement`.
         masks: what their black means: "ignore", not to be looked at; or "empty", nothing is there, as with alpha.
         points: weight of `kernels.RaySums.off_target`.
         stereo: whether the points include pixels of training photos whose depth stereo matching tells, see
@@ -46,7 +46,7 @@ class Components:
         near: whether gradients near a camera are scaled down; see `reference.scale_gradients`.
         distortion: weight of `kernels.RaySums.distortion`; 0.05 is best or as good as any on real and synthetic
             captures.
-        antialias: whether details smaller than a pixel fade out of what it sees; see `reference.hash_encode`.
+        antialias: whether details smaller than a pixel fade out of its view; see `reference.hash_encode`.
         pixels: which ones are drawn: from "anywhere", or half of them where the "error" is; see `error_map`.
     """
 

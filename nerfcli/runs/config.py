@@ -25,7 +25,7 @@ class RunConfig:
     """Source and settings of a run; entries missing in files of earlier versions have their defaults.
 
     Args:
-        settings: as they were asked for, with the downscale and contraction that were chosen.
+        settings: as requested, with the downscale and contraction that were chosen.
         scene: the folder of the scene, relative to where the user then was, or absolute.
         scene_kind: the format of the scene, see `Scene`.
         unit, unit_source: of length, see `Scene`.
@@ -67,7 +67,7 @@ class RunConfig:
 
         Args:
             scene: what is trained on.
-            settings: as they were asked for.
+            settings: as requested.
             factor: by which photos are made smaller.
             contraction: of the field.
             selection: how the components were chosen, where the scene decided.

@@ -29,7 +29,7 @@ class KnownDistance:
         name: what it is between, for people.
         units: its length in the scene.
         metres: its true length.
-        tolerance: standard error of `metres` in metres, or None where nobody said.
+        tolerance: standard error of `metres` in metres, or None where unknown.
     """
 
     name: str

@@ -104,7 +104,7 @@ class Race:
         kept, the rest once more beside it; and so on. Removals last, as what is added may do their work.
 
         Args:
-            additions, removals: changes of the model that was asked for.
+            additions, removals: changes to the requested model.
             rules: for those of the additions that more than a trial speaks for; else `judge_one`.
         """
         self.decisions = {change: untried(*change, NO_TIME) for change in (*additions, *removals)}

@@ -86,7 +86,7 @@ def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components,
     or poses that do not fit; the logarithm of the length's factor, which is 0 elsewhere; and the decisions.
 
     Trials cannot decide about lengths: a model that has begun with a wrong one is bent to fit, and stays so for long.
-    For the same reason a model that is asked for with lenses that learn begins with the length that features tell. And
+    For the same reason a requested model with trained lenses begins with the length that features tell. And
     of poses a trial is too short to show more than that they do no harm, which features have shown.
     """
     check, learns = facts.cameras, requested.cameras in LEARN_FOCAL

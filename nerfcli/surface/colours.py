@@ -45,7 +45,7 @@ def point_colours(model: Model, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     scale = model.training_from_scene.scale
     places = model.training_from_scene.apply(points)
-    # A ray of a single interval is asked for its colour in its middle, and for nothing else.
+    # A ray of a single interval has its colour evaluated in its middle, and nothing else.
     cuts = torch.tensor([0.0, 2.0])
     total = np.zeros((len(points), 3))
     density = np.zeros(len(points))

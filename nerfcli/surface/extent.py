@@ -13,7 +13,7 @@ from nerfcli.surface.views import DepthView, depth_views, spread_frames
 LOOK_VIEWS, LOOK_PX = 24, 64
 # Of the points seen, those that the box leaves out at each of its sides, and by how much it is then made larger.
 _OUTSIDE, _MARGIN = 0.01, 0.05
-# Voxels along the longest side of a box, at most and at least, where nobody says how large they are.
+# Voxels along the longest side of a box, at most and at least, by default.
 FINEST_CELLS, COARSEST_CELLS = 384, 64
 # Pixels that a voxel is wide.
 _PIXELS_PER_VOXEL = 1.5

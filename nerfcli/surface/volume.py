@@ -10,10 +10,10 @@ from nerfcli.render.model import Model
 from nerfcli.surface.colours import point_colours
 from nerfcli.surface.grid import Grid
 
-# Voxels along the longest side where nobody says how large they are.
+# Voxels along the longest side by default.
 CELLS = 160
 _LAYERS_AT_A_TIME = 8
-# Voxels that take less of the light than this have no colour: nobody would see it.
+# Voxels that take less of the light than this have no colour: it would not be seen.
 _VISIBLE = 1e-3
 
 

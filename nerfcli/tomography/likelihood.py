@@ -144,7 +144,7 @@ class Gaussian:
 def likelihood_of(scan: Scan, views: np.ndarray, *, binning: int = 1) -> Poisson | Gaussian:
     """Build the likelihood of some views of a scan.
 
-    Transmissions are counts of an open beam of 1 in photons. Where nobody knows how many photons a value stands for,
+    Transmissions are counts of an open beam of 1 in photons. Where the number of photons per value is unknown,
     it is estimated from the noise between neighbouring pixels, see `photons_per_value`.
 
     Args:

@@ -41,7 +41,7 @@ class Scan:
         values: (V, rows, columns) float32.
         open_beam: detector values without object, above the dark ones, that can be broadcast to `values`; counts only.
         dark: detector values without beam, likewise; counts only.
-        photons_per_value: how many photons one detector value stands for; None where nobody knows. For "transmission",
+        photons_per_value: how many photons one detector value stands for; None where unknown. For "transmission",
             how many photons a transmission of 1 stands for.
         usable: bool, broadcast to `values`: False for dead pixels and what else must not be believed; None for all.
         held_out: sorted indices of the views that no reconstruction reads.

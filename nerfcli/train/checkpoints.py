@@ -146,7 +146,7 @@ def decisions_of(run: Path, settings: TrainSettings, description: dict[str, Any]
     """Return the decisions of an earlier call, from its last checkpoint and its settings.
 
     Raises:
-        UserError: another version wrote it, or it was begun with another contraction than is asked for.
+        UserError: another version wrote it, or it was begun with another contraction than is requested.
     """
     if description.get("format") != STATE_FORMAT:
         raise UserError(f"{run / STATE} was written by another version of nerfcli", "train again with --overwrite")

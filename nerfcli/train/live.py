@@ -68,7 +68,7 @@ class LiveTraining:
                 if request.paused:
                     self._wait(lambda: write(True))
                     write(False)
-        except UserError as error:  # a training does not end because nobody can look at it
+        except UserError as error:  # a training goes on without its viewer
             self._failed = True
             self._notify(f"the training can no longer be viewed: {error.message}")
         self._next_look = time.monotonic() + LOOK_SECONDS
@@ -83,7 +83,7 @@ class LiveTraining:
             time.sleep(seconds)
 
     def _request(self) -> Request | None:
-        """Return what viewers want; None where nobody looks.
+        """Return what viewers want; None without a viewer.
 
         Raises:
             KeyboardInterrupt: somebody wants the training to end.

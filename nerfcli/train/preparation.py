@@ -70,7 +70,7 @@ class Prepared:
         extent: of the field.
         pool: the training photos.
         selection: how the scene decided on the components; None where it did not.
-        log_exposure: the mean of the training photos by EXIF; None where exposures are not asked for, or not known.
+        log_exposure: the mean of the training photos by EXIF; None where exposures are not learned or unknown.
         log_gains: (photos, 3) logarithms of their exposures relative to it, as the trials found them or as far as EXIF
             tells; else 0.
         log_focal: logarithm of the factor of focal lengths to start from.
@@ -155,7 +155,7 @@ def prepare(
 
     Args:
         scene: photos, cameras and split.
-        settings: as asked for.
+        settings: as requested.
         run: where files may stand that hold what does not fit into memory.
         memory_bytes: that may be resident, or be used on a GPU.
         begun: decisions of a training that goes on; None for a new one.

@@ -9,7 +9,7 @@ import torch.distributed as dist
 from nerfcli.fit.ranks import ALONE, Alone, Ranks, lost_ranks_reported
 from nerfcli.torchrun import is_one_of_several
 
-# Photos are loaded and components are selected while others wait; to meet, or for a step, nobody waits long. A process
+# Photos are loaded and components are selected while others wait; the wait to meet, or for a step, is short. A process
 # that ends later is noticed at once, by its closed connections: only a machine that falls silent takes so long.
 PREPARATION, STEP = timedelta(hours=12), timedelta(minutes=5)
 

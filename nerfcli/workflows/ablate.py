@@ -86,7 +86,7 @@ def ablate_scene(
             holdout=holdout,
             warn=warn,
         )
-        # Three times as large as the field, and nobody resumes from here.
+        # Three times as large as the field, and an ablation never resumes from it.
         (target / STATE).unlink(missing_ok=True)
         return run
 

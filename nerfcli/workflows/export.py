@@ -95,7 +95,7 @@ def export_run(
 
 
 def default_target(run: Path, to: str, suffix: str | None = None) -> Path:
-    """Return where an export goes if nobody says: beside the run, named after it."""
+    """Return the default path of an export: beside the run, named after it."""
     place = run.resolve()
     name = place.name if to == "page" else f"{place.name}-{to}"
     return (run if run.name not in ("", "..") else place).with_name(name + (suffix or TARGETS[to][0]))

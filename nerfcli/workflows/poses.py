@@ -22,6 +22,7 @@ _STAGES = {
     "pair": "photos, finding similar ones",
     "match": "pairs compared",
     "map": "photos registered",
+    "merge": "sub-models, merging them",
     "check": "checks of the poses",
 }
 

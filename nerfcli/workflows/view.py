@@ -1,6 +1,6 @@
 """Serve the interactive page of a run: fields of its training as they come, pictures by the CPU for who has no GPU.
 
-Nothing heavy is imported before a page is opened: a server that nobody looks at costs a training next to nothing.
+Nothing heavy is imported before a page is opened: a server without a viewer costs a training next to nothing.
 """
 
 import getpass

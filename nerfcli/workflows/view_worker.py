@@ -1,6 +1,6 @@
 """The server of `train --view`, a process of its own: `python -m nerfcli.workflows.view_worker RUN`.
 
-A training then computes the same, in the same time, whoever looks at it or does not.
+A training then computes the same, in the same time, with or without a viewer.
 """
 
 import os

@@ -2,7 +2,7 @@
 
 version                 1
 kind, unit              text
-unit_source             text, empty where nobody said how a metre is known; may be missing, as pixels may
+unit_source             text, empty where the source of the scale is unknown; may be missing, as pixels may
 pixels                  text: "stored" or "upright", see `Capture`
 names                   (F,) text
 images, masks           (F,) text: paths relative to the file's folder; empty where a frame has none

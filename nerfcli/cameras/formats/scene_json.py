@@ -33,7 +33,7 @@ class Description:
         listed: names of frames by what they are for: "test", "val", or "unused" of those that the split leaves out.
         masks: the folder of the masks, or the mask of each photo that has one.
         depth_bounds: nearest and farthest z by the name of the frame, in scene units; empty where they are not known.
-        provenance: what made the scene: command, settings, versions; empty where nobody wrote it down.
+        provenance: what made the scene: command, settings, versions; empty where unknown.
     """
 
     path: Path

@@ -1,7 +1,7 @@
 """Judge the component that becomes the scene, and keep the numbers by which the report lists all of them.
 
 Components are numbered by size, after the second chance of the largest: it may take in photos of the others, or lose
-some. So whoever asks for a smaller one gets the one that the report lists under this number.
+some. A request for a smaller one therefore gets the one that the report lists under this number.
 """
 
 from collections.abc import Callable, Sequence

@@ -25,8 +25,8 @@ _PAIR_FACTOR = 2147483647
 def register_photos(job: Job) -> None:
     """Have the job's photos and no others in the database, with the ids and cameras that the job gives them.
 
-    Features stay. Verified matches of photos whose camera has changed go, as do all traces of photos that the job does
-    not have.
+    Features stay. Verified matches go if they were verified with intrinsics that have changed, as do all traces of
+    photos that the job does not have.
     """
     job.database.parent.mkdir(parents=True, exist_ok=True)
     cameras = {number: camera_of_group(group) for number, group in enumerate(job.groups, start=1)}
@@ -36,17 +36,20 @@ def register_photos(job: Job) -> None:
         for number, (image_id, file) in enumerate(zip(job.image_ids, job.files, strict=True))
     }
     with closing(pycolmap.Database.open(str(job.database))) as database:
-        described = {camera.camera_id: _described(camera) for camera in database.read_all_cameras()}
+        before = {camera.camera_id: camera for camera in database.read_all_cameras()}
         there = {
-            image.image_id: (image.name, image.camera_id, described[image.camera_id])
+            image.image_id: (image.name, image.camera_id, _described(before[image.camera_id]))
             for image in database.read_all_images()
         }
     if there == wanted:
         return
     forget_features(job, there.keys() - wanted.keys())
-    forget_geometries(
-        job, [image_id for image_id in there.keys() & wanted.keys() if there[image_id][2] != wanted[image_id][2]]
-    )
+    verified_otherwise = [
+        image_id
+        for image_id in there.keys() & wanted.keys()
+        if _verified_with(before[there[image_id][1]]) != _verified_with(cameras[wanted[image_id][1]])
+    ]
+    forget_geometries(job, verified_otherwise)
     with _edited(job) as database:
         for table in ("frame_data", "frames", "rig_sensors", "rigs", "images", "cameras", "pose_priors"):
             database.execute(f"DELETE FROM {table}")
@@ -68,13 +71,14 @@ def register_photos(job: Job) -> None:
 
 
 def camera_of_group(group: CameraGroup) -> pycolmap.Camera:
-    """Return the camera model of a group, with its intrinsics if given, or EXIF's focal length."""
+    """Return the camera model of a group, with its intrinsics if given, or with an estimated focal length or EXIF's."""
     if group.params is not None:
         camera = pycolmap.Camera.create_from_model_name(1, group.model, 1.0, group.width, group.height)
         camera.params = list(group.params)
         camera.has_prior_focal_length = True
         return camera
-    focal_px = usual_focal_px(group.width, group.height) if group.focal_px is None else group.focal_px
+    known_px = group.focal_px if group.estimated_focal_px is None else group.estimated_focal_px
+    focal_px = usual_focal_px(group.width, group.height) if known_px is None else known_px
     camera = pycolmap.Camera.create_from_model_name(1, group.model, focal_px, group.width, group.height)
     camera.has_prior_focal_length = group.focal_is_prior
     return camera
@@ -160,6 +164,13 @@ def evidence(job: Job) -> list[dict[str, Any]]:
 
 def _described(camera: pycolmap.Camera) -> tuple[Any, ...]:
     return (camera.model.name, camera.width, camera.height, *camera.params.tolist(), camera.has_prior_focal_length)
+
+
+def _verified_with(camera: pycolmap.Camera) -> tuple[Any, ...]:
+    """Return what two-view geometry depends on: without a prior, fundamental matrices need no focal length."""
+    if camera.has_prior_focal_length:
+        return _described(camera)
+    return (camera.model.name, camera.width, camera.height)
 
 
 def _forget_pairs(database: sqlite3.Connection, image_id: int, tables: Iterable[str]) -> None:

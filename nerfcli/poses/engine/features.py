@@ -13,9 +13,9 @@ from nerfcli.poses.engine.database import clear_matches, forget_features, keep_g
 from nerfcli.poses.input.job import Job, LaidOutMask, Report
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
-# A photo with this share of the features that were asked for is rich enough; measured poses are no better with more.
+# A photo with this share of the requested features is rich enough; measured poses are no better with more.
 _RICH_SHARE = 0.5
-# A mask that leaves less than an eighth of a picture gets no more: fine features at noise level help nobody.
+# A mask that leaves less than an eighth of a picture gets no more: fine features at noise level do not help.
 _MOST_FEATURES_FOR_MASK = 8
 # Matches are written, and so progress is seen and kept, after each block.
 _PAIRS_PER_BLOCK = 128
@@ -164,7 +164,7 @@ def _stage_file(job: Job, stage: str) -> Path:
 def _watched(stage: str, done: Callable[[], int], total: int, report: Report) -> Iterator[None]:
     """Report `done()` once a second while pycolmap works, at the beginning and at the end.
 
-    pycolmap has no callbacks for these stages, so the database is asked, through pycolmap: see `database`.
+    pycolmap has no callbacks for these stages, so the database is polled, through pycolmap: see `database`.
     """
     finished = threading.Event()
 

@@ -16,6 +16,7 @@ import pycolmap
 from nerfcli.multiview.graph import connected_groups
 from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
+from nerfcli.poses.engine.initial_focal import with_focal_lengths
 from nerfcli.poses.engine.mapped import Mapped
 from nerfcli.poses.engine.mapping import MapperOptions, map_photos
 from nerfcli.poses.input.job import Job, Report, Tell
@@ -62,7 +63,7 @@ class _Ladder:
         self._report = report
         self._tell = tell
         self._photos = len(job.files)
-        self._told = 0
+        self._results_reported = 0
         self._announced = ""
 
     def announce(self, what: str, *, takes: float = 0.0) -> None:
@@ -75,11 +76,11 @@ class _Ladder:
 
     def tell_results(self) -> None:
         """Report the results that have not been reported yet."""
-        for rung in self.rungs[self._told :]:
+        for rung in self.rungs[self._results_reported :]:
             largest, *others = rung["models"] or ["none"]
             also = f" (and {len(others)} smaller models)" if len(others) > 1 else f" + {others[0]}" if others else ""
             self._tell(f"{rung['what']}: {largest}{also} of {self._photos} photos registered")
-        self._told = len(self.rungs)
+        self._results_reported = len(self.rungs)
 
     def attempt(self, what: str, job: Job, start: MapperOptions) -> None:
         """Map once; the result counts if it places more photos than the best so far."""
@@ -91,7 +92,13 @@ class _Ladder:
         if len(models) > 1:
             output = Path(job.folder) / f"merged_{number}"
             merged = merge_models(
-                models, job.database, output=output, seed=job.seed, threads=job.threads, fixed=job.fixed_cameras
+                models,
+                job.database,
+                output=output,
+                seed=job.seed,
+                threads=job.threads,
+                fixed=job.fixed_cameras,
+                report=self._report,
             )
             if _placed(merged) > _placed(models):
                 self._take("sub-models merged", merged, job)
@@ -154,15 +161,17 @@ class _Ladder:
 def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     """Map a job's photos, with as many attempts as it takes.
 
-    The first attempt has pycolmap's own thresholds. If it places less than half of the photos with a focal length from
-    EXIF, the next one starts without it. If its lens came out wide or it leaves out many photos, the next
-    one starts from a fisheye, where pairs of photos say that it was one. If photos that match some other one well are
-    still left out, the next ones start from a pair with a smaller baseline, from the strongest pair that was left out,
+    The first attempt has pycolmap's own thresholds, and starts from focal lengths of pairs of photos where EXIF has
+    none to rely on. If it places less than half of the photos with a focal length from EXIF, the next one starts
+    without it. If its lens came out wide or it leaves out many photos, the next one starts from a fisheye, where pairs
+    of photos say that it was one. If photos that match some other one well are still left out, the next ones start from
+    a pair with a smaller baseline, from the strongest pair that was left out,
     and with low angles; of many photos, only if a quarter is left out. Then all pairs are compared that were not, and
     more features are sought in the photos' full size. Last, single photos are placed by the points that they show (see
     `localise`). Where the camera only turned, nothing more is tried. If the first attempt is not the last, `tell`
     receives each attempt and its result.
     """
+    job = with_focal_lengths(job, tell)
     ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, MapperOptions())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
@@ -170,7 +179,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
         ladder.tell_results()
         tell("not trying anything else: the camera turned on the spot")
         return replace(ladder.best, attempts=ladder.rungs)
-    job = _without_exif(ladder, job, report, share=ladder.share(featured))
+    job = _without_exif(ladder, job, report, tell, share=ladder.share(featured))
     job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
     _other_starts(ladder, job, tell)
     compared = set(job.pairs)
@@ -244,7 +253,7 @@ def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
         step()
 
 
-def _without_exif(ladder: _Ladder, job: Job, report: Report, *, share: float) -> Job:
+def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, share: float) -> Job:
     """Start without EXIF's focal lengths, if little is placed with them; the job of the better result."""
     bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
     if share >= _LITTLE_SHARE or bare.groups == job.groups:
@@ -253,6 +262,7 @@ def _without_exif(ladder: _Ladder, job: Job, report: Report, *, share: float) ->
     ladder.announce(what)
     register_photos(bare)  # which takes out what was verified with the other focal length
     match(bare, bare.pairs, report)
+    bare = with_focal_lengths(bare, tell)
     ladder.attempt(what, bare, MapperOptions())
     if ladder.best.job is bare:
         return bare

@@ -49,14 +49,14 @@ def likeness(descriptors: Sequence[np.ndarray], report: Report) -> np.ndarray:
 
     Args:
         descriptors: per photo (features, 128) whole numbers up to 255.
-        report: told ("pair", photos done, photos in all).
+        report: receives ("pair", photos done, photos in all).
 
     Returns:
         (photos, photos) counts, symmetric, 0 on the diagonal.
     """
     count = len(descriptors)
     most = max((len(rows) for rows in descriptors), default=0)
-    # Photos with fewer features are filled with zeros, which are nobody's clear neighbour.
+    # Photos with fewer features are filled with zeros, which are no photo's clear neighbour.
     padded = np.zeros((count, max(most, 2), 128), np.float32)
     for photo, rows in enumerate(descriptors):
         padded[photo, : len(rows)] = rows

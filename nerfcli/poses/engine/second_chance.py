@@ -104,7 +104,8 @@ def second_chance(
     for number, (what, takes, make) in enumerate(hypotheses):
         left = max(most - (time.perf_counter() - start), 0.0)
         if number < len(hypotheses) - 1 and takes >= left:
-            tell(f"skipped, would take too long ({duration(takes)}, with {duration(left)} left): {what}")
+            why = f"it takes about {duration(takes)}, and {duration(left)} are left" if left > 0 else "no time is left"
+            tell(f"{what}: skipped, since {why}")
             continue
         tell(f"next: {what}" + (f" (about {duration(takes)})" if takes else ""))
         runner = checks()

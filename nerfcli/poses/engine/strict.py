@@ -72,7 +72,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
         job: all photos.
         training: its `training_part`.
         result: what the worker found for it.
-        report: told ("extract", ...), ("match", ...) and ("map", photos done, in all).
+        report: receives ("extract", ...), ("match", ...) and ("map", photos done, in all).
 
     Returns:
         The result, for all photos of the job, with "strict": how each held-out photo was placed, and the fingerprint of

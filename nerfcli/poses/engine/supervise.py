@@ -24,6 +24,7 @@ _STAGES = {
     "pair": "choosing pairs",
     "match": "matching photos",
     "map": "placing photos",
+    "merge": "merging sub-models",
     "check": "checking the poses",
 }
 _GO_ON = "completed work is kept; run the same command again to continue"
@@ -53,11 +54,11 @@ def run_worker(
     Args:
         job_path: the job's JSON file; the worker's log is written beside it.
         threads: for OpenMP inside pycolmap, -1 for all.
-        progress: told (stage, done, total).
+        progress: receives (stage, done, total).
         limits: the worker is ended when it goes beyond one of them.
         since: the time of `time.monotonic` from which the limit of time counts; None for now.
         lock: a descriptor that the worker inherits.
-        notify: told what the user should know, one sentence at a time.
+        notify: receives messages for the user, one sentence at a time.
 
     Raises:
         WorkerDiedError: the worker died; the text says while doing what, and its last words.

@@ -100,7 +100,7 @@ def with_object_masks(job: Job, featured: Job, tell: Tell) -> tuple[Job, dict[st
     Args:
         job: its photos get masks.
         featured: the job whose features are in the database, of the same photos or some of them.
-        tell: told in one sentence what was found.
+        tell: receives one sentence on what was found.
 
     Returns:
         The job, and None where there is nothing to report. Without masks that can be believed the job is as it was.

@@ -100,7 +100,7 @@ def choose_frames(seconds: np.ndarray, measures: Sequence[FrameMeasure], *, coun
     if not 1 <= count <= len(measures):
         raise ValueError(f"count must be within 1...{len(measures)}, got {count}")
     path = _path(seconds, np.array([measure.moved for measure in measures]))
-    # Stretch k begins with first[k]; each holds a frame at least, even where many are asked for of a few.
+    # Stretch k begins with first[k]; each holds a frame at least, even where more are requested than there are.
     first = np.searchsorted(path, path[-1] * np.arange(count) / count)
     first = np.maximum.accumulate(first - np.arange(count)) + np.arange(count)
     first = np.minimum(first, len(measures) - count + np.arange(count))
@@ -115,7 +115,7 @@ def _path(seconds: np.ndarray, moved: np.ndarray) -> np.ndarray:
     Between one anchor and the next the speed is constant, and the usual one is the median over these steps.
     """
     anchors = np.flatnonzero(moved >= MOVED_SHARE)
-    # Before the first step and behind the last one the picture moves by less than can be told.
+    # Before the first step and behind the last one the picture moves by less than can be measured.
     times = seconds[anchors]
     steps = np.diff(times)
     if len(steps) == 0:

@@ -18,7 +18,8 @@ class CameraGroup:
 
     choose: whether the model is only where to start, and a better one may be chosen. params: what is known of the
     intrinsics, in COLMAP's order. fixed: whether they stay as they are. focal_px is where the focal length starts by
-    EXIF, None if EXIF does not say; focal_is_prior: whether it may be relied on.
+    EXIF, None if EXIF does not say; focal_is_prior: whether it may be relied on. estimated_focal_px: where it starts by
+    pairs of its photos, see `engine.initial_focal`.
     """
 
     photos: tuple[int, ...]
@@ -30,6 +31,7 @@ class CameraGroup:
     fixed: bool = False
     focal_px: float | None = None
     focal_is_prior: bool = False
+    estimated_focal_px: float | None = None
 
     def without_exif(self) -> "CameraGroup":
         """Return the same group without EXIF's focal length."""

@@ -26,7 +26,7 @@ def lay_out_masks(
         photos: the photos, and files: their names below the worker's folder of photos.
         masks: the user's folder of masks.
         folder: where to write; made if need be.
-        notify: told which photos have no mask, and which are hidden by theirs.
+        notify: receives which photos have no mask, and which are hidden by theirs.
 
     Raises:
         UserError: no such folder, no mask in it for any photo, or masks that cannot be read or do not fit.

@@ -14,7 +14,7 @@ from nerfcli.errors import UserError
 from nerfcli.media.geodesy import east_north_up
 from nerfcli.poses.input.photos import Photo
 
-# What may be asked for. "auto" is one of the others, by the number of photos and what is known of them.
+# Choices. "auto" is one of the others, by the number of photos and what is known of them.
 PAIRINGS = ("auto", "exhaustive", "sequential", "retrieval", "spatial")
 
 # Up to here every photo is compared with every other one, whatever the names say.
@@ -54,7 +54,7 @@ def choose_pairs(photos: Sequence[Photo], *, rule: str = "auto") -> Pairing:
 
     Raises:
         ValueError: no such rule.
-        UserError: "spatial" is asked for, and a photo has no GPS position.
+        UserError: "spatial" is requested, and a photo has no GPS position.
     """
     if rule == "auto":
         rule = _best_rule(photos)

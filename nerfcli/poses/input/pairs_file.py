@@ -15,7 +15,7 @@ def read_pairs(path: Path, photos: Photos) -> Pairing:
     the two, help where more than one cut would do. Pairs with a photo that cannot be read are left out.
 
     Raises:
-        UserError: no such file, no pair in it, or a line that is no pair of two photos, told with its number.
+        UserError: no such file, no pair in it, or a line that is no pair of two photos, with its number.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

@@ -47,7 +47,7 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
 
     Args:
         folder: a folder with photos; its sub-folders are not searched.
-        progress: told (photos read, photos in all) after each photo.
+        progress: receives (photos read, photos in all) after each photo.
 
     Raises:
         UserError: no such folder, a file instead of a folder, no photos in it, or fewer than `MIN_PHOTOS` readable.
@@ -77,7 +77,7 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
 def camera_groups(photos: Iterable[Photo]) -> tuple[tuple[str, ...], ...]:
     """Group photos that may share intrinsics: same make, model, lens, focal length, upright size and crop.
 
-    Focal lengths within 2 % are the same one: autofocus moves them a little. Photos without EXIF are told apart by
+    Focal lengths within 2 % are the same one: autofocus moves them a little. Photos without EXIF are distinguished by
     their size alone. Groups and the names in them are in the order of `photos`.
     """
     groups: dict[tuple[object, ...], list[str]] = {}

@@ -22,6 +22,8 @@ _FEATURES_PER_LOOK = 256
 _FEATURES_PER_PIXEL = 0.015
 # Of the mapper: the first for few photos; the second for each other photo, since all are adjusted again and again.
 _MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.38, 0.0025
+# Of mapping, what merging its sub-models takes.
+_MERGE_SHARE = 0.2
 # Of the global mapper.
 _AT_ONCE_SECONDS_PER_PHOTO = 0.5
 _CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
@@ -121,9 +123,9 @@ class Outlook:
     The plan's seconds are stretched by how long the stage at hand has taken so far, after its first twentieth; those of
     later stages by the least that any stage was. The machine slows all of them, whereas what makes one of them slow is
     its own (matches of shiny things, poses of a dense walk). Work that an earlier call has done counts for nothing.
-    Which photos are enlarged to find more features in them is known only after the first search, and how many features
-    the matcher compares after the second; where that adds work, the share that is done stands still until it is true
-    again.
+    Which photos are enlarged to find more features in them is known only after the first search, how many features
+    the matcher compares after the second, and whether there are sub-models to merge after mapping; where that adds
+    work, the share that is done stands still until it is true again.
 
     Args:
         plan: for the stages that have not begun.
@@ -152,6 +154,8 @@ class Outlook:
         self._at = (stage, done, total)
         if stage == "enlarge":
             self._plan_enlarging(total)
+        if stage == "merge":
+            self._plan_merging()
         ratio = (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
         if self._begins_again(stage, ratio):
             self._share = 0.0
@@ -198,6 +202,12 @@ class Outlook:
         enlarge = _ENLARGED_FACTOR * extract * photos / max(self._plan.photos, 1)
         later = {stage: seconds for stage, seconds in self._plan.seconds.items() if stage != "extract"}
         self._seconds = {"extract": extract, "enlarge": enlarge, **later}
+
+    def _plan_merging(self) -> None:
+        """Put the merger of sub-models before the checks."""
+        before = {stage: seconds for stage, seconds in self._seconds.items() if stage not in ("merge", "check")}
+        merge = _MERGE_SHARE * self._plan.seconds.get("map", 0.0)
+        self._seconds = {**before, "merge": merge, "check": self._plan.seconds.get("check", 0.0)}
 
 
 def duration(seconds: float) -> str:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from nerfcli.holdout import DEFAULT_HOLDOUT
 from nerfcli.poses.input.pairs import PAIRINGS
 
-# What may be asked for as `camera_model`.
+# Choices of `camera_model`.
 CAMERA_MODELS = (
     "auto",
     "SIMPLE_PINHOLE",

@@ -1,8 +1,8 @@
 """Stages as files: what is complete, and on what it depends.
 
 A complete stage is a JSON file {"key", "content", "seal"} in the work folder. The key is a hash of all that the content
-depends on: a stage whose key is not the one that is asked for is as good as not there. The seal is a hash of the
-content: a stage that is cut off or was changed is as good as not there, too.
+depends on: a stage with another key than the requested one counts as missing. The seal is a hash of the
+content: a stage that is cut off or was changed counts as missing, too.
 """
 
 import hashlib

@@ -72,8 +72,8 @@ def extract_frames(
         folder: gets frame_000123.jpg... and frames.json, all or nothing.
         count: how many; None for 120, or all that a shorter video has.
         overwrite: replace frames that were made from another video or with another count.
-        notify: told what the user should know, one sentence at a time.
-        progress: told (share done in 0...1, what is being done).
+        notify: receives messages for the user, one sentence at a time.
+        progress: receives (share done in 0...1, what is being done).
 
     Raises:
         UserError: the video cannot be read or is cut short, has fewer frames than `count` or shows fewer than four
@@ -158,7 +158,7 @@ def _different(
 
 
 def _kept(folder: Path, path: Path, request: dict[str, Any], *, overwrite: bool, notify: Callable[[str], None]) -> bool:
-    """Return whether `folder` holds already what is asked for.
+    """Return whether `folder` already holds the requested frames.
 
     Raises:
         UserError: it holds something else, and must not be replaced.

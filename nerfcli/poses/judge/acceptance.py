@@ -1,7 +1,7 @@
 """Acceptance of a model, based on evidence that the mapper did not choose itself.
 
 The number of placed photos and the reprojection error say little: a wrong model has thrown away what contradicts it. So
-the verified matches of all pairs are asked again, and observations that the adjustment did not see.
+the verified matches of all pairs are tested again, and observations that the adjustment did not see.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -96,7 +96,7 @@ def judge(
         pairs: the verified pairs of the capture.
         turn: how well mere turns of the camera explain the matches.
         names: what the user calls each photo of the model.
-        seed: of what is drawn at random.
+        seed: of random draws.
         threads: of the adjustment, -1 for all.
         given: ids of cameras whose intrinsics were known beforehand, whatever focal length they have.
         fixed: ids of cameras whose intrinsics stay as they are.

@@ -49,7 +49,7 @@ def best_turn(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]
     """Find how well rotations of one camera explain the matches; None without a pair.
 
     Args:
-        pairs: verified pairs; of many, an even choice is asked.
+        pairs: verified pairs; of many, an even choice is used.
         sizes: width and height of every photo, pixels, by image id.
     """
     if not pairs:

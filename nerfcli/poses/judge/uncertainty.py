@@ -1,6 +1,6 @@
 """Uncertainty of poses: one standard deviation of each pose, as blur in pixels.
 
-The covariance of the adjustment depends on which points or cameras hold the frame, which nobody asked about. It is
+The covariance of the adjustment depends on which points or cameras fix the frame, an arbitrary choice. It is
 brought into the frame in which the pictures of a scene that stands still move least in all photos together (an
 S-transformation, Baarda 1973); there, every photo's own share is read off.
 

@@ -107,7 +107,7 @@ def determine(
     free = list(parameters_of(camera)) if named else ["f", "k1"]
     steps = [_step(free, None, taken=True, camera=camera if named else None)]
     # The principal point comes first: a sensor off its axis is what cameras have, and tangential terms imitate it.
-    # It is asked again with k2, which may hide it.
+    # It is tested again with k2, which may hide it.
     for group in [_PRINCIPAL_POINT] if named else [_PRINCIPAL_POINT, ("k2",), _PRINCIPAL_POINT, _TANGENTIAL]:
         if set(group) <= set(free) or (len(steps) > 2 and "k2" not in free):
             continue

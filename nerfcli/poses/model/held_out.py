@@ -1,7 +1,7 @@
 """Bundle adjustment without a tenth of the observations, and how far they are off afterwards.
 
-The mean reprojection error is measured on what was adjusted to it. An observation that was not used tells whether poses
-and intrinsics hold where nobody pulled at them: the measure by which camera models are compared and results accepted.
+The mean reprojection error is measured on what was adjusted to it. Observations that were not fitted measure how well
+poses and intrinsics generalise; camera models are compared, and results accepted, by them.
 """
 
 from collections.abc import Sequence

@@ -33,13 +33,13 @@ def as_fisheye(job: Job) -> Job | None:
     """Return the job with cameras that start from a fisheye, where pairs of photos say so;
     None where none of them does.
 
-    Only cameras of which neither a file nor the user has said anything are asked.
+    Only cameras without a model from a file or the user are tested.
     """
     groups = []
     with closing(pycolmap.Database.open(str(job.database))) as database:
         for group in job.groups:
-            asked = group.choose and group.model == START_MODEL and group.params is None
-            focal_px = _fisheye_focal_px(group, job, database) if asked else None
+            is_open = group.choose and group.model == START_MODEL and group.params is None
+            focal_px = _fisheye_focal_px(group, job, database) if is_open else None
             groups.append(group if focal_px is None else _fisheye(group, focal_px))
     return None if tuple(groups) == job.groups else replace(job, groups=tuple(groups))
 
@@ -88,7 +88,7 @@ def _agreeing(
 def _strongest_pairs(images: set[int], database: pycolmap.Database) -> list[tuple[Array, Array]]:
     """Return pixels (matches, 2) in both photos of the pairs with the most matches, each photo in one pair at the most.
 
-    Of photos that were taken side by side all matches agree whatever the lens, so that a photo is asked once.
+    Of photos that were taken side by side all matches agree whatever the lens, so that one pair per photo is enough.
     """
     pair_ids, counts = database.read_num_matches()
     pairs = [(count, *pycolmap.pair_id_to_image_pair(pair_id)) for pair_id, count in zip(pair_ids, counts, strict=True)]

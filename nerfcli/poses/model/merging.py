@@ -5,7 +5,7 @@ Matches between a photo of the one and a photo of the other whose pixels are poi
 similarity that brings many of them together joins the models.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,6 +46,7 @@ def merge_models(
     seed: int,
     threads: int,
     fixed: Sequence[int] = (),
+    report: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> list[pycolmap.Reconstruction]:
     """Return the models, largest first, each joined with the ones before where they have enough in common.
 
@@ -58,12 +59,14 @@ def merge_models(
         seed: of the search for the similarity.
         threads: -1 for all.
         fixed: ids of cameras whose intrinsics stay as they are.
+        report: called with ("merge", models done, in all).
     """
     with pycolmap.Database.open(str(database)) as opened:
         pairs = read_verified_pairs(opened, min_matches=1)
         tracks = _matched_keypoints(opened)
     merged: list[pycolmap.Reconstruction] = []
-    for model in models:
+    for number, model in enumerate(models):
+        report("merge", number, len(models))
         if any(set(model.reg_image_ids()) <= set(base.reg_image_ids()) for base in merged):
             continue  # nothing that is not there already
         for index, base in enumerate(merged):
@@ -77,6 +80,7 @@ def merge_models(
                 break
         else:
             merged.append(model)
+    report("merge", len(models), len(models))
     return sorted(merged, key=lambda model: -model.num_reg_images())
 
 

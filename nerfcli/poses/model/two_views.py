@@ -1,7 +1,7 @@
 """Compare verified pairs of photos with the poses of a model.
 
 The verified matches of a pair hold whatever the mapper made of them. A wrong model has small residuals because it has
-thrown away the observations that contradict it; they still stand in the database, and here they are asked.
+thrown away the observations that contradict it; they are still in the database, and are tested here.
 
 Letters: p, q are unit rays of a match in the two cameras; R, t the pose of the second camera from the first.
 """
@@ -136,7 +136,7 @@ class RotationError:
 def rotation_errors(model: pycolmap.Reconstruction, pairs: Sequence[VerifiedPair], *, seed: int) -> list[RotationError]:
     """Relative poses from the matches of two photos alone, with the model's intrinsics, against the model.
 
-    Only the pairs with the most matches of each photo are asked, and of these only those that have parallax: without
+    Only the pairs with the most matches of each photo are used, and of these only those that have parallax: without
     it the five-point problem may turn a camera about.
     """
     options = pycolmap.RANSACOptions()

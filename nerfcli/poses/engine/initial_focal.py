@@ -1,0 +1,54 @@
+"""Focal lengths to start mapping from, where EXIF has none to rely on."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import replace
+
+import pycolmap
+
+from nerfcli.poses.engine.database import register_photos
+from nerfcli.poses.input.job import CameraGroup, Job, Tell
+from nerfcli.poses.model.focal_length import focal_length
+from nerfcli.poses.model.reasons import FEW_MATCHES
+from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
+
+# Measured on 15 captures: where pairs determine the focal length (errors up to 5 %), the spread is below 3.5 % and
+# the rise 0.3 px^2 or more; of objects from all sides and one distance it is above 7 %, and the rise below 0.03 px^2.
+_LARGEST_SPREAD = 0.05
+_LEAST_RISE = 0.1
+
+
+def with_focal_lengths(job: Job, tell: Tell) -> Job:
+    """Return the job with focal lengths estimated from pairs of photos, where these determine them; its database too.
+
+    Only cameras of which neither EXIF nor the user has said anything to rely on are asked. By itself the mapper starts
+    from 1.2 times the longer side; where that is a third off it takes up to three times as long.
+    """
+    asked = [
+        group
+        for group in job.groups
+        if group.params is None and not group.focal_is_prior and "FISHEYE" not in group.model
+    ]
+    if not asked:
+        return job
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
+    groups = tuple(_estimated(group, job, pairs, tell) if group in asked else group for group in job.groups)
+    if groups == job.groups:
+        return job
+    estimated = replace(job, groups=groups)
+    register_photos(estimated)
+    return estimated
+
+
+def _estimated(group: CameraGroup, job: Job, pairs: Sequence[VerifiedPair], tell: Tell) -> CameraGroup:
+    photos = {job.image_ids[number] for number in group.photos}
+    of_group = [pair for pair in pairs if pair.one in photos and pair.other in photos]
+    found = focal_length(of_group, (group.width, group.height), seed=job.seed)
+    if found is None or found.spread > _LARGEST_SPREAD or found.rise < _LEAST_RISE:
+        return group
+    tell(
+        f"starting from a focal length of {found.px:.0f} px, estimated from {found.pairs} pairs of photos "
+        f"(spread {100 * found.spread:.1f} %)"
+    )
+    return replace(group, estimated_focal_px=found.px)

@@ -1,0 +1,139 @@
+"""Focal length of a camera from the verified pairs of its photos, before any of them is placed.
+
+Letters: p, q are the pixels of a match from the middle of the picture, in units of the focal length, with 1 appended;
+E = U diag(1, 1, 0) V the essential matrix of a pair, q^T E p = 0.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nerfcli.poses.model.two_views import VerifiedPair
+
+Array = NDArray[np.float64]
+
+# Focal lengths that are compared, over the longer side: fields of view from 103 to 14 degrees.
+_GRID = np.geomspace(0.4, 4.0, 48)
+# Pairs that are used, drawn at random, and matches of each.
+_MOST_PAIRS, _MATCHES = 300, 50
+_LEAST_PAIRS = 20
+_VERIFIED_PX = 2.0
+# Distances from the epipolar line beyond this count by their logarithm.
+_NOISE_PX = 1.5
+# What a pair may say against a focal length, px^2: one with wrong matches, or of something that moves, must not decide.
+_MOST_PER_PAIR = 3.0
+_FITTING_STEPS = 6
+_RESAMPLED = 100
+_AWAY = 1.2
+# Generators of rotations.
+_TURNS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
+)
+_TWO = np.diag([1.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """Focal length in pixels, by so many pairs.
+
+    spread: relative, half of the interval that holds 80 % of estimates from pairs drawn again. rise: of a pair's cost
+    where the focal length is a fifth shorter or longer, px^2, whichever is less; 3 at most.
+    """
+
+    px: float
+    pairs: int
+    spread: float
+    rise: float
+
+
+def focal_length(pairs: Sequence[VerifiedPair], size: tuple[int, int], *, seed: int) -> FocalLength | None:
+    """Estimate the focal length with which the matches of all pairs fit essential matrices best.
+
+    With a wrong focal length a fundamental matrix belongs to no rotation and direction (Kruppa's equations). For each
+    focal length of a grid, each pair gets the essential matrix that fits its matches best; what these cost more than
+    with the pair's own best focal length, up to a limit, is summed over the pairs. Flat scenes, pure rotations, and
+    cameras that look at one point from one distance fit any focal length: there is no rise then, or a large spread.
+
+    Args:
+        pairs: of photos of one camera, without distortion to speak of, with the principal point in the middle.
+        size: (width, height) of its pictures.
+        seed: of the choice of pairs and matches, and of the spread.
+
+    Returns:
+        None if fewer than 20 pairs have enough matches.
+    """
+    rng = np.random.default_rng(seed)
+    usable = [pair for pair in pairs if pair.matches >= _MATCHES]
+    drawn = [usable[index] for index in rng.permutation(len(usable))[:_MOST_PAIRS]]
+    found = [two_views for pair in drawn if (two_views := _two_views(pair, size, rng)) is not None]
+    if len(found) < _LEAST_PAIRS:
+        return None
+    F, p, q = (np.array(parts) for parts in zip(*found, strict=True))
+    focal_px = _GRID * max(size)
+    costs = np.array([_fitted_cost(F, p, q, each) for each in focal_px]).T  # (pairs, focal lengths)
+    costs = np.minimum(costs - costs.min(axis=1, keepdims=True), _MOST_PER_PAIR)
+    again = [_lowest(focal_px, costs[rng.integers(len(costs), size=len(costs))].sum(axis=0)) for _ in range(_RESAMPLED)]
+    low, high = np.quantile(np.log(again), [0.1, 0.9])
+    mean = costs.mean(axis=0)
+    px = _lowest(focal_px, mean)
+    away = np.interp(np.log([px / _AWAY, px * _AWAY]), np.log(focal_px), mean)
+    return FocalLength(px, len(found), float(high - low) / 2, float(away.min() - mean.min()))
+
+
+def _two_views(
+    pair: VerifiedPair, size: tuple[int, int], rng: np.random.Generator
+) -> tuple[Array, Array, Array] | None:
+    """Return the fundamental matrix of a pair, and some of its inliers in each photo, pixels from the middle."""
+    options = pycolmap.RANSACOptions()
+    options.max_error = _VERIFIED_PX
+    options.min_num_trials, options.max_num_trials = 50, 1000  # the matches are verified
+    options.random_seed = int(rng.integers(2**31))
+    one, other = (pixels - np.array(size) / 2 for pixels in (pair.pixels_one, pair.pixels_other))
+    found = pycolmap.estimate_fundamental_matrix(one, other, options)
+    inliers = np.flatnonzero([] if found is None else found["inlier_mask"])
+    if found is None or len(inliers) < _MATCHES:
+        return None
+    inliers = rng.choice(inliers, _MATCHES, replace=False)
+    return found["F"], one[inliers], other[inliers]
+
+
+def _fitted_cost(F: Array, p: Array, q: Array, focal_px: float) -> Array:
+    """Return per pair the robust sum of squared Sampson distances, px^2, of the essential matrix that fits best.
+
+    Gauss-Newton with weights from the essential matrix nearest to F, by the rotations U and V.
+    """
+    scale = np.diag([focal_px, focal_px, 1.0])
+    U, _, V = np.linalg.svd(scale @ F @ scale)
+    p, q = (np.insert(pixels / focal_px, 2, 1.0, axis=-1) for pixels in (p, q))
+    best = np.full(len(F), np.inf)
+    for _ in range(_FITTING_STEPS):
+        E = U @ _TWO @ V
+        there, back = p @ np.swapaxes(E, 1, 2), q @ E
+        slope = np.linalg.norm(np.concatenate([there[..., :2], back[..., :2]], axis=-1), axis=-1)
+        factor = focal_px / np.maximum(slope, 1e-12)
+        px = factor * (q * there).sum(axis=-1)  # (pairs, matches)
+        best = np.minimum(best, (_NOISE_PX**2 * np.log1p((px / _NOISE_PX) ** 2)).sum(axis=-1))
+        turned = np.concatenate(
+            [U[:, None] @ _TURNS @ (_TWO @ V)[:, None], (U @ _TWO)[:, None] @ _TURNS @ V[:, None]], axis=1
+        )
+        J = factor[..., None] * np.einsum("nmi,nkij,nmj->nmk", q, turned, p, optimize=True)
+        weighted = J / (1 + (px / _NOISE_PX) ** 2)[..., None]
+        normal = np.swapaxes(J, 1, 2) @ weighted
+        # One of six rotations changes nothing.
+        normal += 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        step = np.linalg.solve(normal, -np.einsum("nmk,nm->nk", weighted, px)[..., None])[..., 0]
+        U, V = U @ Rotation.from_rotvec(step[:, :3]).as_matrix(), Rotation.from_rotvec(step[:, 3:]).as_matrix() @ V
+    return best
+
+
+def _lowest(focal_px: Array, costs: Array) -> float:
+    """Return the focal length at the vertex of the parabola through the lowest cost and its neighbours."""
+    index = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
+    before, lowest, after = costs[index - 1 : index + 2]
+    bend = before - 2 * lowest + after
+    offset = np.clip((before - after) / (2 * bend), -0.5, 0.5) if bend > 0 else 0.0
+    return float(focal_px[index] * (focal_px[1] / focal_px[0]) ** offset)
