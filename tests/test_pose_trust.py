@@ -184,13 +184,13 @@ def test_a_second_chance_is_bounded_in_time(solved: Solved, tmp_path: Path):
 def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
     solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Of 200 s, the first two take 150: mapping from scratch, 100 s as the first time, does not fit; its part does."""
+    """Of 200 s, the first two take 130: mapping from scratch, 100 s as the first time, does not fit; its part does."""
     wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=100.0)
     first = examine(wrong.models, wrong.job, lambda *progress: None)
     now = [0.0]
 
     def late(*arguments) -> None:
-        now[0] += 75.0
+        now[0] += 65.0
 
     monkeypatch.setattr(chances.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(chances, "_regrown", late)
@@ -198,7 +198,7 @@ def test_a_hypothesis_is_skipped_that_takes_longer_than_what_is_left(
     notes: list[str] = []
     chance = second_chance(wrong, first, lambda *progress: None, notes.append, checks=Checks)
     assert "next: from the largest consistent part (about 30 s)" in notes
-    assert "from scratch, with other initial pairs: skipped, since it takes about 2 min, and 50 s are left" in notes
+    assert "from scratch, with other initial pairs: skipped, since it takes about 2 min, and 70 s are left" in notes
     assert chance.mapped.attempts[-1]["what"] == "only the largest consistent part of the first model"
 
 

@@ -35,7 +35,7 @@ from nerfcli.poses.model.two_views import read_verified_pairs
 _GOOD_SHARE = 0.9
 # Below this, it is worth several times the work that was done so far.
 _FEW_SHARE = 0.75
-# From here on mapping from scratch takes four minutes and more: a few photos are not worth it.
+# From here on mapping from scratch takes two minutes and more: a few photos are not worth it.
 _MANY_PHOTOS = 250
 # Below this, what is believed of the lens beforehand is doubted.
 _LITTLE_SHARE = 0.5
