@@ -155,17 +155,19 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
 def _run_mapper(
     job: Job, report: Report, options: pycolmap.IncrementalPipelineOptions, base_folder: Path | None
 ) -> list[pycolmap.Reconstruction]:
-    placed = 0
+    placed = most = 0
 
     def started() -> None:
         nonlocal placed
-        placed = 2
-        report("map", placed, len(job.files))
+        placed = 1
+        placed_one()
 
     def placed_one() -> None:
-        nonlocal placed
+        nonlocal placed, most
         placed += 1
-        report("map", min(placed, len(job.files)), len(job.files))
+        # Of the largest model so far: another one begins with two photos again, of the few that are left.
+        most = max(most, min(placed, len(job.files)))
+        report("map", most, len(job.files))
 
     with TemporaryDirectory(dir=job.folder, prefix="mapper-") as output:
         models = pycolmap.incremental_mapping(
