@@ -302,6 +302,8 @@ def test_merging_sub_models_adds_to_what_is_left_and_takes_nothing_from_the_shar
     now = 100.0
     assert outlook.update("map", 10, 10) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0))
     assert outlook.update("merge", 0, 4) == (pytest.approx(100.0 / 120.0), pytest.approx(20.0 + 20.0))
+    # The first of four has nothing to be merged with and takes no time, which says little of the others.
+    assert outlook.update("merge", 1, 4)[1] == pytest.approx(0.75 * 15.0 + 0.75 * 20.0)
     now = 105.0
     assert outlook.update("merge", 1, 4)[1] == pytest.approx(15.0 + 20.0)
     now = 120.0

@@ -30,8 +30,8 @@ _AT_ONCE_SECONDS_PER_PHOTO = 0.5
 _CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
 # How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
 _GROWTH = {"map": 1.3}
-# Of a stage, the share after which its speed says something.
-_TELLING = 0.05
+# Of a stage, the share after which its speed says something; what one sub-model took says nothing of the next.
+_TELLING, _TELLING_OF_MERGE = 0.05, 1.0
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class Outlook:
             self._share = 0.0
         if stage != self._stage or ratio < self._ratio:
             took, of_plan = self._latest
-            if of_plan > _TELLING * self._seconds.get(self._stage, 0.0):
+            if of_plan > _telling(self._stage) * self._seconds.get(self._stage, 0.0):
                 self._stretches.append(took / of_plan)
             self._stage, self._began, self._latest = stage, (now, ratio), (0.0, 0.0)
         self._ratio = ratio
@@ -173,7 +173,7 @@ class Outlook:
         stretch = min(self._stretches, default=1.0)
         if planned > 0:
             # What a stage begins with says little of its rest: its first twentieth is as planned until it is done.
-            unseen = max(_TELLING * planned - of_plan, 0.0)
+            unseen = max(_telling(stage) * planned - of_plan, 0.0)
             own = (took + unseen * stretch) / (of_plan + unseen)
             left = own * planned * (1 - ratio)
             stretch = min(own, *self._stretches) if self._stretches else own
@@ -209,6 +209,10 @@ class Outlook:
         before = {stage: seconds for stage, seconds in self._seconds.items() if stage not in ("merge", "check")}
         merge = _MERGE_SHARE * self._plan.seconds.get("map", 0.0)
         self._seconds = {**before, "merge": merge, "check": self._plan.seconds.get("check", 0.0)}
+
+
+def _telling(stage: str) -> float:
+    return _TELLING_OF_MERGE if stage == "merge" else _TELLING
 
 
 def duration(seconds: float) -> str:
