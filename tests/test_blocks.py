@@ -52,7 +52,7 @@ def cloudy(similarity: Similarity, *, kind: str = "hash", seed: int = 0) -> Mode
     return Model(
         field=field,
         occupied=torch.rand(16, 16, 16) < 0.67,
-        marching=Marching(near=0.03, far=2.5, shortest_step=1 / 40, growth=1 / 40),
+        marching=Marching(near=0.03, far=2.5, shortest_step=1 / 100, growth=1 / 100),
         background=(0.1, 0.2, 0.3),
         training_from_scene=similarity,
         unit="arbitrary",
