@@ -463,7 +463,7 @@ def draw(table: Numbers, path: Path) -> None:
         axis.set(title=title, xticks=range(len(STRATA)), xticklabels=STRATA)
         axis.grid(axis="y", alpha=0.3)
     axes[1].axhline(0.9, color="black", lw=0.8, ls=":")
-    axes[0].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(table))
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
