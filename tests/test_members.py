@@ -24,6 +24,7 @@ from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.workflows.members import PHOTO_FRACTION, VARIED, member_settings
 
+USAGE = 2  # Click's exit code for wrong options
 QUICK = ("--steps", "1", "--downscale", "8", "--threads", "1", "--model", "default")
 
 
@@ -141,6 +142,26 @@ def test_members_are_trained_into_the_run_and_kept(capture):
     result = nerfcli(*command[:-1], "seeds", "--steps", "2")
     assert result.exit_code == BAD_INPUT
     assert error_of(result)[0].endswith("members/1 exists")
+
+
+def test_tasks_of_an_array_job_train_one_member_each(capture):
+    """Out of order, and the same fields as by one command; the run itself is never touched."""
+    together, apart = capture.with_name("together"), capture.with_name("apart")
+    assert nerfcli("train", capture, *QUICK, "-o", together, "--members", "3").exit_code == 0
+    task = ("train", capture, *QUICK, "-o", apart, "--members")
+    result = nerfcli(*task, "2/3")
+    assert result.exit_code == BAD_INPUT
+    assert "is not complete, and --members 2/3 trains one of its members" in error_of(result)[0]
+    assert nerfcli("train", capture, *QUICK, "-o", apart).exit_code == 0
+    before = listing(apart)
+    for number in (3, 1, 2):
+        result = nerfcli(*task, f"{number}/3", "--overwrite")
+        assert result.exit_code == 0, result.stderr
+        assert (apart / "members" / str(number) / "field.safetensors").exists()
+    assert {name: entry for name, entry in listing(apart).items() if not name.startswith("members")} == before
+    digests = [[member.checkpoint_sha256() for member in members_of(Run(run))] for run in (together, apart)]
+    assert digests[0] == digests[1]
+    assert nerfcli(*task, "4/3").exit_code == USAGE
 
 
 def test_an_interrupted_member_is_resumed_by_the_same_command(capture, monkeypatch):

@@ -167,17 +167,19 @@ def bytes_from_text(text: str, option: str = "--memory") -> int:
     return size
 
 
-def block_choice(text: str) -> tuple[int | None, int]:
-    """Parse --blocks: N for all of N blocks, K/N for the K-th; return K (None for all) and N.
+def one_or_all(text: str | None, option: str) -> tuple[int | None, int]:
+    """Parse --blocks or --members: N for all of N, K/N for the K-th; return K (None for all) and N, 0 if not given.
 
     Raises:
-        typer.BadParameter: anything else, or fewer than two blocks.
+        typer.BadParameter: anything else, or fewer than two.
     """
+    if text is None:
+        return None, 0
     match = re.fullmatch(r"(?:(\d+)/)?(\d+)", text.strip())
     number, count = (int(part) if part else None for part in match.groups()) if match else (None, None)
     if count is None or count < 2 or (number is not None and not 1 <= number <= count):
-        message = f"{text!r}; write the number of blocks, at least 2, or K/N for one of them, such as 1/4"
-        raise typer.BadParameter(message, param_hint="--blocks")
+        message = f"{text!r}; write a number, at least 2, or K/N for one of them, such as 1/4"
+        raise typer.BadParameter(message, param_hint=option)
     return number, count
 
 

@@ -27,7 +27,6 @@ from nerfcli.cli.options import (
     Seed,
     Threads,
     VoxelSize,
-    block_choice,
     bytes_from_text,
     contraction_name,
     device_name,
@@ -37,6 +36,7 @@ from nerfcli.cli.options import (
     model_name,
     named_components,
     one_of,
+    one_or_all,
     seconds_from_text,
     thread_count,
 )
@@ -83,10 +83,10 @@ def train(
     ] = None,
     holdout: Holdout = None,
     members: Annotated[
-        int | None,
+        str | None,
         typer.Option(
-            help="Train so many further fields, each with the whole budget, into RUN/members/.",
-            min=2,
+            help="Train N further fields, each with the whole budget, into RUN/members/; K/N trains one.",
+            metavar="N|K/N",
             show_default=False,
         ),
     ] = None,
@@ -151,6 +151,7 @@ def train(
     The resolution of the last two is one pixel's footprint at the centre of the scene.
 
     --members 4 trains the run and then four more fields of the same scene; render and evaluate show where they differ.
+    --members 1/4, --members 2/4, ... train one each, in parallel, as tasks of an array job.
     They differ in --vary: seeds; photos, of which each has 80 %; prior, a smooth random field that each starts from; or
     field, where hash, voxels and mlp take turns. The same command resumes an interrupted one.
 
@@ -183,6 +184,7 @@ def train(
     from nerfcli.errors import UserError
     from nerfcli.memory import default_memory_limit
     from nerfcli.runs.components import Components, choose
+    from nerfcli.runs.run import Run
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.tomography.formats.read import recognise
     from nerfcli.tomography.scan import is_scan
@@ -200,7 +202,8 @@ def train(
         raise typer.BadParameter(
             f"it cannot be combined with {option}, which is about one field", param_hint="--members"
         )
-    only, count = (None, 0) if blocks is None else block_choice(blocks)
+    only, count = one_or_all(blocks, "--blocks")
+    member, member_count = one_or_all(members, "--members")
     if count and (members is not None or view):
         option = "--members" if members is not None else "--view"
         raise typer.BadParameter(f"it cannot be combined with {option}", param_hint="--blocks")
@@ -285,26 +288,32 @@ def train(
             )
 
     def train_one_scene(folder: Path, run: Path) -> None:
+        if member is not None and not Run(run).is_complete(photo_settings()):
+            raise UserError(
+                f"{run} is not complete, and --members {members} trains one of its members",
+                "train it first, with the same options without --members",
+            )
         with console.progress(f"train {folder.name}") as update:
             trained = train_scene(
                 folder,
                 run,
                 photo_settings(),
                 memory_bytes=memory_of_process(),
-                resume=resume,
-                overwrite=overwrite,
+                resume=resume and member is None,
+                overwrite=overwrite and member is None,
                 holdout=rule,
                 view=view,
                 notify=console.note,
                 warn=console.warn,
                 progress=update,
             )
-        if members is None:
+        if not member_count:
             return
         with console.progress(f"members of {folder.name}") as update:
             train_members(
                 trained,
-                members,
+                member_count,
+                only=member,
                 vary=vary,
                 device=photo_settings().device,
                 threads=photo_settings().threads,
@@ -350,6 +359,6 @@ def train(
 
     if scene == STDIN or not is_scan(Path(scene)):
         # A wrong option is refused before anything is read.
-        member_settings(photo_settings(), members or 0, vary=vary)
+        member_settings(photo_settings(), member_count, vary=vary)
         block_settings(photo_settings(), 0, count)
     for_each_input(scene, work)

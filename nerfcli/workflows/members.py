@@ -55,6 +55,7 @@ def train_members(
     run: Run,
     count: int,
     *,
+    only: int | None = None,
     vary: str,
     device: str,
     threads: int,
@@ -65,13 +66,14 @@ def train_members(
     warn: Notify = warn_python,
     progress: Progress = no_progress,
 ) -> list[Run]:
-    """Train the members of a run, each with the run's whole budget, and return them.
+    """Train the members of a run, each with the run's whole budget, and return those trained here or kept.
 
     Members that are there and complete are kept, interrupted ones are resumed.
 
     Args:
         run: a complete run.
         count: of the members.
+        only: the member to train, from 1 on; None for all. Processes that train one each need no communication.
         vary: one of `VARIED`, see `member_settings`.
         device, threads: as for `TrainSettings`.
         memory_bytes, resume, overwrite, notify, warn: see `train_again`.
@@ -84,12 +86,13 @@ def train_members(
     budgets = [f"{first.budget_seconds:g} s"] if first.budget_seconds else []
     budgets += [f"{first.steps} steps"] if first.steps else []
     notify(f"{count} members, varied by {vary}, {' or '.join(budgets)} each")
-    members = []
-    for number, settings in enumerate(member_settings(first, count, vary=vary), start=1):
-        path = run.path / MEMBERS / str(number)
+    members, all_settings = [], member_settings(first, count, vary=vary)
+    chosen = range(1, count + 1) if only is None else [only]
+    for place, number in enumerate(chosen):
+        path, settings = run.path / MEMBERS / str(number), all_settings[number - 1]
 
-        def of_all(share: float, words: str, before: int = number - 1) -> None:
-            progress((before + share) / count, f"member {before + 1} of {count}  {words}")
+        def of_all(share: float, words: str, before: int = place, number: int = number) -> None:
+            progress((before + share) / len(chosen), f"member {number} of {count}  {words}")
 
         train_again(
             run,
