@@ -20,7 +20,7 @@ from nerfcli import atomic, kernels, scene
 from nerfcli.errors import BAD_INPUT, INTERRUPTED, TERMINATED
 from nerfcli.exclusive import exclusive
 from nerfcli.interrupts import install_handlers
-from nerfcli.runs.files import LOCK
+from nerfcli.runs.files import LOCK, PHOTO_DEPTHS
 
 ONE_STEP = ("--steps", "1", "--downscale", "8", "--threads", "2")
 FEW = ("--cameras", "test", "--max-size", "16", "--threads", "2")
@@ -39,7 +39,7 @@ WRITERS: dict[str, tuple[Words, int]] = {
 
 def with_leftovers(folder: Path, before: dict[str, bytes]) -> dict[str, bytes]:
     """What has come into a folder or changed, aside from locks and what the same command takes up again."""
-    kept = ("unfinished", LOCK, "new/")
+    kept = ("unfinished", LOCK, PHOTO_DEPTHS, "new/")
     return {
         name: content
         for name, content in listing(folder).items()
