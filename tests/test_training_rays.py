@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import correlate
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -228,33 +227,6 @@ def test_masked_pixels_are_never_drawn():
     assert {tuple(row) for row in numbers} == {(0, 7, 31), (0, 29, 0)}
     with pytest.raises(UserError, match="no pixels are left to train on"):
         PixelPool([replace(photo, used=np.zeros_like(used))], SIMILARITY, CPU)
-
-
-@pytest.mark.parametrize("channels", [3, 4])
-def test_smoothed_pixels_are_those_of_filtered_photos(channels):
-    """SciPy's correlation of premultiplied colours, divided by that of what counts: to the border, behind masks."""
-    random = np.random.default_rng(0)
-    photos, expected = [], []
-    for index, camera in enumerate((CAMERA, Camera.pinhole(24, 18, 50.0))):
-        shape = (camera.height, camera.width)
-        pixels = random.integers(0, 256, (*shape, channels)).astype(np.uint8)
-        used = random.random(shape) < 0.7
-        photos.append(LoadedPhoto(replace(ring()[index], camera=camera), pixels, used))
-        colours = pixels / 255.0
-        alpha = colours[..., 3:] if channels == 4 else np.ones((*shape, 1))
-        parts = np.concatenate([colours[..., :3] * alpha, alpha, np.ones_like(alpha)], -1) * used[..., None]
-        kernel = np.outer((1, 2, 1), (1, 2, 1))[..., None]
-        sums = correlate(parts, kernel, mode="constant")
-        light, opacity, total = sums[..., :3], sums[..., 3:4], sums[..., 4:]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            smooth = np.concatenate([light / opacity, opacity / total], -1)[..., :channels]
-        expected.append(smooth.reshape(-1, channels))
-    pool = PixelPool(photos, SIMILARITY, CPU)
-    assert pool.usable is not None
-    sharp = pool.rays_of(pool.usable)
-    found = pool.smoothed(sharp)
-    np.testing.assert_allclose(found.colours, np.concatenate(expected)[pool.usable], atol=1e-5)
-    assert found.directions is sharp.directions
 
 
 def test_photos_with_and_without_alpha_go_together():

@@ -18,7 +18,6 @@ from nerfcli.fit.losses import colour_losses, opacity_entropy
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.fit.point_depth import PointRays, fading
 from nerfcli.fit.ranks import ALONE, Alone
-from nerfcli.fit.smoothing import smoothed_at
 from nerfcli.fit.watch import UNWATCHED, NonFiniteError, Watch
 from nerfcli.kernels import March, Rays, Targets
 from nerfcli.photos.pool import Drawn, Pool
@@ -184,9 +183,9 @@ class Fitting:
         rays = min(self._most_rays, max(64, round(settings.samples_at(self.step) / max(1.0, self.samples_per_ray))))
         source = self.pool if self.error_map is None or self.furthest < BEGINS else self.error_map
         drawn = source.draw(rays, self.generator)
-        if self.points is not None and fading(fraction) > 0.0:
-            drawn = self.points.added_to(drawn, self.generator)
-        return smoothed_at(fraction, drawn, self.pool)
+        if self.points is None or fading(fraction) == 0.0:
+            return drawn
+        return self.points.added_to(drawn, self.generator)
 
     def _stride(self, fraction: float) -> int:
         """Return how many of the shortest steps along rays are taken as one."""

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -114,7 +113,6 @@ class Pool(Protocol):
     first_pixel: Tensor
     footprint: float
     cones: Tensor
-    longer_side_px: int
     poses: Tensor
     cameras: tuple[Camera, ...]
 
@@ -127,10 +125,6 @@ class Pool(Protocol):
         """`count` random pixels, with replacement."""
         ...
 
-    def smoothed(self, drawn: Drawn) -> Drawn:
-        """Return pixels in the colours of photos with half the detail."""
-        ...
-
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Return the photo index of each pixel (N,)."""
         ...
@@ -141,8 +135,7 @@ class PixelPool:
 
     Bearings are kept once per camera, not per photo: photos that share intrinsics share them. `without_ray` counts the
     pixels that the lens model has no direction for, which are left out; `footprint` is that of `pixel_footprint`;
-    `cones` (P,) are the widths of a pixel of each photo per distance, `sizes` (P, 2) heights and widths of the photos,
-    `longer_side_px` the largest of these.
+    `cones` (P,) are the widths of a pixel of each photo per distance, `sizes` (P, 2) heights and widths of the photos.
 
     Args:
         photos: one at least.
@@ -167,7 +160,6 @@ class PixelPool:
         self.first_pixel = torch.tensor(np.cumsum([0, *counts[:-1]]), device=device)
         self.names_and_widths = [(photo.frame.name, photo.pixels.shape[1]) for photo in photos]
         self.sizes = torch.tensor([photo.pixels.shape[:2] for photo in photos], device=device)
-        self.longer_side_px = max(max(photo.pixels.shape[:2]) for photo in photos)
         self.frames = tuple(photo.frame for photo in photos)
         self.cameras = tuple(photo.frame.camera for photo in photos)
         poses = [training_from_scene.apply_pose(photo.frame.world_from_cam) for photo in photos]
@@ -233,27 +225,6 @@ class PixelPool:
         rays = self._backend.pixel_rays(numbers, pixels)
         none = torch.zeros(0, device=numbers.device)
         return Drawn(*rays, numbers, distances=none, trust=none, weights=none)
-
-    def smoothed(self, drawn: Drawn) -> Drawn:
-        """Return pixels in the colours of smoothed photos: means over 3x3 pixels with weights (1, 2, 1) x (1, 2, 1).
-
-        Pixels beyond the border or behind a mask do not count; colours count by their alpha.
-        """
-        photos = self.photo_of(drawn.numbers)
-        first, (heights, widths) = self.first_pixel[photos], self.sizes[photos].unbind(-1)
-        place = drawn.numbers - first
-        total = torch.zeros_like(drawn.colours[:, :1])
-        opacity, light = torch.zeros_like(total), torch.zeros_like(drawn.colours[:, :3])
-        for down, right in product((-1, 0, 1), repeat=2):
-            row, column = place // widths + down, place % widths + right
-            inside = (row >= 0) & (row < heights) & (column >= 0) & (column < widths)
-            numbers = torch.where(inside, first + row * widths + column, drawn.numbers)
-            weights = ((2 - abs(down)) * (2 - abs(right)) * (inside & self.is_usable(numbers)))[:, None]
-            colours = self.colours[numbers].float() / 255.0
-            alpha = weights * (colours[:, 3:] if self.has_alpha else 1.0)
-            total, opacity, light = total + weights, opacity + alpha, light + alpha * colours[:, :3]
-        smooth = light / opacity.clamp_min(1e-6)
-        return drawn._replace(colours=torch.cat([smooth, opacity / total], -1) if self.has_alpha else smooth)
 
     def photo_of(self, numbers: Tensor) -> Tensor:
         """Return the photo index of each pixel (N,)."""

@@ -190,7 +190,6 @@ class _SavedBatch:
         self._drawn = Drawn(**{name: tensors[f"batch.{name}"] for name in Drawn._fields})
         self._after_draw = tensors["batch.after_draw"]
         self.footprint = math.nan  # the field's size is known
-        self.longer_side_px = 0  # the colours are those that were learned from, smoothed or not
 
     @property
     def has_alpha(self) -> bool:
@@ -199,9 +198,6 @@ class _SavedBatch:
     def draw(self, count: int, generator: torch.Generator) -> Drawn:
         generator.set_state(self._after_draw)
         return self._drawn
-
-    def smoothed(self, drawn: Drawn) -> Drawn:
-        return drawn
 
     def photo_of(self, numbers: Tensor) -> Tensor:
         return torch.searchsorted(self.first_pixel, numbers, right=True) - 1
