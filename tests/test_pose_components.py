@@ -34,10 +34,10 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[View], Mapped]
     views = [*ring(10, [WIDE], seed=0, turn_deg=200), *ring(9, [WIDE], seed=1, at=FAR, turn_deg=180)]
     scene = synthetic.together(synthetic.boulder(800, seed=0), synthetic.boulder(800, seed=1, centre=FAR))
     synthetic.write_database(folder / "database.db", views, scene, noise=Noise(outliers=0.2), seed=0)
-    told: list[tuple[str, int, int]] = []
-    climbed = climb(synthetic.synthetic_job(folder, views, seed=0), lambda *progress: told.append(progress))
-    # A second model does not set back what is told of the first attempt: 2 to 10 photos, then 10 while it grows.
-    placed = [done for stage, done, _ in told if stage == "map"]
+    reports: list[tuple[str, int, int]] = []
+    climbed = climb(synthetic.synthetic_job(folder, views, seed=0), lambda *progress: reports.append(progress))
+    # A second model does not set the progress back: 2 to 10 photos of the first, then 10 while it grows.
+    placed = [done for stage, done, _ in reports if stage == "map"]
     assert placed[:17] == [*range(2, 11), *[10] * 8]
     assert [sorted(model.reg_image_ids()) for model in climbed.models] == [FIRST, SECOND]
     return views, climbed

@@ -401,16 +401,16 @@ def test_sub_models_are_merged_where_they_overlap(solved: Solved, tmp_path: Path
             second.deregister_frame(second.image(image_id).frame_id)
     turn = pycolmap.Rotation3d(np.array([0.3, -0.4, 1.2]))
     second.transform(pycolmap.Sim3d(3.0, turn, np.array([5.0, -2.0, 1.0])))
-    told: list[tuple[str, int, int]] = []
+    reports: list[tuple[str, int, int]] = []
     merged = merging.merge_models(
         [first, second],
         solved.job.database,
         output=tmp_path / "merged",
         seed=0,
         threads=1,
-        report=lambda *progress: told.append(progress),
+        report=lambda *progress: reports.append(progress),
     )
-    assert told == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
+    assert reports == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
     assert [model.num_reg_images() for model in merged] == [10]
     for image_id in range(2, 11):
         poses = [model.image(image_id).cam_from_world() for model in (merged[0], solved.model)]

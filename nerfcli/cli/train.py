@@ -151,9 +151,9 @@ def train(
     The resolution of the last two is one pixel's footprint at the centre of the scene.
 
     --members 4 trains the run and then four more fields of the same scene; render and evaluate show where they differ.
-    --members 1/4, --members 2/4, ... train one each, in parallel, as tasks of an array job.
     They differ in --vary: seeds; photos, of which each has 80 %; prior, a smooth random field that each starts from; or
-    field, where hash, voxels and mlp take turns. The same command resumes an interrupted one.
+    field, where hash, voxels and mlp take turns. The same command resumes an interrupted one. Of a complete run,
+    --members 1/4, --members 2/4, ... train one each, in parallel, as tasks of an array job.
 
     --blocks 4 divides the ground of a scene with 3D points into four cells and trains a field for each, on the photos
     that see it, into RUN/blocks/; RUN renders them as one field. On a cluster, train --blocks 1/4, --blocks 2/4, ...

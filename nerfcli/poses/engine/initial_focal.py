@@ -21,19 +21,19 @@ _LEAST_RISE = 0.1
 def with_focal_lengths(job: Job, tell: Tell) -> Job:
     """Return the job with focal lengths estimated from pairs of photos, where these determine them; its database too.
 
-    Only cameras of which neither EXIF nor the user has said anything to rely on are asked. By itself the mapper starts
+    Only cameras without a reliable focal length from EXIF or the user are estimated. By itself the mapper starts
     from 1.2 times the longer side; where that is a third off it takes up to three times as long.
     """
-    asked = [
+    unknown = [
         group
         for group in job.groups
         if group.params is None and not group.focal_is_prior and "FISHEYE" not in group.model
     ]
-    if not asked:
+    if not unknown:
         return job
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
-    groups = tuple(_estimated(group, job, pairs, tell) if group in asked else group for group in job.groups)
+    groups = tuple(_estimated(group, job, pairs, tell) if group in unknown else group for group in job.groups)
     if groups == job.groups:
         return job
     estimated = replace(job, groups=groups)
