@@ -152,6 +152,8 @@ def test_tasks_of_an_array_job_train_one_member_each(capture):
     result = nerfcli(*task, "2/3")
     assert result.exit_code == BAD_INPUT
     assert "is not complete, and --members 2/3 trains one of its members" in error_of(result)[0]
+    missing = nerfcli("train", capture / "nowhere", *QUICK, "-o", apart, "--members", "2/3")
+    assert "is not complete" not in error_of(missing)[0]
     assert nerfcli("train", capture, *QUICK, "-o", apart).exit_code == 0
     before = listing(apart)
     for number in (3, 1, 2):

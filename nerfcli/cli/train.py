@@ -288,7 +288,7 @@ def train(
             )
 
     def train_one_scene(folder: Path, run: Path) -> None:
-        if member is not None and not Run(run).is_complete(photo_settings()):
+        if member is not None and folder.exists() and not Run(run).is_complete(photo_settings()):
             raise UserError(
                 f"{run} is not complete, and --members {members} trains one of its members",
                 "train it first, with the same options without --members",
