@@ -2,17 +2,20 @@
 
     python benchmarks/depth.py desk -o desk-depth
     python benchmarks/depth.py redkitchen path/to/redkitchen -o kitchen-depth
+    python benchmarks/depth.py redkitchen path/to/redkitchen --scene scene-of-nerfcli-poses -o kitchen-depth
 
 desk: sample_scenes/desk with its true cameras, against the true z of its held-out photos. redkitchen: a hand-held RGB-D
 video with poses (7-Scenes; images/, depth/ in millimetres with 0 for none, pose/ camera to world), against its sensor,
-seen by its depth camera. Both are in metres. A folder OUT gets the scene, the run, OUT.csv and one picture per held-out
-view: photo, true z, conditional z, error. `--run RUN` takes a run that is there already.
+seen by its depth camera. One number, from camera positions, brings the unit to metres; with the capture's own poses it
+is 1. A folder OUT gets the scene, the run, OUT.csv and one picture per held-out view: photo, true z, conditional z,
+error. `--scene SCENE` takes the poses of `nerfcli poses`, `--run RUN` a run that is there already.
 """
 
 import csv
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -26,6 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from nerfcli import kernels
+from nerfcli.cameras.alignment import align
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.formats.run_cameras import read_cameras
 from nerfcli.cameras.frame import Frame
@@ -75,14 +79,12 @@ def kitchen_scene(folder: Path, capture: Path) -> None:
     The capture's poses and its lens (585 px) are those of the depth camera, and the pictures are not registered: with
     them, matches between colour pictures lie 1.9 px (median) off their epipolar lines, with `COLOUR_FOCAL_PX` 1.1 px.
     Points triangulated from these matches are 21 cm (median) off the sensor's depth with the former, 12 cm with the
-    latter, too near by 4 cm: no field that is trained on these poses can be expected to do better by much.
+    latter, too near by 4 cm: no field that is trained on these poses can be expected to do better by much. Those of
+    `nerfcli poses` (`--scene`) have no such limit.
     """
     cx, cy = np.loadtxt(capture / "camera-intrinsics.txt")[:2, 2]
     lens = {"fl_x": COLOUR_FOCAL_PX, "fl_y": COLOUR_FOCAL_PX, "cx": cx, "cy": cy}
-    poses = {
-        path: np.loadtxt(capture / "pose" / f"{path.stem}.txt") @ DEPTH_FROM_COLOUR
-        for path in sorted((capture / "images").glob("*"))
-    }
+    poses = {path: kitchen_pose(path.name, capture) for path in sorted((capture / "images").glob("*"))}
     _write_scene(folder, lens | {"camera_model": "PINHOLE", "w": 640, "h": 480}, poses)
 
 
@@ -99,11 +101,24 @@ def desk_truth(frame: Frame) -> np.ndarray:
     return tifffile.imread(DESK / "truth" / "depth" / f"{Path(frame.name).stem}.tiff").astype(np.float64)
 
 
-def kitchen_depth_view(frame: Frame, capture: Path) -> Frame:
-    """What the depth camera sees when the colour camera takes a photo."""
+def kitchen_pose(name: str, capture: Path) -> np.ndarray:
+    """World from colour camera (4, 4) as it comes with the capture, in metres."""
+    return np.loadtxt(capture / "pose" / f"{Path(name).stem}.txt") @ DEPTH_FROM_COLOUR
+
+
+def kitchen_metres(frames: Sequence[Frame], capture: Path) -> float:
+    """Metres per unit of the frames: the scale of the similarity that brings their positions to the capture's."""
+    centres = np.array([frame.world_from_cam[:3, 3] for frame in frames])
+    return align(centres, np.array([kitchen_pose(frame.name, capture)[:3, 3] for frame in frames])).scale
+
+
+def kitchen_depth_view(frame: Frame, capture: Path, *, metres: float = 1.0) -> Frame:
+    """What the depth camera sees when the colour camera takes a photo, where a unit is so many metres."""
     matrix = np.loadtxt(capture / "camera-intrinsics.txt")
     camera = Camera("PINHOLE", 640, 480, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]))
-    return replace(frame, camera=camera, world_from_cam=frame.world_from_cam @ np.linalg.inv(DEPTH_FROM_COLOUR))
+    colour_from_depth = np.linalg.inv(DEPTH_FROM_COLOUR)
+    colour_from_depth[:3, 3] /= metres
+    return replace(frame, camera=camera, world_from_cam=frame.world_from_cam @ colour_from_depth)
 
 
 def kitchen_truth(frame: Frame, capture: Path) -> np.ndarray:
@@ -185,7 +200,10 @@ def main(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for scene, run, CSV and pictures.")] = Path(
         "depth-benchmark"
     ),
-    run: Annotated[Path | None, typer.Option(help="A run of the same capture in metres, instead of a new one.")] = None,
+    scene: Annotated[
+        Path | None, typer.Option(help="Of nerfcli poses, redkitchen only; else the capture's poses.")
+    ] = None,
+    run: Annotated[Path | None, typer.Option(help="A run of the same capture, instead of a new one.")] = None,
     budget: Annotated[str, typer.Option(help="Of the training: --budget 60s or, repeatable, --steps 2000.")] = "60s",
     downscale: Annotated[str, typer.Option(help="Of the training.")] = "2",
     views: Annotated[int, typer.Option(help="Held-out views at most, evenly chosen.", min=1)] = 6,
@@ -196,21 +214,29 @@ def main(
     if capture not in ("desk", "redkitchen") or (capture == "redkitchen") != (folder is not None):
         raise typer.BadParameter("give desk, or redkitchen and its folder")
     torch.set_num_threads(threads)
+    if scene is not None and folder is None:
+        raise typer.BadParameter("the desk is measured with its true cameras only", param_hint="--scene")
     if run is None:
-        scene, run = output / "scene", output / "run"
-        desk_scene(scene) if folder is None else kitchen_scene(scene, folder)
+        run = output / "run"
+        if scene is None:
+            scene = output / "scene"
+            desk_scene(scene) if folder is None else kitchen_scene(scene, folder)
         limit = ("--budget", budget) if not budget.isdigit() else ("--steps", budget)
         options = (*limit, "--downscale", downscale, "--threads", str(threads), "--overwrite")
         subprocess.run([sys.executable, "-m", "nerfcli", "train", str(scene), "-o", str(run), *options], check=True)
     output.mkdir(parents=True, exist_ok=True)
     kernels.prepare(print)
     model = load_model(run / FIELD, "cpu")
-    test = read_cameras(run).test
+    cameras = read_cameras(run)
+    test = cameras.test
+    metres = 1.0 if folder is None else kitchen_metres([*cameras.train, *test], folder)
     chosen = [test[index] for index in np.unique(np.linspace(0, len(test) - 1, views).round().astype(int))]
     whole = [desk_truth(frame) if folder is None else kitchen_truth(frame, folder) for frame in chosen]
     truths = [truth[::STRIDE, ::STRIDE] for truth in whole]
-    looks = chosen if folder is None else [kitchen_depth_view(frame, folder) for frame in chosen]
-    maps = [depths(model, look, min_opacity=min_opacity) for look in looks]
+    looks = chosen if folder is None else [kitchen_depth_view(frame, folder, metres=metres) for frame in chosen]
+    maps = [
+        {name: metres * depth for name, depth in depths(model, look, min_opacity=min_opacity).items()} for look in looks
+    ]
     rows = measure(maps, truths)
     for frame, one, truth in zip(chosen, maps, truths, strict=True):
         assert frame.image is not None
@@ -218,7 +244,7 @@ def main(
 
     table = Table(
         *("depth along z", "coverage", "median cm", "RMSE cm", "within 1 %", "within 5 %", "bias cm"),
-        title=f"{capture}: {len(chosen)} held-out views, opacity >= {min_opacity:g}",
+        title=f"{capture}: {len(chosen)} held-out views, opacity >= {min_opacity:g}, {metres:.4g} m per unit",
     )
     for row in rows:
         table.add_row(

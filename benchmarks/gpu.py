@@ -330,7 +330,7 @@ def pictures(capture: Path, device: Any, sizes: Sizes) -> dict[str, float]:
     for _ in range(sizes.warm_up_steps):
         fitting.advance(0.5)
     model = Model(
-        fitting.field, fitting.occupied, fitting.marching, (1.0, 1.0, 1.0), frame_of_training, unit="arbitrary"
+        fitting.field, fitting.cells.coarse, fitting.marching, (1.0, 1.0, 1.0), frame_of_training, unit="arbitrary"
     )
     frame = scene.load(capture).train_frames[0]
     side = sizes.picture

@@ -572,7 +572,9 @@ GROUPS: tuple[Group, ...] = (
         (),
         (
             Mutant("DECAY = 0.8", "DECAY = 1.0"),
-            Mutant("return ~(self.optical_depth <= optical_depth)", "return self.optical_depth > optical_depth"),
+            Mutant("return ~(self.optical_depth <= self", "return (self.optical_depth > self"),
+            Mutant("self.optical_depth.nanmean().clamp_max(optical_depth)", "optical_depth"),
+            Mutant(".nanmean().clamp_max", ".mean().clamp_max"),
             Mutant(
                 "numbers % side, numbers // side % side, numbers // side**2",
                 "numbers // side**2, numbers // side % side, numbers % side",
@@ -698,6 +700,20 @@ GROUPS: tuple[Group, ...] = (
             Mutant("np.where(number >= 0, 1.0 + of_strata[number], np.nan)", "1.0 + of_strata[number]"),
             Mutant('side="right"', 'side="left"'),
             Mutant("((1 - level) / 2, (1 + level) / 2)", "(1 - level, level)"),
+            Mutant("(-tolerance, tolerance)", "(0.0, tolerance)"),
+            Mutant("np.where(number >= 0, of_strata[number], np.nan)", "of_strata[number]"),
+        ),
+    ),
+    Group(
+        "viewer/coverage.py",
+        ("tests/test_page.py",),
+        "cells_hold",
+        (),
+        (
+            Mutant("(z * side + y) * side + x", "(x * side + y) * side + z"),
+            Mutant("photos, points[first])", "photos, points[: len(first)])"),
+            Mutant("256 * np.rint(parallax)", "256 * np.rint(parallax / 2)"),
+            Mutant("model.training_from_scene.apply(points)", "points"),
         ),
     ),
     Group(

@@ -320,4 +320,22 @@ TRAINING: tuple[Group, ...] = (
             Mutant("LEAST_TOLD = 6", "LEAST_TOLD = 1"),
         ),
     ),
+    Group(
+        "fit/open_cells.py",
+        ("tests/test_open_cells.py",),
+        "",
+        (),
+        (
+            Mutant("self.coarse if self.visits is None or step % LOOK_AROUND_EVERY == 0", "self.coarse if True"),
+            Mutant("before * DECAY)", "before)"),
+            Mutant("(visits >= 0).nonzero()", "(visits > -2).nonzero()"),
+            Mutant(".maximum(visits[visited])", ""),
+            Mutant("visits[visited] = UNVISITED", "pass"),
+            Mutant("ranks.keep_largest(self.visits)", "pass"),
+            Mutant("parts &= self.coarse", "parts & self.coarse"),
+            Mutant("self._occupancy.least(threshold)", "threshold"),
+            Mutant("self.coarse &= self._covered", "pass"),
+            Mutant('"fine_visits": self.visits, ', ""),
+        ),
+    ),
 )

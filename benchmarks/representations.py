@@ -84,7 +84,7 @@ class Capture:
     def model(self, fitting: Fitting) -> Model:
         """What the training of `fitting` has come to."""
         return Model(
-            fitting.field, fitting.occupied, self.extent.marching, self.background, self.similarity, "arbitrary"
+            fitting.field, fitting.cells.coarse, self.extent.marching, self.background, self.similarity, "arbitrary"
         )
 
 

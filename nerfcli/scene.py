@@ -19,6 +19,7 @@ from nerfcli.cameras.formats.blender import read_blender
 from nerfcli.cameras.formats.colmap import colmap_on_disk, is_model, read_colmap, read_model
 from nerfcli.cameras.formats.colmap_model import ColmapModel
 from nerfcli.cameras.formats.llff import IMAGE_FOLDERS, read_llff
+from nerfcli.cameras.formats.run_cameras import CAMERAS
 from nerfcli.cameras.formats.scene_json import SCENE_FILE, SCENE_VERSION, UNITS, UNUSED, read_description
 from nerfcli.cameras.formats.transforms import read_transforms
 from nerfcli.cameras.frame import Capture, Frame, Size
@@ -344,18 +345,24 @@ def refuse_without_training_photos(scene: Scene) -> None:
         )
 
 
+def photo_folder(path: Path) -> Path | None:
+    """Return the folder that contains photos: `path`, or its folder `images`; None if neither does."""
+    return next((folder for folder in (path, path / "images") if folder.is_dir() and list_images(folder)), None)
+
+
 def _no_scene(path: Path) -> UserError:
+    if (path / CAMERAS).is_file():
+        hint = f"give the scene it was trained on; to continue it: nerfcli train SCENE -o {path} --resume"
+        return UserError(f"{path} is a run, not a scene", hint)
     looked_for = (
         f"{SCENE_FILE}, {', '.join(name for name in _MODEL_FOLDERS[:-1])} (COLMAP), "
         "transforms.json, transforms_train.json, poses_bounds.npy"
     )
-    for folder in (path, path / "images"):
-        photos = len(list_images(folder)) if folder.is_dir() else 0
-        if photos:
-            return UserError(
-                f"{folder} has {photos} photos but no poses; looked for {looked_for}",
-                f"estimate them with: nerfcli poses {folder}",
-            )
+    if folder := photo_folder(path):
+        return UserError(
+            f"{folder} has {len(list_images(folder))} photos but no poses; looked for {looked_for}",
+            f"estimate them with: nerfcli poses {folder}",
+        )
     return UserError(
         f"{path} is not a scene; looked for {looked_for}",
         "give a scene folder, or estimate poses first: nerfcli poses PHOTOS",

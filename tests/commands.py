@@ -2,11 +2,16 @@
 
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
+import typer.testing
 from typer.testing import CliRunner, Result
 
 from nerfcli import cli
+
+# Each call of the runner would build all commands again, which takes as long as most of them do to refuse an input.
+typer.testing._get_command = cache(typer.testing._get_command)  # pyright: ignore[reportPrivateUsage, reportPrivateImportUsage]
 
 
 def nerfcli(*arguments: str | Path, stdin: str | None = None) -> Result:

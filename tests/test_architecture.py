@@ -4,7 +4,9 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -138,12 +140,36 @@ def part_of(path: Path) -> str:
     return part_named(path.relative_to(ROOT).with_suffix("").parts)
 
 
+class Source(NamedTuple):
+    """What the tests look for in a file."""
+
+    imports: list[ast.Import | ast.ImportFrom]
+    calls: list[tuple[int, str]]
+    constants: set[str]
+    docstring: str | None
+
+
+@cache
+def source(path: Path) -> Source:
+    """Parse a file once for all tests; its tree is not kept."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    found = Source([], [], set(), ast.get_docstring(tree))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found.imports.append(node)
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name | ast.Attribute):
+            found.calls.append((node.lineno, ast.unparse(node.func)))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found.constants.add(node.value)
+    return found
+
+
 def imported(path: Path) -> Iterator[tuple[int, str]]:
     """Line and full dotted name of everything that a file imports, inside functions too."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in source(path).imports:
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             assert node.level == 0, f"{path}:{node.lineno}: relative imports hide who imports whom"
             yield from ((node.lineno, f"{node.module}.{alias.name}") for alias in node.names)
 
@@ -197,11 +223,8 @@ def test_the_command_line_starts_without_heavy_libraries():
 def test_only_the_command_line_prints_and_exits(path):
     if part_of(path) == "cli":
         return
-    wrong = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("print", "exit", "quit", "sys.exit"):
-            wrong.append(f"line {node.lineno}: {ast.unparse(node.func)}")
-    assert not wrong
+    calls = source(path).calls
+    assert not [f"line {line}: {name}" for line, name in calls if name in ("print", "exit", "quit", "sys.exit")]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
@@ -209,8 +232,8 @@ def test_the_files_of_a_run_have_one_reader_each(path):
     """Whoever wants to read one has to go through `runs`, or for its cameras through the format."""
     if path.relative_to(ROOT).as_posix() in ("runs/files.py", "cameras/formats/run_cameras.py"):
         return
-    texts = (node.value for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Constant))
-    assert not set(texts) & {"config.json", "log.jsonl", "field.safetensors", "state.safetensors", "metrics.json"}
+    names = source(path).constants
+    assert not names & {"config.json", "log.jsonl", "field.safetensors", "state.safetensors", "metrics.json"}
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
@@ -224,4 +247,4 @@ def test_a_file_holds_one_idea_and_says_which(path):
     assert len(text.splitlines()) <= MOST_LINES
     assert path.stem not in ("utils", "util", "helpers", "misc", "common")
     if text.strip():
-        assert ast.get_docstring(ast.parse(text)), "a module says in its docstring what it is for"
+        assert source(path).docstring, "a module says in its docstring what it is for"

@@ -150,6 +150,20 @@ def test_a_picture_is_what_the_reference_gives_in_float64(name, count):
             )
 
 
+@pytest.mark.parametrize("wanted", ["numba_cpu", "reference"])
+@pytest.mark.parametrize("count", [0, 1, 5, 123])
+def test_where_the_light_of_samples_ends_is_what_the_reference_gives_in_float64(wanted, count):
+    field = field_of("compiled sizes", torch.float32, wanted)
+    rays, march = rays_and_march(count, torch.float32)
+    samples = field.backend.trace_rays(rays, march, field.medium(), background=torch.zeros(3)).intervals
+    *spans, offsets = samples
+    exact = reference.light_ends(*(values.double() for values in spans), offsets=offsets, shares=(0.25, 0.5))
+    light = field.backend.light_ends(samples, shares=(0.25, 0.5))
+    for key, expected in exact._asdict().items():
+        value = getattr(light, key).double()
+        torch.testing.assert_close(value, expected, rtol=1e-6, atol=1e-6, equal_nan=True, msg=key)
+
+
 @pytest.mark.parametrize("negligible", [1e-3, 0.05, 0.5])
 def test_compiled_pictures_stay_within_their_bound(negligible):
     """More rays than a thread carries at a time; the same rays alone give the same bits."""
@@ -472,9 +486,18 @@ def test_a_gpu_with_working_kernels_takes_them(with_gpu, monkeypatch):
     backend = kernels.backend_for(torch.device("cuda:1"), torch.float32)
     assert (backend.name, backend.deterministic) == ("triton_cuda", False)
     assert kernels.backend_for(CPU, torch.float32).name == "numba_cpu"
-    refusal = r"triton_cuda cannot be used: it supports float32, not bfloat16"
+    refusal = r"triton_cuda cannot be used: float32 is supported, not bfloat16"
     with pytest.raises(UserError, match=refusal):
         kernels.backend_for(torch.device("cuda"), torch.bfloat16, wanted="triton_cuda")
+
+
+def test_half_precision_on_a_gpu_takes_the_reference_with_one_warning(with_gpu, monkeypatch, recwarn):
+    monkeypatch.setattr(kernels, "_why_not_triton", lambda index: None)
+    names = [kernels.backend_for(torch.device("cuda"), torch.float16).name for _ in range(2)]
+    names.append(kernels.backend_for(torch.device("cuda"), torch.float64).name)
+    assert names == ["reference"] * 3
+    (warning,) = recwarn
+    assert "the GPU kernels cannot be used (float32 is supported, not float16)" in str(warning.message)
 
 
 def test_without_a_gpu_its_kernels_are_an_error_only_where_they_are_wanted():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from examples import examples
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from nerfcli.cameras import rigid
@@ -136,6 +136,7 @@ def test_opencv_fisheye_agrees_with_opencv():
 
 
 @given(k=st.integers(-600, 600).map(lambda thousandth: thousandth / 1000), radius=st.floats(0.01, 1.5))
+@example(k=0.1, radius=1.1)  # the root is 1, where the table of radii used to end, and the pixel counted as outside
 @examples(60)
 def test_simple_radial_bearing_is_the_smallest_root_of_its_cubic_or_invalid(k, radius):
     """r (1 + k r^2) = radius: closed form through the roots of the cubic, at any strength of the distortion."""

@@ -40,7 +40,7 @@ USAGE = 2
 PROJECT = Path(__file__).parent.parent
 GUIDES = (PROJECT / "README.md", *sorted((PROJECT / "docs").glob("*.md")))
 # Enough for a command that trains to do everything that it does.
-QUICK = ("--steps", "1", "--downscale", "8", "--threads", "2")
+QUICK = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "2")
 
 
 def write_photos(folder: Path, count: int) -> Path:
@@ -164,7 +164,11 @@ def test_all_threads_are_the_processors_of_this_process():
     [
         ("train", "scene"),
         ("trian x", "trian"),
-        ("train x --stepz 3", "--stepz"),
+        ("train x --stepz 3", "--stepz (Possible options: --help, --seed, --steps)"),
+        ("poses x --budget 3m", "--budget, which belongs to train, run, bench, ablate"),
+        ("poses x y", "(y); give one, or several on standard input: ls -d captures/*/ | nerfcli poses -"),
+        ("view x y", "unexpected extra argument(s) (y)"),
+        ("export x", "'--to'. What to export: page, mesh"),
         ("train x --steps 0", "--steps"),
         ("train x --downscale 3", "'3'; choose auto, 1, 2, 4 or 8"),
         ("train x --field gaussians", "'gaussians'; choose hash, voxels or mlp"),
@@ -176,7 +180,7 @@ def test_all_threads_are_the_processors_of_this_process():
         ("poses x --camera-model PERSPECTIVE", "'PERSPECTIVE'; choose auto"),
         ("render x --depth expected", "'expected'; choose conditional, moment"),
         ("render x --depth-axis y", "'y'; choose ray or z"),
-        ("render x --outputs rgb,normals", "'normals'; choose some of rgb,depth,opacity"),
+        ("render x --outputs rgb,normals", "'normals'; choose from rgb, depth, opacity"),
         ("render x --min-opacity 1.5", "--min-opacity"),
         ("render x --colour-map jet", "'jet'; choose turbo, viridis or grey"),
         ("render x --video-format avi", "'avi'; choose mp4, h265, webm or gif"),
@@ -210,7 +214,17 @@ def test_a_missing_path_is_told_in_two_lines(command, tmp_path):
 def test_a_scene_where_a_run_is_needed_is_told_with_what_to_do(command, capture, tmp_path):
     error = error_of(nerfcli(command, capture))
     assert error == (f"Error: {capture} is a scene, not a run", f"Hint:  train it first: nerfcli train {capture}")
+    photos = write_photos(tmp_path / "photos", 1)
+    hint = f"Hint:  make a run of it first: nerfcli run {photos}"
+    assert error_of(nerfcli(command, photos)) == (f"Error: {photos} is a folder of photos, not a run", hint)
     assert error_of(nerfcli(command, tmp_path / "nowhere"))[0] == f"Error: {tmp_path / 'nowhere'} does not exist"
+
+
+@pytest.mark.parametrize("command", ["train", "ablate"])
+def test_a_run_where_a_scene_is_needed_is_told_with_what_to_do(command, finished, tmp_path):
+    error, hint = error_of(nerfcli(command, finished, "-o", tmp_path / "out"))
+    assert error == f"Error: {finished} is a run, not a scene"
+    assert hint.endswith(f"to continue it: nerfcli train SCENE -o {finished} --resume")
 
 
 def test_photos_where_cameras_are_needed_are_told_with_what_to_do(tmp_path):
@@ -264,7 +278,7 @@ def test_damaged_photos_are_named_with_what_is_wrong(tmp_path):
     error, hint = error_of(result)
     assert "only 2 of 4 photos" in error
     assert "photo 0.jpg: damaged or truncated" in error.replace(" is ", " ")
-    assert "copy the damaged files again" in hint
+    assert "copy them again" in hint
     assert listing(tmp_path) == before
 
 
@@ -730,7 +744,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 @pytest.mark.parametrize(("sent", "exit_code"), [(signal.SIGINT, INTERRUPTED), (signal.SIGTERM, TERMINATED)])
 def test_ctrl_c_and_sigterm_save_a_checkpoint_and_say_how_to_go_on(sent, exit_code, capture):
     run = capture.with_name("spheres-run")
-    options = ("--downscale", "8", "--threads", "1", "--model", "default")
+    options = ("--downscale", "8", "--log2-rows", "10", "--threads", "1", "--model", "default")
     process = started("train", capture, "--budget", "10m", *options)
     deadline = time.monotonic() + 120
     while not (run / "log.jsonl").exists() and process.poll() is None and time.monotonic() < deadline:

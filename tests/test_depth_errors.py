@@ -15,6 +15,7 @@ from nerfcli.errors import UserError
 from nerfcli.evaluate import depth_errors
 from nerfcli.evaluate.depth_errors import measure_depth_errors, surface_tracks
 from nerfcli.media.descriptions import depth_meta_of
+from nerfcli.media.exr import read_exr
 from nerfcli.multiview.stereo import DenseDepth
 from nerfcli.multiview.tracks import Tracks
 from nerfcli.multiview.triangulation import triangulate
@@ -35,7 +36,7 @@ def errors() -> DepthErrors:
     spread = np.linspace(-1, 1, 1001)
     of_strata = [0.4 * spread, 0.1 + 0.1 * spread, 0.01 * spread]
     coverage = np.repeat([1.0, 3.0, 7.0], 1001)
-    return DepthErrors.of(np.concatenate(of_strata), coverage, np.arange(3003) % 2)
+    return DepthErrors.of(np.concatenate(of_strata), coverage, np.arange(3003) % 2, matched=0.5)
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9])
@@ -50,13 +51,29 @@ def test_intervals_are_those_of_evenly_spread_errors(errors, level):
     assert errors.pixels == (1001, 1001, 1001)
 
 
+@pytest.mark.parametrize("tolerance", [0.005, 0.05, 0.25, 1.0])
+def test_confidence_is_the_proportion_of_evenly_spread_errors(errors, tolerance):
+    """Of errors from -0.4 to 0.4, from 0 to 0.2 and from -0.01 to 0.01, those from -tolerance to tolerance."""
+    coverage = np.array([0, 1, 2, 3, 4, 20, np.nan])
+    confidence = errors.confidence(coverage, tolerance=tolerance)
+    one, two, four = min(tolerance / 0.4, 1), min(tolerance / 0.2, 1), min(tolerance / 0.01, 1)
+    np.testing.assert_allclose(confidence, [np.nan, one, two, two, four, four, np.nan], atol=1e-6)
+    assert confidence.dtype == np.float32
+
+
+def test_confidence_is_1_where_all_errors_are_0():
+    errors = DepthErrors.of(np.zeros(600), np.repeat([1.0, 2.0, 4.0], 200), np.arange(600) % 2, matched=0.5)
+    np.testing.assert_array_equal(errors.confidence(np.array([1.0, 2.0, 4.0]), tolerance=0.001), 1.0)
+
+
 def test_where_too_little_was_measured_there_is_no_interval():
     """Too few pixels in the first stratum, one photo alone in the second."""
     coverage = np.repeat([1.0, 2.0, 4.0], [LEAST_PIXELS - 1, LEAST_PIXELS, LEAST_PIXELS])
     photos = np.where(coverage == 2, 0, np.arange(len(coverage)) % 2)
-    errors = DepthErrors.of(np.zeros(len(coverage)), coverage, photos)
+    errors = DepthErrors.of(np.zeros(len(coverage)), coverage, photos, matched=0.5)
     lower, _ = errors.bounds(np.ones(3), np.array([1.0, 2.0, 4.0]), level=0.9)
     assert np.isnan(lower).tolist() == [True, True, False]
+    np.testing.assert_array_equal(errors.confidence(np.array([1.0, 2.0, 4.0]), tolerance=0.02), [np.nan, np.nan, 1])
     again = DepthErrors.from_json(json.loads(json.dumps(errors.to_json(), allow_nan=False)))
     np.testing.assert_array_equal(again.quantiles, errors.quantiles)
     assert (again.pixels, again.photos) == (errors.pixels, 2)
@@ -92,14 +109,16 @@ def test_errors_are_those_between_matched_and_median_distances(spheres_run, monk
     maps = depth_maps(model, run.cameras.train, max_size=48)
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
     found = measure_depth_errors(run, model, maps, threads=1)
-    expected = []
+    expected, matched = [], []
     for frame in run.cameras.test:
         picture = render_picture(model, frame, background=model.background, depth=DepthRequest("median", "ray"))
         assert picture.depth is not None
         truth = tifffile.imread(TRUTH / f"{Path(frame.name).stem}_distance.tiff")
+        matched.append(np.isfinite(truth).mean())
         expected.append((truth / picture.depth - 1)[np.isfinite(truth) & np.isfinite(picture.depth)])
     every = np.concatenate(expected)
     assert found.photos == 3
+    assert found.matched == pytest.approx(np.mean(matched))
     assert 0.9 * len(every) < sum(found.pixels) <= len(every)
     # Nearly all is in the last stratum.
     np.testing.assert_allclose(found.quantiles[2][20:181], np.quantile(every, np.linspace(0.1, 0.9, 161)), atol=0.01)
@@ -155,10 +174,46 @@ def test_render_writes_the_interval_and_keeps_the_errors(spheres_run, tmp_path, 
     assert json.loads((run / DEPTH_ERRORS).read_text())["photos"] == 3
 
 
+def test_render_writes_the_proportion_of_depths_within_the_tolerance(spheres_run, tmp_path, monkeypatch):
+    """Measured with the true distances of the same pictures, confidence is the proportion itself."""
+    run = copied(spheres_run, tmp_path)
+    monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth())
+    common = ("render", run, "--depth", "median", "--depth-axis", "ray", "--depth-format", "tiff,exr", "--threads", "2")
+    outputs = ("--outputs", "depth,coverage,confidence", "--depth-tolerance", "0.01", "-o", tmp_path / "views")
+    result = nerfcli(*common, *outputs)
+    assert result.exit_code == 0, result.stderr
+    depth, coverage, confidence, truth = (
+        np.stack([tifffile.imread(path) for path in sorted(paths)])
+        for paths in (
+            *((tmp_path / "views" / name).rglob("*.tiff") for name in ("depth", "coverage", "confidence")),
+            TRUTH.glob("*_distance.tiff"),
+        )
+    )
+    compared = (coverage >= 4) & np.isfinite(truth)
+    within = np.abs(truth - depth)[compared] <= 0.01 * depth[compared]
+    assert 0.2 < within.mean() < 0.95
+    np.testing.assert_allclose(confidence[coverage >= 4], within.mean(), atol=0.01)
+    assert np.isnan(confidence[coverage == 0]).all()
+    assert np.isnan(confidence[np.isnan(depth)]).all()
+    exr = min((tmp_path / "views").rglob("*.exr"))
+    np.testing.assert_array_equal(read_exr(exr)["confidence.V"], confidence[0])
+    path = min((tmp_path / "views" / "confidence").rglob("*.tiff"))
+    meta = depth_meta_of(path)
+    assert meta is not None
+    assert (meta.quantity, meta.convention, meta.unit) == ("confidence", "confidence:0.01", "fractions of 1")
+    assert "confidence, in fractions of 1: the proportion of depths" in nerfcli("info", path).stdout
+    preview = nerfcli("info", path.with_suffix(".png")).stdout
+    assert "confidence: proportion of depths with an error of at most 1 %" in meta.title
+    assert "range: 0.0 1.0" in preview
+    kept = nerfcli(*common, *outputs, "--level", "0.5")
+    assert "is kept: it is complete" in kept.stderr
+
+
 def test_render_says_where_there_is_no_interval(spheres_run, tmp_path, monkeypatch):
     run = copied(spheres_run, tmp_path)
     monkeypatch.setattr(depth_errors, "dense_depths", matched_by_truth(0.01))
     result = nerfcli("render", run, "--outputs", "lower", "--threads", "2", "-o", tmp_path / "views")
     assert result.exit_code == 0, result.stderr
-    assert "no intervals where 4 photos see the surface: only" in result.stderr
+    assert "no intervals or confidence where 4 photos see the surface: only" in result.stderr
+    assert "what cannot be matched is usually worse" in result.stderr
     assert np.isnan(tifffile.imread(next((tmp_path / "views/lower").rglob("*.tiff")))).all()

@@ -31,7 +31,13 @@ from nerfcli.train.preparation import prepare
 CAMERA = Camera("SIMPLE_PINHOLE", 12, 8, (12.0, 6.0, 4.0))
 LEARNED = Components(background="sphere", exposure="learned")
 SHORT = TrainSettings(
-    budget_seconds=None, steps=6, first_samples_per_step=2**9, samples_per_step=2**9, threads=2, components=LEARNED
+    budget_seconds=None,
+    steps=6,
+    first_samples_per_step=2**9,
+    samples_per_step=2**9,
+    log2_rows=10,
+    threads=2,
+    components=LEARNED,
 )
 
 

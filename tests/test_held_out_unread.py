@@ -62,6 +62,7 @@ def settings(model: str, components: Components) -> TrainSettings:
         steps=12,
         first_samples_per_step=2**9,
         samples_per_step=2**9,
+        log2_rows=10,
         model=model,
         components=components,
     )

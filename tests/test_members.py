@@ -25,7 +25,7 @@ from nerfcli.runs.settings import TrainSettings
 from nerfcli.workflows.members import PHOTO_FRACTION, VARIED, member_settings
 
 USAGE = 2  # Click's exit code for wrong options
-QUICK = ("--steps", "1", "--downscale", "8", "--threads", "1", "--model", "default")
+QUICK = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "1", "--model", "default")
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from nerfcli.exclusive import exclusive
 from nerfcli.interrupts import install_handlers
 from nerfcli.runs.files import LOCK, PHOTO_DEPTHS
 
-ONE_STEP = ("--steps", "1", "--downscale", "8", "--threads", "2")
+ONE_STEP = ("--steps", "1", "--downscale", "8", "--log2-rows", "10", "--threads", "2")
 FEW = ("--cameras", "test", "--max-size", "16", "--threads", "2")
 
 # Of commands that write: their words, with the capture and a run of it, and the bytes that a file may have.
@@ -102,9 +102,9 @@ def test_ctrl_c_and_sigterm_end_a_command_in_one_line(name, finished, capture, i
 
 
 @pytest.mark.parametrize("name", ["info", pytest.param("render", marks=pytest.mark.slow)])
-def test_a_reader_that_goes_away_loses_nothing(name, finished):
+def test_a_reader_that_goes_away_loses_nothing(name, finished, capture):
     """As `| true`: the results are complete, and nobody complains."""
-    process = started("info", finished, "--json") if name == "info" else started("render", finished, *FEW, "--quiet")
+    process = started("info", capture, "--json") if name == "info" else started("render", finished, *FEW, "--quiet")
     assert process.stdout is not None
     assert process.stderr is not None
     process.stdout.close()
@@ -126,16 +126,17 @@ def test_a_second_training_of_a_run_is_refused_while_the_first_is_at_work(captur
     assert [path.name for path in run.iterdir()] == [LOCK]
 
 
-def test_a_run_that_was_moved_without_its_photos_says_which_and_how_to_mend_it(finished, capture):
+def test_a_run_whose_photos_were_moved_elsewhere_says_which_and_how_to_mend_it(finished, capture):
     moved = capture.parent / "elsewhere" / "run"
     shutil.copytree(finished, moved)
+    photos = capture.rename(capture.with_name("photos elsewhere"))
     result = nerfcli("evaluate", moved)
     assert result.exit_code == BAD_INPUT
     error, hint = error_of(result)
     missing = moved.parent / "spheres" / "test" / "r_000.png"
     assert error == f"Error: photo not found: {missing}"
     assert "put a link to the photo folder there" in hint
-    (moved.parent / "spheres").symlink_to(capture)  # as it says
+    (moved.parent / "spheres").symlink_to(photos)  # as it says
     assert nerfcli("evaluate", moved).exit_code == 0
 
 

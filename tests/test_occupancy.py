@@ -118,6 +118,16 @@ def test_a_cell_with_nan_is_looked_into(grid):
     assert grid.above(1e9).all()
 
 
+def test_the_fullest_cells_of_thin_fog_stay_open(grid):
+    """With nothing above the threshold, those above the mean of all; NaN in one of them changes the others little."""
+    refreshed(grid, Ramp())
+    depth = grid.optical_depth
+    assert torch.equal(grid.above(1e9), depth > depth.double().mean())
+    assert torch.equal(grid.above(1e-3), depth > 1e-3)
+    depth[0, 0, 0] = math.nan
+    assert torch.equal(grid.above(1e9), ~(depth <= depth[depth.isfinite()].double().mean()))
+
+
 def test_state_round_trip(grid):
     refreshed(grid, Ramp())
     other = Occupancy(SIDE, torch.device("cpu"))

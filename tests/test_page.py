@@ -2,7 +2,9 @@
 
 import base64
 import json
+import os
 import re
+import shutil
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,15 +22,20 @@ from nerfcli.cameras.formats.camera_path import read_path
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_vector
 from nerfcli.errors import UserError
+from nerfcli.export.visibility import with_visibility
 from nerfcli.field.background import SphereBackground
 from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.field.hash_field import HashField, HashFieldSettings
 from nerfcli.field.interface import Field
 from nerfcli.field.voxel_field import VoxelField, VoxelFieldSettings
+from nerfcli.kernels import grid_coordinates
 from nerfcli.kernels.reference.encoding import hash_encode
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Marching, Model
 from nerfcli.render.pictures import render_picture
+from nerfcli.render.visibility import DepthMap, depth_maps
+from nerfcli.runs.run import Run
+from nerfcli.viewer.coverage import seen_cells
 from nerfcli.viewer.packing import FINEST_LEVEL, pack_model, quantised, reached_rows
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import PagePhotos
@@ -40,6 +47,7 @@ COLOUR_BOUND = 2e-3
 COMPRESSED_NOTHING = base64.b64encode(zlib.compress(b"")).decode()
 # The share of pixels within the bound of depths: at edges a median jumps from one surface to another.
 AGREEING = 0.98
+UNSEEN = np.zeros((2, 2, 2), "<u2")
 SIMILARITY = Similarity(0.7, rotation_from_vector(np.array([0.2, -0.4, 0.9])), np.array([0.1, -0.2, 0.3]))
 
 
@@ -66,7 +74,7 @@ def rough(field: Field, *, sky: bool = False) -> Model:
 
 def page_of(model: Model, frames: list[Frame]) -> str:
     photos = PagePhotos([], 0, 0)
-    numbers = PageNumbers.of(pack_model(model), make_proof(model, frames))
+    numbers = PageNumbers.of(pack_model(model), make_proof(model, frames), UNSEEN)
     box = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     return page_html(model, numbers, run=Path("a-run"), frames=frames, photos=photos, box=box)
 
@@ -163,6 +171,42 @@ def test_the_proof_holds_the_pictures_of_nerfcli_render():
     np.testing.assert_array_equal(expected[first * count : (first + 1) * count].reshape(HEIGHT, WIDTH), picture.depth)
 
 
+def plane_from(x: float) -> DepthMap:
+    """What a camera 1.2 above the plane z = 0 of the scene sees of it, through a lens of 40 degrees."""
+    pose = look_at(np.array([x, 0.0, 1.2]), np.array([x, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    frame = Frame("a.png", Camera.pinhole(240, 240, 120 / np.tan(np.radians(20))), pose)
+    rays, _ = frame.camera.pixel_bearings()
+    return DepthMap(frame, (1.2 / rays[:, 2]).reshape(240, 240).astype(np.float32))
+
+
+def cell_values(model: Model, cells: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Of the cells that points (N, 3) of the scene lie in."""
+    places = grid_coordinates(torch.from_numpy(model.training_from_scene.apply(points)), model.contraction).numpy()
+    x, y, z = np.floor(places * len(cells)).astype(int).T
+    return cells[z, y, x]
+
+
+def test_cells_hold_the_coverage_and_parallax_of_the_surface_in_them():
+    """Of a plane below three cameras: how many have a point in the picture, and the angle between their rays."""
+    model = rough(VoxelField(VoxelFieldSettings(contraction="none", view_degree=1, log2_vertices=11)))
+    places = (-0.3, 0.0, 0.35)
+    cells = seen_cells(model, [plane_from(x) for x in places])
+    points = np.random.default_rng(0).uniform(-0.9, 0.9, (5000, 3)) * (1, 0.44, 0)
+    from_middle = np.abs(points[:, :1] - places)
+    reach, width = 1.2 * np.tan(np.radians(20)), 2 * np.sqrt(3) / len(cells) / SIMILARITY.scale
+    clear = (np.abs(from_middle - reach) > width).all(axis=1)
+    seen = from_middle < reach
+    angles = np.degrees(np.arctan2(points[:, :1] - places, np.hypot(1.2, points[:, 1:2])))
+    lowest, highest = np.where(seen, angles, 90).min(axis=1), np.where(seen, angles, -90).max(axis=1)
+    found = cell_values(model, cells, points)
+    assert set(seen[clear].sum(axis=1)) == {0, 1, 2, 3}
+    alike = found % 256 == seen.sum(axis=1)
+    assert alike[clear].mean() > 0.99
+    expected = np.where(seen.sum(axis=1) > 1, highest - lowest, 0)
+    np.testing.assert_allclose((found // 256)[clear & alike], expected[clear & alike], atol=1.5)
+    assert not cell_values(model, cells, points + np.array([0, 0, 3 * width])).any()
+
+
 def test_a_network_without_a_table_is_refused_with_a_way_out():
     field = FourierField(FourierFieldSettings(contraction="l2", width=16, octaves=4))
     with pytest.raises(UserError, match="cannot render a field of type") as caught:
@@ -180,7 +224,7 @@ def test_names_of_a_capture_stay_text():
     evil = "</script><script>alert(1)</script>"
     page = page_html(
         model,
-        PageNumbers.of(pack_model(model), make_proof(model, [at((1, 1, 1))])),
+        PageNumbers.of(pack_model(model), make_proof(model, [at((1, 1, 1))]), UNSEEN),
         run=Path("a-run"),
         frames=[at((1, 1, 1))],
         photos=PagePhotos([{"name": evil, "split": "train"}], 0, 0),
@@ -213,7 +257,8 @@ def test_what_stands_there_is_not_replaced_unasked(spheres_run, tmp_path):
 
 @pytest.fixture(scope="module")
 def spheres_page(spheres_run, tmp_path_factory) -> Path:
-    return export_run(spheres_run, tmp_path_factory.mktemp("page") / "spheres.html", to="page", threads=2)
+    run = shutil.copytree(spheres_run, spheres_run.with_name(f"page-run-{os.getpid()}"))  # it keeps depths of photos
+    return export_run(run, tmp_path_factory.mktemp("page") / "spheres.html", to="page", threads=2)
 
 
 @pytest.fixture(scope="module")
@@ -250,6 +295,45 @@ def test_the_browser_draws_what_nerfcli_renders(opened):
         assert differences["numbers"] > 1000, name
         assert differences["percentile_99"] <= 2e-3, name
         assert differences["undefined_here"] + differences["undefined_there"] <= 3, name
+
+
+def test_the_browser_shows_how_many_photos_see_the_surface(opened, spheres_run):
+    """In the cell of the median point, by the kernels; nearly everywhere in the stratum that `render` gives."""
+    run = Run(spheres_run)
+    model, photos = run.model(), depth_maps(run.model(), run.cameras.train)
+    cells = seen_cells(model, photos)
+    camera = opened.run("nerfcliPage.scene.proof.cameras[0]")
+    drawn = opened.run(
+        "(() => { const { proof } = nerfcliPage.scene, { width, height, share } = proof;"
+        " const picture = nerfcliPage.renderer.picture({ ...proof.cameras[0], width, height, share });"
+        " const value = (map, i) => valueOf(map, picture, i, { factor: 7, farthest: 1, minOpacity: 0.5 });"
+        " const pixels = [...Array(width * height).keys()];"
+        " return ['coverage', 'parallax'].map(map => pixels.map(i => value(map, i))); })()"
+    )
+    coverage, parallax = np.array(drawn, dtype=float)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = camera["turn"], camera["place"]
+    frame = Frame("a.png", Camera("PINHOLE", WIDTH, HEIGHT, tuple(camera["lens"])), pose)
+    request = DepthRequest("median", "ray")
+    picture = render_picture(model, frame, background=model.background, depth=request)
+    exact = with_visibility(picture, frame, axis="ray", photo_depths=photos)
+    assert picture.depth is not None
+    assert exact.coverage is not None
+    there = np.isfinite(coverage) & np.isfinite(picture.depth.ravel())
+    assert there.sum() > 300
+    assert (np.isfinite(coverage) == np.isfinite(picture.depth.ravel())).mean() > AGREEING
+    rays, _ = frame.camera.pixel_bearings()
+    points = (rays * picture.depth.reshape(-1, 1))[there] @ pose[:3, :3].T + pose[:3, 3]
+    found = cell_values(model, cells, points)
+    assert (coverage[there] == found % 256).mean() > AGREEING
+    assert (parallax[there] == found // 256).mean() > AGREEING
+    strata = [np.searchsorted((1, 2, 4), values[there], side="right") for values in (coverage, exact.coverage.ravel())]
+    assert (strata[0] == strata[1]).mean() > 0.9
+    opened.run("nerfcliPage.choose(MAPS.indexOf('coverage'))")
+    opened.wait("nerfcliPage.done")
+    assert opened.run("document.getElementById('meaning').textContent").startswith("coverage: training photos that see")
+    assert opened.run("document.getElementById('ticks').textContent") == "02468 or more photos"
+    assert opened.run("state.range") == [0, 8]
 
 
 @pytest.mark.parametrize(
@@ -341,7 +425,7 @@ def test_measuring_gives_the_distance_between_depths(opened):
 def test_the_crop_box_gives_the_command_and_crops_the_view(opened):
     opened.key("b")
     command = opened.run("document.getElementById('command').textContent")
-    assert re.fullmatch(r"nerfcli export spheres-run --to mesh --box=(-?[\d.e-]+,){5}-?[\d.e-]+", command)
+    assert re.fullmatch(r"nerfcli export page-run-\d+ --to mesh --box=(-?[\d.e-]+,){5}-?[\d.e-]+", command)
     before = opened.run("nerfcliPage.probe.colour.filter((_, i) => i % 4 === 3).reduce((a, b) => a + b)")
     opened.run(
         "(() => { const i = document.getElementById('numbers').children[3], b = state.box; i.value = b[0] + 1e-3;"

@@ -9,8 +9,8 @@ import pytest
 from test_photos import NO_EXIF
 
 from nerfcli.errors import BAD_INPUT, UserError
-from nerfcli.poses.engine.retrieval import alike, likeness
-from nerfcli.poses.input.pairs import EXHAUSTIVE_UP_TO, Pairing, capture_order, choose_pairs
+from nerfcli.poses.engine.retrieval import alike, likeness, promising
+from nerfcli.poses.input.pairs import EXHAUSTIVE_UP_TO, Pairing, capture_order, choose_pairs, sequential_pairs
 from nerfcli.poses.input.pairs_file import read_pairs
 from nerfcli.poses.input.photos import Photo, Photos
 from nerfcli.poses.input.plan import Outlook, Plan, make_plan
@@ -190,6 +190,17 @@ def test_look_alikes_are_the_neighbours_that_are_not_known():
     assert {(i, i + 2) for i in range(28)} <= set(found)
 
 
+def test_pairs_without_common_features_are_left_out_except_the_best_of_each_photo():
+    """Photos up to three apart share features; those at the ends have fewer than four such partners."""
+    _, truth = shared_descriptors(30)
+    pairs = sequential_pairs(range(30))
+    kept = promising(truth, pairs)
+    assert set(kept) <= set(pairs)
+    assert {(i, j) for i, j in pairs if j - i <= 3} <= set(kept)
+    assert all(sum(photo in pair for pair in kept) >= 4 for photo in range(30))
+    assert all({0, 29} & set(pair) for pair in kept if pair[1] - pair[0] > 3)
+
+
 # The plan
 
 
@@ -294,7 +305,7 @@ def test_a_second_search_for_features_adds_to_what_is_left_and_takes_nothing_fro
     assert outlook.update("match", 0, 45)[1] == pytest.approx(10.0)
 
 
-def test_merging_sub_models_adds_to_what_is_left_and_takes_nothing_from_the_share():
+def test_merging_and_locating_add_to_what_is_left_and_take_nothing_from_the_share():
     """A fifth of the plan's time for mapping, on a machine as fast as planned; it is done before the checks begin."""
     now = 0.0
     outlook = Outlook(Plan(10, 1600, 4096, "exhaustive", 45, {"map": 100.0, "check": 20.0}), clock=lambda: now)
@@ -308,7 +319,11 @@ def test_merging_sub_models_adds_to_what_is_left_and_takes_nothing_from_the_shar
     assert outlook.update("merge", 1, 4)[1] == pytest.approx(15.0 + 20.0)
     now = 120.0
     outlook.update("merge", 4, 4)
-    assert outlook.update("check", 0, 4) == (pytest.approx(120.0 / 140.0), pytest.approx(20.0))
+    # Then 20 trials to locate single photos, at 0.7 s each.
+    assert outlook.update("locate", 0, 20) == (pytest.approx(120.0 / 140.0), pytest.approx(14.0 + 20.0))
+    now = 134.0
+    outlook.update("locate", 20, 20)
+    assert outlook.update("check", 0, 4) == (pytest.approx(134.0 / 154.0), pytest.approx(20.0))
 
 
 @pytest.mark.parametrize(

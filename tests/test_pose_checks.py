@@ -6,6 +6,7 @@ coordinates that are not finite, cameras in one place or on a line.
 
 import json
 import math
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -196,6 +197,13 @@ def estimate(
     return report, notes
 
 
+@pytest.fixture(scope="module")
+def estimated(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PosesReport]:
+    """The scene of these photos, and what was reported."""
+    scene = tmp_path_factory.mktemp("estimated") / "scene"
+    return scene, estimate(photos, scene)[0]
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="POSIX signals")
 def test_a_check_that_ends_the_process_is_left_out(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The worker aborts in the covariance, as C++ may; the scene is there, and says which check it lacks."""
@@ -261,8 +269,11 @@ def test_a_refused_model_stays_and_can_be_accepted(
 
 
 @pytest.mark.parametrize("component", [2, 3])
-def test_a_component_that_is_not_there_is_bad_input(photos: Path, tmp_path: Path, component: int):
+def test_a_component_that_is_not_there_is_bad_input(
+    photos: Path, estimated: tuple[Path, PosesReport], tmp_path: Path, component: int
+):
     settings = replace(ONE_THREAD, component=component)
+    shutil.copytree(estimated[0], tmp_path / "scene")
     with pytest.raises(UserError, match=rf"there is no component {component}: the photos of .* form 1 \(\d+ photos\)"):
         estimate(photos, tmp_path / "scene", settings)
 
@@ -287,8 +298,8 @@ def test_after_the_time_limit_in_a_check_only_the_checks_are_left(photos: Path, 
     assert "the photos are already mapped: running the checks" in notes
 
 
-def test_closing_notes_name_components_and_checks(photos: Path, tmp_path: Path):
-    report, _ = estimate(photos, tmp_path / "scene")
+def test_closing_notes_name_components_and_checks(estimated: tuple[Path, PosesReport]):
+    _, report = estimated
     first = report.components[0]
     two = replace(
         report,
@@ -326,9 +337,9 @@ def test_reasons_name_the_users_photos(job: Job, monkeypatch: pytest.MonkeyPatch
     assert found.left_out == {2: "contradicts the rest: its 28.5 matches with frame_00002.jpg cannot be"}
 
 
-def test_a_smaller_component_needs_no_share_of_all_photos(photos: Path, tmp_path: Path):
+def test_a_smaller_component_needs_no_share_of_all_photos(photos: Path, estimated: tuple[Path, PosesReport]):
     """4 of 20 photos: too few for the scene of all, enough for the component that was asked for."""
-    report, _ = estimate(photos, tmp_path / "scene")
+    _, report = estimated
     few = replace(report, registered=4, total=20)
     assert refusal(few, photos) is not None
     assert refusal(replace(few, settings=replace(few.settings, component=2)), photos) is None

@@ -89,6 +89,12 @@ def test_a_smaller_component_gets_a_second_chance_of_its_own(
     assert found.mapped.job == misled.job  # with all pairs of photos
 
 
+def test_a_model_is_not_grown_over_photos_that_match_none_of_its_own(apart: tuple[list[View], Mapped], misled: Mapped):
+    found, notes = choose(replace(misled, models=apart[1].models), 1)
+    assert [sorted(model.reg_image_ids()) for model in found.mapped.models] == [FIRST, SECOND]
+    assert notes == []
+
+
 def test_components_keep_the_numbers_that_were_reported(misled: Mapped):
     listed, _ = choose(misled, 1)
     assert [sorted(model.reg_image_ids()) for model in listed.mapped.models] == [FIRST, SECOND]

@@ -13,25 +13,29 @@ import numpy as np
 import pycolmap
 import pytest
 import synthetic_captures as synthetic
+from scipy.spatial.transform import Rotation
 from synthetic_captures import LONG, UNKNOWN_FISHEYE, WIDE, Noise, Scene, View
 
 from nerfcli.multiview.graph import connected_groups
-from nerfcli.poses.engine import ladder
+from nerfcli.poses.engine import ladder, mapping
 from nerfcli.poses.engine import second_chance as chances
+from nerfcli.poses.engine.chosen import choose_component
 from nerfcli.poses.engine.database import register_photos
 from nerfcli.poses.engine.features import match
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import Mapped
-from nerfcli.poses.engine.second_chance import is_contradicted, second_chance
+from nerfcli.poses.engine.mapping import MapperOptions, map_photos
+from nerfcli.poses.engine.second_chance import grow, is_contradicted, second_chance
 from nerfcli.poses.input.job import Job
-from nerfcli.poses.judge.acceptance import judge
+from nerfcli.poses.judge.acceptance import Failure, Verdict, judge
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
 from nerfcli.poses.judge.examine import Examined, examine
 from nerfcli.poses.judge.parallax import best_turn
 from nerfcli.poses.model import merging
+from nerfcli.poses.model.intrinsics import converted
 from nerfcli.poses.model.lens_family import as_fisheye
-from nerfcli.poses.model.two_views import read_verified_pairs, rotation_errors
+from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs, rotation_errors
 from nerfcli.poses.model.view_graph import Bottlenecks, consistent_groups
 
 pytestmark = pytest.mark.usefixtures("_quiet")
@@ -155,6 +159,102 @@ def test_a_contradicted_model_is_mapped_again_from_its_sound_part(solved: Solved
         assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.4
 
 
+def without(model: pycolmap.Reconstruction, photos: range) -> pycolmap.Reconstruction:
+    """Return a copy of a model without some photos."""
+    rest = pycolmap.Reconstruction(model)
+    for image_id in photos:
+        rest.deregister_frame(rest.image(image_id).frame_id)
+    rest.tear_down()
+    return rest
+
+
+def in_two_parts(solved: Solved, tmp_path: Path) -> Mapped:
+    """Return a right model in two parts, of seven and four photos, in a folder of its own."""
+    shutil.copytree(solved.job.database.parent, tmp_path / "again")
+    parts = [without(solved.model, range(8, 11)), without(solved.model, range(1, 7))]
+    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
+    return Mapped(parts, job, [{"what": "default thresholds", "models": [7, 4]}], seconds=1000.0)
+
+
+def test_an_accepted_model_takes_in_the_photos_of_a_smaller_one(solved: Solved, tmp_path: Path):
+    """Synthetic truth: of a right model in two parts, the larger grows over the three photos of the smaller one."""
+    mapped = in_two_parts(solved, tmp_path)
+    notes: list[str] = []
+    for _ in range(2):  # the second time, from what was kept
+        found = choose_component(mapped, lambda *progress: None, notes.append, component=1, checks=Checks)
+        assert found.examined.verdict.accepted
+        assert [model.num_reg_images() for model in found.mapped.models] == [10]
+        assert found.examined.model is not None
+        truth = synthetic.true_model(solved.views)
+        for image_id in range(2, 11):
+            relative = [
+                model.image(image_id).cam_from_world() * model.image(1).cam_from_world().inverse()
+                for model in (found.examined.model, truth)
+            ]
+            assert np.degrees((relative[0].rotation * relative[1].rotation.inverse()).angle()) < 0.4
+    assert notes == [
+        "3 photos are in smaller models, next: from the accepted model (about 5 min)",
+        "from the accepted model: 10 of 10 photos registered, accepted",
+    ]
+
+
+def test_an_accepted_model_grows_with_the_lens_that_was_chosen_for_it(solved: Solved, tmp_path: Path):
+    """The mapper began with SIMPLE_RADIAL; the checks chose OPENCV."""
+    mapped = in_two_parts(solved, tmp_path)
+    first = examine(mapped.models[:1], mapped.job, lambda *progress: None)
+    assert first.model is not None
+    camera = first.model.cameras[1]
+    richer = converted(camera, "OPENCV")
+    camera.model, camera.params = richer.model, richer.params.tolist()
+    notes: list[str] = []
+    found = grow(mapped, first, lambda *progress: None, notes.append, checks=Checks)
+    assert notes[-1] == "from the accepted model: 10 of 10 photos registered, accepted"
+    assert found.mapped.models[0].num_reg_images() == 10
+
+
+def test_a_model_that_grows_into_one_that_is_refused_stays_as_it_was(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    mapped = in_two_parts(solved, tmp_path)
+    monkeypatch.setattr(chances, "map_photos", lambda *_, **__: [synthetic.bent(solved.model, 8)])
+    notes: list[str] = []
+    found = choose_component(mapped, lambda *progress: None, notes.append, component=1, checks=Checks)
+    assert found.examined.verdict.accepted
+    assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]
+    assert notes[-1].startswith("from the accepted model: 10 of 10 photos registered, the poses contradict")
+    assert [attempt["models"] for attempt in found.mapped.attempts] == [[7, 4], [10]]
+
+
+def test_a_model_that_takes_in_no_further_photo_is_not_checked_again(
+    solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    mapped = in_two_parts(solved, tmp_path)
+    monkeypatch.setattr(chances, "map_photos", lambda *_, **__: [pycolmap.Reconstruction(mapped.models[0])])
+    monkeypatch.delattr(chances, "examine")
+    notes: list[str] = []
+    found = choose_component(mapped, lambda *progress: None, notes.append, component=1, checks=Checks)
+    assert [model.num_reg_images() for model in found.mapped.models] == [7, 4]
+    assert notes[-1] == "from the accepted model: no further photo registered"
+
+
+def test_nothing_is_mapped_again_where_the_camera_only_turned():
+    """The capture is at fault: rotations explain its matches to 2 px; at 20 px, it is the model."""
+    contradicted = Failure("the poses contradict pairs of photos", "40 % of the matches ...", "take more photos")
+    assert not is_contradicted(Verdict({"parallax_px": 2.0}, (contradicted,)))
+    assert is_contradicted(Verdict({"parallax_px": 20.0}, (contradicted,)))
+    assert is_contradicted(Verdict({"parallax_px": None}, (contradicted,)))
+
+
+def test_a_second_chance_says_what_contradicts_where_no_pair_does(solved: Solved, tmp_path: Path):
+    wrong = replace(wrongly_mapped(solved, tmp_path / "again"), seconds=0.0)
+    first = examine(wrong.models, wrong.job, lambda *progress: None)
+    evidence = "40 % of the matches are in pairs whose relative rotation differs"
+    verdict = Verdict({"pairs": {"judged": 15, "contradicting": 0}}, (Failure("contradict", evidence, "more photos"),))
+    notes: list[str] = []
+    second_chance(wrong, replace(first, verdict=verdict), lambda *progress: None, notes.append, checks=Checks)
+    assert notes[0] == f"{evidence}: mapping again, for at most 0 s"
+
+
 @pytest.mark.parametrize(("failing", "attempts"), [(1, [[10], [10]]), (2, [[10], [10]]), (3, [[10], [7]])])
 def test_each_hypothesis_stands_in_for_the_one_before(
     solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int, attempts: list[list[int]]
@@ -226,6 +326,39 @@ def test_of_many_photos_a_few_are_not_worth_another_mapping_from_scratch(
     assert "not trying other starts, which take about 4 s each: most photos are registered" in notes
 
 
+def test_the_mapper_counts_the_photos_that_it_goes_on_from(solved: Solved, tmp_path: Path):
+    shutil.copytree(solved.job.database.parent, tmp_path / "again")
+    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
+    base = pycolmap.Reconstruction(solved.model)
+    for photo in (9, 10):
+        base.deregister_frame(base.image(photo).frame_id)
+    base.tear_down()
+    reports: list[tuple[str, int, int]] = []
+    map_photos(job, lambda *report: reports.append(report), attempt=7, start=MapperOptions(), base=base)
+    assert reports == [("map", 8, 10), ("map", 9, 10), ("map", 10, 10)]
+
+
+def test_a_run_of_the_mapper_ends_at_its_limit(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Ten times the plan's 0.38 + 0.0005 n seconds a photo, two minutes at least; what it has placed is kept."""
+    assert [mapping.limit_seconds(photos) for photos in (10, 300)] == [120, 1590]
+    shutil.copytree(solved.job.database.parent, tmp_path / "again")
+    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
+    (tmp_path / "again" / "work" / "models_0.json").unlink(missing_ok=True)
+    limits: list[int] = []
+    real = pycolmap.incremental_mapping
+
+    def watched(*arguments, options: pycolmap.IncrementalPipelineOptions, **more) -> dict[int, pycolmap.Reconstruction]:
+        limits.append(options.max_runtime_seconds)
+        return real(*arguments, options=options, **more)
+
+    monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", watched)
+    monkeypatch.setattr(ladder, "limit_seconds", lambda photos: 0)
+    notes: list[str] = []
+    assert climb(job, lambda *progress: None, notes.append).models[0].num_reg_images() == 10
+    assert limits[0] == 120
+    assert notes[0] == "default thresholds: stopped after 0 s, longer than most captures take"
+
+
 def test_groups_hold_together_against_what_speaks_against_them():
     """By hand: two strong pairs, held apart although one join between them is positive."""
     joins = [(1, 2, 9.0), (3, 4, 9.0), (2, 3, 5.0), (1, 4, -6.0), (5, 1, -1.0)]
@@ -260,12 +393,81 @@ def test_a_photo_far_from_all_others_is_left_out(solved: Solved):
     assert "times as far away as the other cameras" in left_out[10]
 
 
+def common_pixels(views: Sequence[View], points: np.ndarray, *, noise_px: float) -> list[VerifiedPair]:
+    """All pairs of views, each matched in what both see of the points (n, 3)."""
+    rng = np.random.default_rng(0)
+    found = []
+    for number, view in enumerate(views):
+        local = points @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
+        camera = synthetic.true_model([view]).camera(1)
+        pixels = np.asarray(camera.img_from_cam(local)) + rng.normal(scale=noise_px, size=(len(points), 2))
+        inside = (local[:, 2] > 0) & ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+        found.append((number + 1, pixels, inside))
+    return [
+        VerifiedPair(one, other, pixels[inside & also], others[inside & also])
+        for index, (one, pixels, inside) in enumerate(found)
+        for other, others, also in found[index + 1 :]
+    ]
+
+
+def side_by_side(count: int) -> list[View]:
+    """Cameras at steps of 0.05 along x, looking along +y."""
+    centres = [np.array([0.05 * number, 0.0, 0.0]) for number in range(count)]
+    return [View(WIDE, synthetic.looking_at(centre, centre + np.array([0.0, 1.0, 0.0]))) for centre in centres]
+
+
+def test_points_far_away_agree_whichever_side_noise_makes_their_rays_meet():
+    """Synthetic truth: a parallax of 0.4 px and a noise of 0.5 px; of a camera turned by 3 degrees, nothing agrees."""
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-40, 40, 400), rng.uniform(90, 110, 400), rng.uniform(-30, 30, 400)])
+    views = side_by_side(2)
+    (pair,) = common_pixels(views, points, noise_px=0.5)
+    (agreement,) = agreements(synthetic.true_model(views), [pair])
+    assert agreement.matches > 300
+    assert agreement.share == 1
+    turned = Rotation.from_euler("x", 3, degrees=True).as_matrix() @ views[1].cam_from_world
+    (agreement,) = agreements(synthetic.true_model([views[0], View(WIDE, turned)]), [pair])
+    assert agreement.contradicts
+
+
+def test_a_photo_from_much_farther_away_stays_if_its_matches_determine_its_place():
+    """Synthetic truth: seven photos within 0.3 of a rugged wall at a distance of 2, and one from a distance of 9."""
+    rng = np.random.default_rng(2)
+    points = np.column_stack([rng.uniform(-1, 1, 300), rng.uniform(1.5, 2.5, 300), rng.uniform(-0.7, 0.7, 300)])
+    back = np.array([0.15, -7.0, 0.3])
+    views = [*side_by_side(7), View(WIDE, synthetic.looking_at(back, back + np.array([0.0, 1.0, 0.0])))]
+    pairs = common_pixels(views, points, noise_px=0.5)
+    assert leave_out_contradicting(synthetic.true_model(views), pairs)[1] == {}
+    # A sky says nothing about where it is seen from.
+    sky = points * 1e4
+    held_by_sky = [*common_pixels(views[:-1], points, noise_px=0.5), *common_pixels(views, sky, noise_px=0.5)]
+    assert list(leave_out_contradicting(synthetic.true_model(views), held_by_sky)[1]) == [8]
+
+
 def test_a_scene_that_repeats_itself_is_recognised(tmp_path: Path):
     """A body whose back looks like its front. The mapper places every photo at half a pixel, half of them wrong."""
     folded = solve(tmp_path, synthetic.ring(14, [WIDE], seed=0), synthetic.twofold(800, seed=0))
     assert folded.model.num_reg_images() == 14
     assert folded.model.compute_mean_reprojection_error() < 0.8
     assert folded.kinds == ["parts of the scene look alike (repeated structure)"]
+
+
+def test_a_photo_placed_by_points_is_judged_with_what_holds_it(solved: Solved):
+    """Photo 10 has one mistaken pair of 20 matches; without the points that place it, that would refuse the model."""
+    with pycolmap.Database.open(str(solved.job.database)) as database:
+        pairs = read_verified_pairs(database, min_matches=15)
+    held = [pair for pair in pairs if pair.other == 10]
+    rest = [pair for pair in pairs if pair.other != 10]
+    strongest = max(held, key=lambda pair: pair.matches)
+    shifted = np.roll(strongest.pixels_other, 7, axis=0)[:20]
+    mistaken = VerifiedPair(strongest.one, 10, strongest.pixels_one[:20], shifted)
+
+    def accepted(held: Sequence[VerifiedPair]) -> bool:
+        evidence = [*rest, mistaken]
+        return judge(solved.model, evidence, turn=None, names={}, seed=0, threads=1, held=held).accepted
+
+    assert not accepted([])
+    assert accepted(held)
 
 
 def test_a_camera_that_only_turns_is_recognised(tmp_path: Path):
@@ -348,10 +550,28 @@ def test_a_focal_length_that_exif_tells_wrong_is_left_out(tmp_path: Path):
     assert [rung["what"] for rung in climbed.attempts] == ["default thresholds", "without EXIF's focal length"]
     assert climbed.attempts[0]["models"] == [] or max(climbed.attempts[0]["models"]) < 4
     assert "next: without EXIF's focal length" in notes
+    assert notes[-1].startswith("EXIF's focal length (4800 px) was not used, since few photos registered with it; the ")
+    assert notes[-1].endswith(" px: if EXIF is right, give --intrinsics")
     assert climbed.models[0].num_reg_images() == 8
     (camera,) = climbed.models[0].cameras.values()
     assert camera.mean_focal_length() == pytest.approx(WIDE.params[0], rel=0.02)
     assert not camera.has_prior_focal_length
+
+
+def test_a_given_initial_pair_is_tried_once(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """pycolmap tries an unsuitable one again 200 times at each of five thresholds, with the same result."""
+    shutil.copytree(solved.job.database.parent, tmp_path / "again")
+    job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
+    trials: list[int] = []
+
+    def mapping(*arguments, options: pycolmap.IncrementalPipelineOptions, **others) -> dict[int, object]:
+        trials.append(options.init_num_trials)
+        return {}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    for number, start in enumerate((MapperOptions(init_pair=(1, 2)), MapperOptions())):
+        map_photos(job, lambda *progress: None, attempt=50 + number, start=start)
+    assert trials == [1, 200]
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ def test_amounts_of_memory(text: str, size: int):
     assert bytes_from_text(text) == size
 
 
-@pytest.mark.parametrize("text", ["", "much", "-4GB", "0", "4 GB RAM", "0.2", "4xb"])
+@pytest.mark.parametrize("text", ["", "much", "-4GB", "0", "4", "4 GB RAM", "0.2", "4xb"])
 def test_what_is_no_amount_of_memory(text: str):
     with pytest.raises(typer.BadParameter, match="is not an amount of memory; write 4GB or 500MB"):
         bytes_from_text(text)
@@ -72,6 +72,15 @@ def test_the_plan_can_be_read(tmp_path: Path):
     photos = write_photos(tmp_path / "photos", 5)
     result = nerfcli("poses", photos, "--dry-run")
     assert result.stdout.startswith(f"{photos}: 5 photos, 10 pairs to match (exhaustive), about ")
+    assert result.stdout.endswith("; 0.5 GB of memory\n")
+
+
+def test_the_plan_names_the_files_that_are_skipped(tmp_path: Path):
+    photos = write_photos(tmp_path / "photos", 5)
+    (photos / "IMG_1.heic").write_bytes(b"heic")
+    result = nerfcli("poses", photos, "--dry-run")
+    assert "IMG_1.heic is skipped: .heic files are not supported" in result.stderr
+    assert result.stdout.startswith(f"{photos}: 5 photos, ")
 
 
 @pytest.mark.parametrize("command", ["poses", "run"])

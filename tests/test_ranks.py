@@ -19,10 +19,12 @@ from commands import error_of, nerfcli
 
 from nerfcli.errors import LOST_RANK, TERMINATED
 from nerfcli.field.checkpoint import load_tensors
+from nerfcli.fit.ranks import Alone
 from nerfcli.photos.pool import Drawn
 from nerfcli.runs.components import Components, choose
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings
+from nerfcli.train import loop
 from nerfcli.workflows import machine
 from nerfcli.workflows.train import train_scene
 
@@ -33,21 +35,23 @@ VARIANTS = {
     "": (200, 50),
     "exposure": (200, 50),
     "background=black": (200, 50),
-    "pixels=error,points,entropy": (100, 24),
+    "pixels=error,points,entropy,movers": (100, 24),
     "cameras=all": (100, 14),
 }
 SMALL = TrainSettings(
     budget_seconds=None, steps=200, log2_rows=12, first_samples_per_step=2**11, samples_per_step=2**11, threads=1
 )
 TRAININGS = """
-import math, sys
+import atexit, math, sys
 from dataclasses import replace
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-from test_ranks import SPHERES, SMALL, VARIANTS, settings_with, train_until
+from test_ranks import SPHERES, SMALL, VARIANTS, settings_with, torch, train_until
 from nerfcli.fit.fitting import Fitting
 from nerfcli.train import sentinel
 
+# After all that the program does at its end: threads that still listen would abort some processes, one in four.
+atexit.register(lambda: print("joined" if torch.distributed.is_initialized() else "parted"))
 for number, (components, (steps, last)) in enumerate(VARIANTS.items()):
     train_until(last, Path({folder!r}) / str(number), settings_with(components, steps))
 
@@ -120,7 +124,7 @@ def ended(processes: Sequence[subprocess.Popen[str]]) -> list[tuple[int, str, li
 def by_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("two")
     done = ended(two_ranks(TRAININGS.format(folder=str(folder), tests=str(Path(__file__).parent))))
-    assert [code for code, _, _ in done] == [0, 0], done
+    assert [(code, out) for code, out, _ in done] == [(0, "parted\n")] * 2, done
     return folder
 
 
@@ -226,6 +230,24 @@ def test_every_pixel_of_a_step_is_one_rank_s_and_points_stay_last(count):
         assert torch.equal(part.distances, known / 10)
         assert torch.equal(part.trust, known / 20)
     assert sum(len(part.distances) for part in parts) == points
+
+
+@pytest.mark.parametrize(("count", "rows"), [(1, 16), (2, 17), (4, 18)])
+def test_rows_of_tables_follow_the_threads_of_all_ranks(spheres, tmp_path, monkeypatch, count, rows):
+    """Twice the processes, twice the samples in the same time, twice the rows; without a budget of time none more."""
+
+    class PreparedError(Exception): ...
+
+    def prepared(scene, settings, **others):
+        raise PreparedError(settings.log2_rows)
+
+    monkeypatch.setattr(loop, "prepare", prepared)
+    monkeypatch.setattr(Alone, "count", count)
+    by_steps = replace(SMALL, log2_rows=None)
+    for settings, expected in ((TrainSettings(budget_seconds=26.0), rows), (by_steps, 16)):
+        with pytest.raises(PreparedError) as found:
+            loop.train(spheres, tmp_path, settings, resume=False, notify=lambda _: None, on_progress=lambda _: None)
+        assert found.value.args == (expected,)
 
 
 def test_processes_of_a_machine_divide_its_processors(monkeypatch):

@@ -41,7 +41,9 @@ from nerfcli.scene import Scene
 from nerfcli.train.loop import train
 
 seeds = st.integers(0, 2**32 - 1)
-FEW = TrainSettings(budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
+FEW = TrainSettings(
+    budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, threads=2
+)
 
 
 def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -25,7 +25,9 @@ from nerfcli.train import sentinel
 from nerfcli.train.loop import train
 from nerfcli.train.sentinel import replay
 
-FEW = TrainSettings(budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
+FEW = TrainSettings(
+    budget_seconds=None, steps=12, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=10, threads=2
+)
 
 
 @pytest.fixture(scope="module")

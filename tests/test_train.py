@@ -40,7 +40,7 @@ from nerfcli.runs.log import LogEntry, append_log, read_log
 from nerfcli.runs.run import Run
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
 from nerfcli.scene import Scene
-from nerfcli.train import loop
+from nerfcli.train import loop, sentinel
 from nerfcli.train.loop import Progress, train
 
 # A step of a few rays is enough where bits are compared, not pictures.
@@ -156,6 +156,15 @@ def test_occupancy_keeps_the_surfaces_and_little_else(spheres, spheres_run):
     assert model.occupied.float().mean() < 0.2
 
 
+def test_a_hundred_steps_do_not_close_all_of_space(spheres, tmp_path):
+    """An empty field has 8.5 dB, and no sample from which it could learn."""
+    settings = replace(FEW, steps=100, log2_rows=12, first_samples_per_step=2**12, samples_per_step=2**12)
+    fit(spheres, tmp_path / "run", settings)
+    *_, before, last = read_log(tmp_path / "run")
+    assert last["samples"] > before["samples"]
+    assert last.get("heldout_psnr", 0.0) > 14
+
+
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(views, tmp_path):
     settings = replace(FEW, steps=10)
     for name, seed in (("one", 3), ("two", 3), ("other", 4)):
@@ -259,6 +268,24 @@ def test_a_training_that_goes_on_to_a_larger_total_keeps_its_rows(views, tmp_pat
     assert read_config(tmp_path / "run").settings.log2_rows == 16
     with pytest.raises(UserError, match="was trained with another field"):
         fit(views, tmp_path / "run", replace(FEW, steps=4, log2_rows=17), resume=True)
+
+
+def test_detailed_fields_train_and_resume_bit_for_bit_with_their_fine_cells(views, tmp_path, monkeypatch):
+    def stop(progress: Progress) -> None:
+        if progress.step == 11:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sentinel, "SNAPSHOT_EVERY", 4)  # the state is looked at, too
+    settings = replace(FEW, log2_rows=17)
+    straight = fit(views, tmp_path / "straight", settings)
+    with pytest.raises(KeyboardInterrupt):
+        fit(views, tmp_path / "parts", settings, on_progress=stop)
+    second = fit(views, tmp_path / "parts", settings, resume=True)
+    assert [progress.loss for progress in second] == [progress.loss for progress in straight[11:]]
+    states = [load_tensors(tmp_path / name / "state.safetensors", "cpu")[0] for name in ("straight", "parts")]
+    for name in ("fine_depth", "fine_occupied", "fine_visits", "occupied"):
+        assert torch.equal(states[0][name], states[1][name])
+    assert 0.01 < states[0]["fine_depth"].isfinite().float().mean() < 0.99
 
 
 def test_detailed_fields_are_rendered_in_half_of_the_steps_of_their_training(views, tmp_path):
@@ -453,6 +480,25 @@ def test_cameras_of_a_run_come_back_exactly_and_move_with_it(tmp_path, spheres):
             assert ours.image.is_file()
     assert read.test[0].mask is not None
     assert read.train[0].mask is None
+
+
+def test_a_run_that_is_moved_alone_finds_its_photos(tmp_path, spheres):
+    run, moved = tmp_path / "runs" / "one", tmp_path / "kept" / "deeper" / "one"
+    run.mkdir(parents=True)
+    moved.parent.mkdir(parents=True)
+    shutil.copytree(SPHERES / "test", tmp_path / "photos")
+    frames = tuple(
+        replace(frame, image=tmp_path / "photos" / Path(frame.name).name, mask=None) for frame in spheres.test_frames
+    )
+    write_cameras(run, frames[1:], [replace(frames[0], mask=frames[0].image)])
+    run.rename(moved)
+    read = read_cameras(moved)
+    assert [frame.image for frame in (*read.test, *read.train)] == [frame.image for frame in frames]
+    assert read.test[0].mask == frames[0].image
+    shutil.rmtree(tmp_path / "photos")
+    missing = read_cameras(moved).train[0].image
+    assert missing is not None
+    assert missing.is_relative_to(moved)
 
 
 def test_a_folder_that_is_no_run_is_told(tmp_path):

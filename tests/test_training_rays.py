@@ -151,7 +151,7 @@ def test_depth_bounds_of_forward_facing_captures_set_the_focus():
     scene = replace(scene_of(frames), depth_bounds=np.tile([1.0, 4.0], (5, 1)))
     similarity, marching = contracted_frame(scene)
     np.testing.assert_allclose(similarity.inverse().apply(np.zeros(3)), [0, 0, 1.6], atol=1e-6)
-    assert marching.near == pytest.approx(0.5 * similarity.scale, rel=1e-6)
+    assert marching.near == pytest.approx(0.9 * similarity.scale, rel=1e-6)
 
 
 @pytest.mark.parametrize("size", [(96, 64), (97, 71), (95, 66)])

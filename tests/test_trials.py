@@ -12,7 +12,8 @@ import torch
 
 from nerfcli.field.exposure import exposed
 from nerfcli.fit.extent import BALLS_BEFORE_BACKGROUND, Extent, choose_extent
-from nerfcli.fit.fitting import DETAILED_STEPS, Fitting
+from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.strides import DETAILED_STEPS
 from nerfcli.photos.pool import load_album
 from nerfcli.photos.storage import IN_MEMORY
 from nerfcli.runs.components import Components
@@ -35,7 +36,7 @@ def start(trials) -> Iterator[TrialStart]:
     """Early in a schedule: cells that close within a few dozen steps would leave nothing to see."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nerfcli.search.trials.FORK_SHARE", 0.02)
-        patch.setattr("nerfcli.fit.fitting.CLOSING_SHARE", 1e9)
+        patch.setattr("nerfcli.fit.open_cells.CLOSING_SHARE", 1e9)
         yield trials.begin(Components(view=0), steps=20)
 
 

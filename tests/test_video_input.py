@@ -175,7 +175,7 @@ def test_what_is_no_video_is_told(tmp_path):
     (tmp_path / "empty.mp4").touch()
     for name, said in {
         "sound.m4a": "contains no video stream",
-        "photo.jpg": "contains no video stream",
+        "photo.jpg": "is a single photo",
         "notes.txt": r"no video stream|is not a readable video",
         "empty.mp4": r"empty \(0 bytes\)",
         "absent.mp4": "does not exist",

@@ -13,6 +13,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Generator, Iterator
 from contextlib import closing
+from copy import deepcopy
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -34,6 +35,7 @@ from nerfcli.field.fourier_field import FourierField, FourierFieldSettings
 from nerfcli.render.depth import DepthRequest
 from nerfcli.render.model import Marching, Model, save_model
 from nerfcli.render.pictures import RenderedPicture, render_picture
+from nerfcli.runs.blocks import Cell, Division, joined
 from nerfcli.runs.files import FIELD, LIVE
 from nerfcli.runs.live import Pulse, Request, read_status, write_request
 from nerfcli.runs.run import Run
@@ -47,7 +49,9 @@ from nerfcli.viewer.pictures import view_of
 from nerfcli.viewer.server import PageServer
 from nerfcli.workflows.view import RunShow
 
-FEW = TrainSettings(budget_seconds=None, steps=12, samples_per_step=2**10, threads=2, downscale=8, model="default")
+FEW = TrainSettings(
+    budget_seconds=None, steps=12, samples_per_step=2**10, log2_rows=10, threads=2, downscale=8, model="default"
+)
 
 
 class Served:
@@ -308,15 +312,27 @@ def test_the_field_comes_as_the_static_page_has_it(served):
     assert content[4 + length :] == b"".join(array.tobytes() for array in packed.arrays.values())
 
 
-def test_a_network_without_a_table_is_drawn_by_the_server(finished):
+def network_without_a_table(model: Model) -> Model:
     field = FourierField(FourierFieldSettings(contraction="none", width=16, octaves=4))
-    old = Run(finished).model()
     occupied = torch.ones(8, 8, 8, dtype=torch.bool)
-    marching = Marching(0.05, 4.0, 0.1, 0.0)
-    model = Model(field, occupied, marching, (0.2, 0.4, 0.6), old.training_from_scene, "arbitrary")
+    return Model(
+        field, occupied, Marching(0.05, 4.0, 0.1, 0.0), (0.2, 0.4, 0.6), model.training_from_scene, "arbitrary"
+    )
+
+
+def two_blocks(model: Model) -> Model:
+    cells = (Cell(high=(0.1, np.inf)), Cell(low=(0.1, -np.inf)))
+    return joined([model, deepcopy(model)], Division(np.eye(3)[:2], cells, ()))
+
+
+@pytest.mark.parametrize(
+    ("made", "refusal"), [(network_without_a_table, "a field of type mlp"), (two_blocks, "several blocks together")]
+)
+def test_what_the_page_cannot_render_is_drawn_by_the_server(finished, made, refusal):
+    model = made(Run(finished).model())
     save_model(finished / FIELD, model)
     with closing(Served(finished)) as served:
-        assert '"refusal":"the page cannot render a field of type mlp' in served.get().decode()
+        assert f'"refusal":"the page cannot render {refusal}' in served.get().decode()
         assert served.refusal("field")[0] == 503
         frame = frame_of(finished, width=30, height=20)
         picture = assembled(served.get("picture", asked(frame)), frame)

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from nerfcli.ablate.variants import CHOSEN, Variant
 from nerfcli.atomic import atomic_path, write_json
@@ -99,7 +99,7 @@ def half_interval(differences: Sequence[float]) -> float | None:
     """
     if len(differences) < 2:
         return None
-    quantile = float(student.ppf(0.5 + CONFIDENCE / 2, len(differences) - 1))
+    quantile = float(stdtrit(len(differences) - 1, 0.5 + CONFIDENCE / 2))
     return quantile * statistics.stdev(differences) / math.sqrt(len(differences))
 
 

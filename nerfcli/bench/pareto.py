@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 # Times within this factor of each other are the same: a training ends with the step during which its time is over.
 SAME_TIME = 1.02
@@ -81,7 +81,7 @@ def least_difference(values: Sequence[float]) -> float | None:
     """
     if len(values) < 2:
         return None
-    return float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) * math.sqrt(2.0))
+    return float(stdtrit(len(values) - 1, 0.975) * np.std(values, ddof=1) * math.sqrt(2.0))
 
 
 def near_best(points: Sequence[SettingResult]) -> SettingResult:

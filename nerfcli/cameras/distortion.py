@@ -146,7 +146,7 @@ class Distortion:
                 [ends[ends < self.reach / 2], self.reach * (1 - 0.5 ** np.arange(1, 51)), [self.reach]]
             )
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-            high_enough = np.append(ends[:-1] * self._factor(ends[:-1] ** 2) >= goals.max(initial=0.0), True)
+            high_enough = np.append(ends[:-1] * self._factor(ends[:-1] ** 2) > goals.max(initial=0.0), True)
             end = ends[np.argmax(high_enough)]
             knots = np.linspace(0.0, end, TABLE_SIZE)
             heights = knots * self._factor(knots**2)

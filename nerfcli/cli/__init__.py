@@ -21,6 +21,7 @@ from nerfcli.cli import (
     train,
     view,
 )
+from nerfcli.cli.usage import Command
 from nerfcli.interrupts import install_handlers
 
 app = typer.Typer(
@@ -46,7 +47,7 @@ for _module in (
     ablate,
 ):
     _name = _module.__name__.rsplit(".", 1)[-1]
-    app.command(_name)(getattr(_module, _name))
+    app.command(_name, cls=Command)(getattr(_module, _name))
 
 
 @app.callback(invoke_without_command=True)

@@ -9,6 +9,8 @@ import typer
 from nerfcli.cli.batch import STDIN, for_each_input
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Overwrite, Quiet, Require, Threads, device_name, one_of, thread_count
+from nerfcli.cli.plans import print_plan
+from nerfcli.errors import UserError
 
 if TYPE_CHECKING:
     from nerfcli.evaluate.requirements import Requirement
@@ -46,6 +48,9 @@ def evaluate(
             help="Scans: run folder of a reconstruction from more views, to compare with; it is not the truth."
         ),
     ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show how much time, memory and disk it would take; writes nothing.")
+    ] = False,
     require: Require = None,
     device: Device = "auto",
     threads: Threads = 0,
@@ -71,6 +76,7 @@ def evaluate(
       nerfcli evaluate photos-scene-run --align pose --save-predictions png --overwrite
       nerfcli evaluate photos-scene-run --seeds 3
       nerfcli evaluate photos-scene-run --members
+      nerfcli evaluate photos-scene-run --dry-run --json
       nerfcli evaluate first-run second-run third-run
       nerfcli evaluate tooth-15-views-run --reference tooth-run
     """
@@ -88,6 +94,9 @@ def evaluate(
         )
     if members and (len(runs) > 1 or seeds > 1):
         raise typer.BadParameter("--members takes a single run, without --seeds", param_hint="--members")
+    if dry_run and (members or seeds > 1):
+        option = "--members" if members else "--seeds"
+        raise typer.BadParameter(f"cannot be combined with {option}", param_hint="--dry-run")
     if seeds > 1 and len(runs) > 1:
         raise typer.BadParameter("--seeds takes a single run and trains the other seeds itself", param_hint="--seeds")
     console = Console(quiet=quiet, json_lines=json)
@@ -149,6 +158,16 @@ def evaluate(
         ]
         console.table(("", "PSNR", "SSIM", "LPIPS"), rows, styles={})
 
+    def plan(folder: Path, one_of_many: bool) -> None:
+        from nerfcli.workflows.render_plan import plan_evaluation
+
+        if is_reconstruction(folder):
+            raise UserError(f"{folder} is a reconstruction of a scan; --dry-run is for photos", "remove --dry-run")
+        found = plan_evaluation(
+            folder, device=torch_device, threads=cores, align_poses=align == "pose", predictions=save_predictions
+        )
+        print_plan(folder, found, console)
+
     def work(folder: Path, one_of_many: bool) -> None:
         if is_reconstruction(folder):
             measure_scan(folder)
@@ -160,6 +179,10 @@ def evaluate(
             measure_members(folder)
         check_requirements(Run(folder), found, requirements)
 
+    if dry_run:
+        for run in runs:
+            for_each_input(run, plan)
+        return
     if seeds == 1 and len(runs) == 1:
         for_each_input(runs[0], work)
         return
@@ -216,8 +239,11 @@ def print_numbers(run: Path, evaluation: "Evaluation", console: Console) -> None
     if metrics["shape"] is not None:
         console.note(Shape(**metrics["shape"]).in_words())
     if kinds:
-        parts = [f"{group['images']} by {kind}, PSNR {group['psnr']:.2f} dB" for kind, group in kinds.items()]
-        console.note(f"views: {'; '.join(parts)}")
+        where = {"interpolation": "between", "extrapolation": "beyond"}
+        parts = [
+            f"{group['images']} {where[kind]} training views, {group['psnr']:.2f} dB" for kind, group in kinds.items()
+        ]
+        console.note(f"held-out views: {'; '.join(parts)}")
     console.note(summary_line([Entry(**entry) for entry in metrics["ledger"]]))
 
 

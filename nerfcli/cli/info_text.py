@@ -9,25 +9,38 @@ from typing import Any
 HEADINGS = ("field", "weights", "optimiser", "step keeps", "ops/sample", "B/sample", "ops/picture", "B/picture")
 _UNITS = ("", "k", "M", "G", "T", "P")
 # Of maps that are no lengths.
-_UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees"}
+_UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees", "confidence": ""}
 _LENGTHS = ("depth", "spread", "disagreement", "lower", "upper", "depth_deviation")
+# Of facts whose name in JSON is not what people say.
+_LABELS = {
+    "held_out": "held-out photos",
+    "missing": "missing photos",
+    "camera_count": "number of cameras",
+    "step": "steps",
+    "settled": "converged",
+    "seconds": "time",
+    "bytes": "size",
+    "field_bytes": "size of the field",
+    "occupied_share": "occupied cells",
+}
 # Letters in a line; what is longer goes on in the next one, further in.
 WIDTH = 110
 
 
 def lines_of(facts: dict[str, Any]) -> list[str]:
-    """Format facts by name, one line each or folded, lists below their name; unknown values are omitted."""
+    """Format facts by label, one line each or folded, lists below their label; unknown values are omitted."""
     lines = []
-    for name, value in facts.items():
+    for key, value in facts.items():
         if value is None or value in ([], {}):
             continue
+        name = _LABELS.get(key, key.replace("_", " "))
         if isinstance(value, list):
             lines += [f"{name}:", *(f"  {_plain(entry)}" for entry in value)]
         elif isinstance(value, dict):
-            listed = ", ".join(f"{key} {_plain(entry)}" for key, entry in value.items() if entry is not None)
+            listed = ", ".join(f"{part} {_plain(entry)}" for part, entry in value.items() if entry is not None)
             lines += _folded(f"{name}: {listed}")
         else:
-            lines.append(f"{name}: {_plain(value)}")
+            lines.append(f"{name}: {_with_unit(key, value)}")
     return lines
 
 
@@ -124,6 +137,18 @@ def _camera(view: dict[str, Any]) -> Iterator[str]:
 
 def _folded(text: str) -> list[str]:
     return textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
+def _with_unit(key: str, value: Any) -> str:
+    if key == "seconds":
+        return f"{value:.4g} s"
+    if key == "samples_per_second":
+        return f"{value:,}"
+    if key.endswith("_share"):
+        return f"{100 * value:.1f} %"
+    if key.endswith("bytes"):
+        return f"{value / 1e6:.2f} MB"
+    return _plain(value)
 
 
 def _plain(value: Any) -> str:

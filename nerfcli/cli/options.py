@@ -21,11 +21,13 @@ Threads = Annotated[int, typer.Option(help="Number of CPU threads; 0 uses all.",
 Downscale = Annotated[str, typer.Option(help="Reduce photos by this factor: auto, 1, 2, 4 or 8.")]
 Include = Annotated[
     list[str] | None,
-    typer.Option("--with", metavar="NAME[=VALUE]", help="Enable a component, see above. Repeatable."),
+    typer.Option(
+        "--with", metavar="NAME[=VALUE]", help="Enable a component; nerfcli train --help lists them. Repeatable."
+    ),
 ]
 Exclude = Annotated[
     list[str] | None,
-    typer.Option("--without", metavar="NAME", help="Disable a component, see above. Repeatable."),
+    typer.Option("--without", metavar="NAME", help="Disable a component; nerfcli train --help lists them. Repeatable."),
 ]
 ModelChoice = Annotated[
     str,
@@ -105,9 +107,9 @@ def some_of(text: str, choices: Collection[str], option: str) -> tuple[str, ...]
     Raises:
         typer.BadParameter: one of them is none of the choices.
     """
-    chosen = tuple(dict.fromkeys(text.split(",")))
+    chosen = tuple(dict.fromkeys(name.strip() for name in text.split(",")))
     if unknown := [name for name in chosen if name not in choices]:
-        raise typer.BadParameter(f"{unknown[0]!r}; choose some of {','.join(choices)}", param_hint=option)
+        raise typer.BadParameter(f"{unknown[0]!r}; choose from {', '.join(choices)}", param_hint=option)
     return chosen
 
 
@@ -157,12 +159,11 @@ def bytes_from_text(text: str, option: str = "--memory") -> int:
     """Parse 4GB, 500MB or 1.5GiB, the value of an option; a plain number is bytes.
 
     Raises:
-        typer.BadParameter: anything else, or zero.
+        typer.BadParameter: anything else, or less than a kilobyte: a forgotten unit.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:([kmgt])(i?)b?|b)?", text.strip().lower())
-    if match is None or not (
-        size := int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " "))
-    ):
+    size = int(float(match[1]) * (1024 if match[3] else 1000) ** " kmgt".index(match[2] or " ")) if match else 0
+    if size < 1000:
         raise typer.BadParameter(f"{text!r} is not an amount of memory; write 4GB or 500MB", param_hint=option)
     return size
 

@@ -19,6 +19,7 @@ from nerfcli.cli.options import (
     some_of,
     thread_count,
 )
+from nerfcli.cli.plans import print_plan
 from nerfcli.cli.render_options import (
     DepthFormat,
     DepthScale,
@@ -36,6 +37,7 @@ from nerfcli.cli.render_options import (
     video_settings,
 )
 from nerfcli.cli.scans import is_of_scan, scan_pictures
+from nerfcli.errors import UserError
 
 DEFAULT_FPS = 24.0
 
@@ -57,9 +59,9 @@ def render(
     outputs: Annotated[
         str | None,
         typer.Option(
-            help="Any of rgb,depth,opacity,spread,disagreement,coverage,parallax,lower,upper,depth_deviation,"
-            "colour_deviation; for scans projection,transmission,residual.  "
-            "[default: rgb,depth,opacity; projection]"
+            help="Any of rgb, depth, opacity, spread, disagreement, coverage, parallax, lower, upper, confidence, "
+            "depth_deviation, colour_deviation, with commas between them; for scans projection, transmission, residual."
+            "  [default: rgb,depth,opacity; projection]"
         ),
     ] = None,
     slices: Annotated[
@@ -91,6 +93,10 @@ def render(
     level: Annotated[
         float, typer.Option(help="Level of the interval of depth between lower and upper.", min=0.5, max=0.99)
     ] = 0.9,
+    depth_tolerance: Annotated[
+        float,
+        typer.Option(help="Relative depth error up to which confidence counts a depth as right.", min=0.001, max=1),
+    ] = 0.02,
     background_distance: Annotated[
         float | None, typer.Option(help="Distance of light that passes, for --depth background, in scene units.", min=0)
     ] = None,
@@ -143,6 +149,9 @@ def render(
         bool,
         typer.Option("--cameras-only", help="Render nothing; only write cameras.json and camera_path.json."),
     ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show how much time, memory and disk it would take; writes nothing.")
+    ] = False,
     max_size: Annotated[
         int | None,
         typer.Option(help="Maximum longer side of the pictures, in pixels.  [default: training resolution]", min=8),
@@ -187,8 +196,9 @@ def render(
     spread is the standard deviation of that distance, disagreement |median - conditional|: both are large where no
     single depth is right (edges, glass, fog). coverage is the number of training photos that see the surface (its
     median depth), parallax the largest angle between two of them. lower and upper are an interval of --level around
-    that depth, measured by stereo matching of the held-out photos; where no training photo sees the surface, there is
-    none. depth_deviation and colour_deviation are standard deviations between the members of a run (train --members).
+    that depth, measured by stereo matching of the held-out photos; confidence is the proportion of depths within
+    --depth-tolerance in the same measurement. They are NaN where no training photo sees the surface. depth_deviation
+    and colour_deviation are standard deviations between the members of a run (train --members).
     Every file describes its values: nerfcli info FILE.
     \b
     Writes RUN/renders/CAMERAS/. Run the same command again to resume an interrupted one. Other videos and previews of
@@ -204,6 +214,7 @@ def render(
       nerfcli render photos-scene-run --cameras orbit --count 120 --video
       nerfcli render photos-scene-run --cameras orbit --outputs rgb,depth --video-layout side-by-side --video-format gif
       nerfcli render photos-scene-run --cameras ellipse --count 1200 --frames 3/8 --jobs 4
+      nerfcli render photos-scene-run --cameras orbit --dry-run --json
       nerfcli render photos-scene-run --cameras interpolate --through a.jpg,k.jpg,c.jpg --video
       nerfcli render photos-scene-run --cameras camera_path.json --nerfstudio-frame dataparser_transforms.json --video
       nerfcli render photos-scene-run --cameras ellipse --count 240 --cameras-only -o ellipse/
@@ -252,6 +263,7 @@ def render(
     finite(step, "--step")
     finite(min_parallax, "--min-parallax")
     finite(level, "--level")
+    finite(depth_tolerance, "--depth-tolerance")
     if (min_views or min_parallax) and "depth" not in chosen:
         hint = "--min-views" if min_views else "--min-parallax"
         raise typer.BadParameter("it removes depth; add depth to --outputs", param_hint=hint)
@@ -263,6 +275,7 @@ def render(
         min_views=min_views,
         min_parallax_deg=min_parallax,
         level=level,
+        depth_tolerance=depth_tolerance,
     )
     one_of(colour_map, COLOUR_MAPS, "--colour-map")
     if max_size is not None and (width is not None or height is not None):
@@ -294,6 +307,8 @@ def render(
 
     def work(folder: Path, one_of_many: bool) -> None:
         if is_reconstruction(folder):
+            if dry_run:
+                raise UserError(f"{folder} is a reconstruction of a scan; --dry-run is for photos", "remove --dry-run")
             render_one_scan(folder, one_of_many)
             return
         name = f"{views.name}-cameras" if cameras_only else folder_name(views, settings)
@@ -305,6 +320,20 @@ def render(
             chosen_views = chosen_frames(of, views, depth_hint=1.0 / of.model().training_from_scene.scale)
             write_frames(chosen_views, target, fps=fps, overwrite=overwrite, warn=console.warn)
             console.result(target)
+            return
+        if dry_run:
+            from nerfcli.workflows.render_plan import plan_rendering
+
+            plan = plan_rendering(
+                folder,
+                views=views,
+                settings=settings,
+                device=device_name(device),
+                threads=thread_count(threads),
+                step=step,
+                part=part,
+            )
+            print_plan(folder, plan, console)
             return
         with console.progress(f"render {views.name}") as update:
             written = render_run(

@@ -141,6 +141,7 @@ def train(
       distortion  a weight: concentrate the density along each ray
       antialias   true, false: fade out details smaller than a pixel; for photos from near and far
       pixels      anywhere, error: sample more pixels where the error is large
+      movers      true, false: leave out people, cars and leaves that other photos do not show
 
     Unless they are set with --with or --without, points, stereo, exposure, cameras, background and view are selected
     automatically: short trainings on up to 15 % of the budget keep a component if it improves PSNR by more than the

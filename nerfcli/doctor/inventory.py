@@ -36,7 +36,7 @@ def readable(unreadable: Mapping[str, str], count: int) -> Finding:
         f"{bad} of {several(total, 'photo')} cannot be read" if bad else f"all {several(count, 'photo')} can be read",
         bad,
         "look from 1, bad from 10 % of the photos",
-        "copy these files again, or remove them" if bad else "",
+        "convert these files to JPEG, copy them again, or remove them" if bad else "",
         tuple(unreadable.items()),
     )
 

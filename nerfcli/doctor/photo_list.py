@@ -7,6 +7,7 @@ from nerfcli import scene as scenes
 from nerfcli.doctor.photo_facts import Source
 from nerfcli.errors import UserError
 from nerfcli.media.images import IMAGE_SUFFIXES, list_images
+from nerfcli.media.unsupported_photos import unsupported_photos
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ def find_subject(path: Path) -> ExaminedCapture:
         raise UserError(f"{path} does not exist", "give a folder of photos, or a scene folder")
     if path.is_file() or scenes.is_scene(path):
         return _of_scene(path)
-    photos = list_images(path)
+    photos = [*list_images(path), *unsupported_photos(path)]
     if not photos:
         below = next((child for child in sorted(path.iterdir()) if child.is_dir() and list_images(child)), None)
         where = f"there are photos in {below}; give that folder" if below else ""

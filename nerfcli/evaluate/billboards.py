@@ -71,8 +71,8 @@ class Shape:
         if self.shown:
             return f"geometry: {compared}"
         return (
-            f"no evidence of geometry: {compared}. These photos do not determine depth (the camera only turned, too "
-            "few photos, a flat scene), or the field learned nothing: do not trust its depth"
+            f"no evidence of geometry: {compared}. The training was too short, or these photos do not determine "
+            "depth (the camera only turned, too few photos, a flat scene): do not trust its depth"
         )
 
 

@@ -49,8 +49,8 @@ def measure_depth_errors(
     train, test = run.cameras.train, run.cameras.test
     if not test:
         raise UserError(
-            f"{run.path} has no held-out photos, and intervals of depth are measured with them",
-            "train with --holdout every:8, or leave lower and upper out of --outputs",
+            f"{run.path} has no held-out photos, and errors of depth are measured with them",
+            "train with --holdout every:8, or leave lower, upper and confidence out of --outputs",
         )
     maps = [*photo_depths, *depth_maps(model, test)]
     tracks = surface_tracks(maps)
@@ -59,7 +59,10 @@ def measure_depth_errors(
     on_progress(0.1)
     measured = dense_depths(photos, tracks, longer_side_px=LONGER_SIDE_PX, threads=threads)
     parts = []
+    matched, pixels = 0, 0
     for number, (photo, found) in enumerate(zip(photos[len(train) :], measured[len(train) :], strict=True)):
+        small = small_frame(photo.frame, LONGER_SIDE_PX).camera
+        matched, pixels = matched + len(found.pixels), pixels + small.width * small.height
         chosen = slice(None, None, 1 + len(found.pixels) // _PIXELS)
         points, median = _median_points(model, photo.frame, found.pixels[chosen])
         coverage, _ = coverage_and_parallax(photo_depths, points)
@@ -67,7 +70,7 @@ def measure_depth_errors(
         there = np.isfinite(errors)
         parts.append(np.stack([errors, coverage, np.full(len(errors), number)])[:, there])
         on_progress(0.7 + 0.3 * (number + 1) / len(test))
-    return DepthErrors.of(*np.concatenate(parts, axis=1))
+    return DepthErrors.of(*np.concatenate(parts, axis=1), matched=matched / pixels)
 
 
 def surface_tracks(maps: Sequence[DepthMap]) -> Tracks:

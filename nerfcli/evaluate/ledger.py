@@ -10,8 +10,6 @@ from typing import Any
 
 from nerfcli.runs.config import RunConfig
 
-_TEXTS = {True: "yes", False: "no", None: "not known"}
-
 
 @dataclass(frozen=True)
 class Entry:

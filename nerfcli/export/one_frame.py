@@ -9,7 +9,7 @@ from nerfcli.export.order import Order
 from nerfcli.export.picture_files import write_picture
 from nerfcli.export.settings import BLACK, depth_meta
 from nerfcli.export.unfinished import Unfinished
-from nerfcli.export.visibility import with_interval, with_visibility, without_unseen_depth
+from nerfcli.export.visibility import with_measured_errors, with_visibility, without_unseen_depth
 from nerfcli.render.accuracy import IN_WORDS as ERROR_IN_WORDS
 from nerfcli.render.accuracy import measure_error, truncation_bounds
 from nerfcli.render.model import Model
@@ -47,7 +47,7 @@ def render_frame(
     if settings.needs_visibility:
         picture = with_visibility(picture, frame, axis=settings.depth.axis, photo_depths=order.photo_depths)
         if order.depth_errors is not None:
-            picture = with_interval(picture, order.depth_errors, level=settings.depth.level)
+            picture = with_measured_errors(picture, order.depth_errors, settings.depth)
         picture, removed = without_unseen_depth(picture, settings.depth)
     tolerance = settings.quality.tolerance
     measured = measure_error(model, frame, depth=wanted, tolerance=tolerance)

@@ -117,9 +117,9 @@ def write_videos(
 def value_range(maps: Callable[[], Iterable[np.ndarray]], output: str) -> tuple[float, float]:
     """Return the range of colours of a clip: the 1st to the 99th percentile; from 0 for what is not a distance.
 
-    (0, 1) where no pixel has a value.
+    (0, 1) for confidence, and where no pixel has a value.
     """
-    found = quantiles(maps, RANGE_SHARES)
+    found = None if output == "confidence" else quantiles(maps, RANGE_SHARES)
     if not found:
         return 0.0, 1.0
     lo, hi = found

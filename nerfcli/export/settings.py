@@ -10,7 +10,7 @@ from nerfcli.render.pictures import Quality
 
 OUTPUTS = (
     *("rgb", "depth", "opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper"),
-    *("depth_deviation", "colour_deviation"),
+    *("confidence", "depth_deviation", "colour_deviation"),
 )
 # Those that are measured: floats on disk, and pictures in colours to look at.
 MEASURED = tuple(output for output in OUTPUTS if output not in ("rgb", "opacity"))
@@ -86,7 +86,7 @@ class ExportSettings:
     @property
     def needs_errors(self) -> bool:
         """Whether the errors of depth must be known."""
-        return "lower" in self.outputs or "upper" in self.outputs
+        return bool({"lower", "upper", "confidence"} & set(self.outputs))
 
     @property
     def needs_members(self) -> bool:
@@ -119,8 +119,9 @@ class ExportSettings:
         for name in ("min_views", "min_parallax_deg"):
             if not settings["depth"][name]:  # as in folders that were made before there was a choice
                 del settings["depth"][name]
-        if not self.needs_errors:
-            del settings["depth"]["level"]
+        for name, outputs in (("level", {"lower", "upper"}), ("depth_tolerance", {"confidence"})):
+            if not outputs & set(self.outputs):
+                del settings["depth"][name]
         return settings | {"outputs": list(self.outputs), "formats": list(self.float_formats)}
 
     def of_presentation(self) -> dict[str, Any]:
@@ -147,7 +148,8 @@ def depth_meta(model: Model, request: DepthRequest) -> DepthMeta:
 
 def meaning_of(meta: DepthMeta, request: DepthRequest, output: str) -> DepthMeta:
     """Return the meaning of an output that is measured, beside depth that means `meta`."""
-    convention = f"{output}:{request.level:g}" if output in ("lower", "upper") else None
+    number = {"lower": request.level, "upper": request.level, "confidence": request.depth_tolerance}.get(output)
+    convention = None if number is None else f"{output}:{number:g}"
     return meta.of(output, opacity_floor=floor_of(request, output), convention=convention)
 
 

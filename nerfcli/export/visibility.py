@@ -1,4 +1,4 @@
-"""Coverage and parallax of a rendered picture, and depth removed where too few photos see the surface."""
+"""Coverage, parallax and measured errors of a rendered picture; depth removed where too few photos see the surface."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -37,12 +37,13 @@ def with_visibility(
     return replace(picture, coverage=coverage.reshape(shape), parallax=parallax.reshape(shape))
 
 
-def with_interval(picture: RenderedPicture, errors: DepthErrors, *, level: float) -> RenderedPicture:
-    """Return the picture, with median and coverage, with an interval of depth in each pixel."""
+def with_measured_errors(picture: RenderedPicture, errors: DepthErrors, request: DepthRequest) -> RenderedPicture:
+    """Return the picture, with median and coverage, with an interval of depth and a confidence in each pixel."""
     assert picture.median is not None
     assert picture.coverage is not None
-    lower, upper = errors.bounds(picture.median, picture.coverage, level=level)
-    return replace(picture, lower=lower, upper=upper)
+    lower, upper = errors.bounds(picture.median, picture.coverage, level=request.level)
+    confidence = errors.confidence(picture.coverage, tolerance=request.depth_tolerance)
+    return replace(picture, lower=lower, upper=upper, confidence=confidence)
 
 
 def without_unseen_depth(picture: RenderedPicture, request: DepthRequest) -> tuple[RenderedPicture, dict[str, Any]]:

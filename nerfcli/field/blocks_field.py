@@ -66,8 +66,7 @@ class BlocksFieldSettings(FieldSettings):
 class BlocksField(Field):
     """The fields of blocks side by side; a point is asked of the one whose cell it is in.
 
-    Rays go through it as through any other field, so that colours, opacity and all definitions of depth need no rules
-    of their own. It is not trained: its blocks are, each by itself.
+    It is not trained: its blocks are, each by itself. Pictures of it are made by `render.spans`.
 
     Args:
         settings: of the blocks.
@@ -117,19 +116,36 @@ class BlocksField(Field):
             found[own] = True
         return found
 
+    def block_numbers(self, points: Tensor) -> Tensor:
+        """Return the block, counted from 0, in whose cell each point (N, 3) of the training frame is: (N,) int64."""
+        places = self._places(points)
+        numbers = torch.zeros_like(places[:, 0], dtype=torch.int64)
+        for number, block in enumerate(self.settings.blocks):
+            numbers[_in_cell(places, block)] = number
+        return numbers
+
+    def _places(self, points: Tensor) -> Tensor:
+        """Return the ground coordinates (N, 2) of points (N, 3)."""
+        # Not a product of matrices, which rounds differently with the number of rows.
+        return (points[:, None] * points.new_tensor(self.settings.ground)).sum(-1)
+
     def _divided(self, coordinates: Tensor) -> Iterator[tuple[Field, float, Tensor, Tensor]]:
         """Yield, for each block, its field and radius, which of the points (N, 3) are in its cell and occupied (M,),
         and their coordinates (M, 3) in its own unit cube.
         """
         settings, side = self.settings, self.settings.occupancy_side
         points = training_points(coordinates, settings.contraction)
-        places = points @ points.new_tensor(settings.ground).T
+        places = self._places(points)
         for block, field, occupied in zip(settings.blocks, self.fields, self.occupancy, strict=True):
             assert isinstance(field, Field)
-            low, high = places.new_tensor(block.low), places.new_tensor(block.high)
-            own = ((places >= low) & (places < high)).all(-1).nonzero()[:, 0]
+            own = _in_cell(places, block).nonzero()[:, 0]
             centred = (points[own] - points.new_tensor(block.centre)) / block.radius
             inside = grid_coordinates(centred, block.field.contraction)
             x, y, z = (inside.clamp(0, 1) * side).long().clamp_max(side - 1).unbind(-1)
             kept = occupied[z, y, x] & ((inside >= 0) & (inside <= 1)).all(-1)
             yield field, block.radius, own[kept], inside[kept]
+
+
+def _in_cell(places: Tensor, block: Block) -> Tensor:
+    """Return whether ground coordinates (N, 2) are in the cell of a block, (N,) bool."""
+    return ((places >= places.new_tensor(block.low)) & (places < places.new_tensor(block.high))).all(-1)

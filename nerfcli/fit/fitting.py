@@ -15,33 +15,25 @@ from nerfcli.fit.appearance import Appearance
 from nerfcli.fit.delayed import Delayed
 from nerfcli.fit.error_map import BEGINS, ErrorMap
 from nerfcli.fit.losses import colour_losses, opacity_entropy
+from nerfcli.fit.movers import Movers
+from nerfcli.fit.open_cells import OpenCells
 from nerfcli.fit.optimiser import FieldOptimiser, PartsOptimiser
 from nerfcli.fit.point_depth import PointRays, fading
 from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.fit.strides import stride_at
 from nerfcli.fit.watch import UNWATCHED, NonFiniteError, Watch
 from nerfcli.kernels import March, Rays, Targets
 from nerfcli.photos.pool import Drawn, Pool
 from nerfcli.render.model import Marching
-from nerfcli.render.occupancy import Occupancy
 from nerfcli.runs.settings import TrainSettings
 
-OCCUPANCY_SIDE = 64
-REFRESH_EVERY = 8
-REFRESH_TURNS = 8
 MOST_RAYS = 2**14
 # Rays of the training end where less than a thousandth of the light is left.
 DEEPEST = 7.0
-# Rays pass over cells where a step takes away less light than this: hardly any at first, when all of space is thin fog
-# and nothing tells yet where the surfaces are; then ever more, so that surfaces have to become compact.
-FIRST_THRESHOLD, THRESHOLD = 3e-4, 1e-2
 # Weight of the light that ends before the sky where this is seen.
 SKY_WEIGHT = 0.1
-# Both beginnings are over at these shares of the budget at the latest, however few the steps.
-WARMUP_SHARE, CLOSING_SHARE = 0.1, 0.3
-# Until this share of the budget, rays take steps this many times as long: the fog of the start has no detail.
-# Short trainings do not come to details, and learn more from more rays: their shares are those of so many steps.
-STRIDES = ((0.05, 8), (0.15, 4), (0.4, 2), (1.0, 1))
-DETAILED_STEPS = 2500
+# The warm-up is over at this share of the budget at the latest, however few the steps.
+WARMUP_SHARE = 0.1
 # Large tables, those of long trainings, have after so many steps all the detail that others have at the end.
 LARGE_TABLE_STEPS = 400
 
@@ -68,6 +60,7 @@ class Fitting:
         cameras_from: the share of the budget from which on cameras learn.
         points: pixels whose distance is known.
         error_map: where the error is, if pixels are drawn by it.
+        movers: where something moves, if that is left out.
         covered: the cells that may be filled, see `coverage.covered_cells`; None for all.
         sky: (pixels,) bool, those of the pool that show a sky that is learned; None where none are known.
         size: of the field; else `sizes.chosen_size` gives one for the settings and the pool.
@@ -86,6 +79,7 @@ class Fitting:
         cameras_from: float = 0.0,
         points: PointRays | None = None,
         error_map: ErrorMap | None = None,
+        movers: Movers | None = None,
         covered: Tensor | None = None,
         sky: Tensor | None = None,
         size: FieldSettings | None = None,
@@ -120,14 +114,12 @@ class Fitting:
             assert isinstance(self.field, HashField)
             self.field.start_randomly(settings.random_start)
         gains = torch.zeros(len(pool.first_pixel), 3) if log_gains is None else log_gains
-        self.points, self.error_map = points, error_map
+        self.points, self.error_map, self.movers = points, error_map, movers
         self.parts = Appearance(self.components, pool, log_gains=gains, log_focal=log_focal)
         self._cameras_from = cameras_from
-        self.occupancy = Occupancy(OCCUPANCY_SIDE, device)
-        self.covered = covered
+        self.cells = OpenCells(self.field, device, covered=covered)
         if sky is not None:
             self.parts.show_sky(sky)
-        self.occupied = self._open_cells()
         self.edges = marching.edges().to(device, torch.float32)
         self._most_rays = MOST_RAYS if device.type == "cpu" else max(MOST_RAYS, settings.samples_per_step // 4)
         self.generator = torch.Generator(device=device).manual_seed(settings.seed)
@@ -157,7 +149,7 @@ class Fitting:
         ranks, whole = self.ranks, self.draw(share)
         drawn = self.parts.with_learning_rays(whole.every(ranks.rank, ranks.count), of_cameras)
         rays = len(whole.origins)
-        edges = self.edges[:: self._stride(share)].contiguous()
+        edges = self.edges[:: stride_at(share, self.step)].contiguous()
         loss, losses, samples = self._loss(drawn, whole=whole, edges=edges, fraction=share, watch=watch)
         self.optimiser.zero_grad()
         self.parts_optimiser.zero_grad()
@@ -178,19 +170,20 @@ class Fitting:
     def draw(self, fraction: float) -> Drawn:
         """Return the pixels of the next step, after looking at what fills space if it is time."""
         settings = self.settings
-        if self.step % REFRESH_EVERY == 0:
-            self._refresh_occupancy()
+        self.cells.refresh(
+            self.step,
+            share=self.furthest,
+            detail=self._detail,
+            marching=self.marching,
+            generator=self.generator,
+            ranks=self.ranks,
+        )
         rays = min(self._most_rays, max(64, round(settings.samples_at(self.step) / max(1.0, self.samples_per_ray))))
         source = self.pool if self.error_map is None or self.furthest < BEGINS else self.error_map
         drawn = source.draw(rays, self.generator)
         if self.points is None or fading(fraction) == 0.0:
             return drawn
         return self.points.added_to(drawn, self.generator)
-
-    def _stride(self, fraction: float) -> int:
-        """Return how many of the shortest steps along rays are taken as one."""
-        fraction = min(fraction, self.step / DETAILED_STEPS)
-        return next(stride for until, stride in STRIDES if fraction <= until)
 
     def smaller_steps(self) -> None:
         """Halve the learning rate from here on, as numbers became non-finite."""
@@ -216,14 +209,20 @@ class Fitting:
         background = self.parts.behind(count, self.generator)[self.ranks.own].contiguous()
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
-            self._march(edges),
+            self._march(edges, self.cells.at(self.step)),
             self.field.medium(self._detail),
             Targets(components.near, bool(components.distortion), drawn.distances),
             background=background,
             sink=self.optimiser.sink,
+            visits=self.cells.visits,
             trace=watch.rows,
         )
-        losses = colour_losses(*self.parts.compared(seen.rgb, seen.transmittance, drawn, behind=background))
+        rendered, measured = self.parts.compared(seen.rgb, seen.transmittance, drawn, behind=background)
+        losses = colour_losses(rendered, measured)
+        if self.movers is not None:
+            residuals = self.ranks.joined((rendered - measured).detach(), count)
+            self.movers.learn(whole.numbers, residuals, share=self.furthest, step=self.step)
+            losses = losses * self.movers.weights(drawn.numbers)
         if self.error_map is not None:
             self.error_map.learn(whole.numbers, self.ranks.joined(losses.detach(), count))
         loss = (losses * drawn.weights if len(drawn.weights) else losses).sum() / count
@@ -243,12 +242,10 @@ class Fitting:
 
     @torch.no_grad()
     def compare(self, drawn: Drawn) -> tuple[Tensor, Tensor]:
-        """Render pixels at the current step length:
-        the model's and the photos' colours, both (N, 3) sRGB, alpha on white.
-        """
+        """Return the model's and the photos' colours of pixels, both (N, 3) sRGB, alpha on white."""
         drawn = self.parts.refined(drawn)
         behind = torch.full_like(drawn.origins, 1.0 if self.pool.has_alpha else 0.0)
-        edges = self.edges[:: self._stride(self.furthest)].contiguous()
+        edges = self.edges[:: stride_at(self.furthest, self.step)].contiguous()
         rendered, transmittance = self._seen(drawn, edges=edges, behind=behind)
         return self.parts.compared(rendered, transmittance, drawn, behind=behind)
 
@@ -256,7 +253,7 @@ class Fitting:
     def light_from_beyond(self, drawn: Drawn, *, distance: float) -> Tensor:
         """(N,) the shares of the light of pixels that come from farther away than a distance, as the field is now."""
         drawn = self.parts.refined(drawn)
-        edges = self.edges[:: self._stride(self.furthest)].contiguous()
+        edges = self.edges[:: stride_at(self.furthest, self.step)].contiguous()
         near = edges[: max(2, int(torch.searchsorted(edges, distance, right=True)))]
         return self._seen(drawn, edges=near, behind=torch.zeros_like(drawn.origins))[1]
 
@@ -265,7 +262,7 @@ class Fitting:
         jitter = torch.full_like(drawn.origins[:, 0], 0.5)
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
-            self._march(edges),
+            self._march(edges, self.cells.coarse),
             self.field.medium(self._detail),
             background=behind,
         )
@@ -280,34 +277,12 @@ class Fitting:
             return min(1.0, max(self.furthest, self.step / LARGE_TABLE_STEPS))
         return self.parts.share_of_detail(self.furthest)
 
-    def _march(self, edges: Tensor) -> March:
-        return March(edges, self.occupied, self.field.settings.contraction, DEEPEST)
+    def _march(self, edges: Tensor, occupied: Tensor) -> March:
+        return March(edges, occupied, self.field.settings.contraction, DEEPEST)
 
     def _cones(self, drawn: Drawn) -> Tensor | None:
         """Widths of pixels per distance, where they matter."""
         return self.pool.cones[self.pool.photo_of(drawn.numbers)] if self.components.antialias else None
-
-    def _refresh_occupancy(self) -> None:
-        # The whole grid once, after a warm-up in which everything is open; then a share at a time.
-        if self.step == 0:
-            return
-        turn = self.step // REFRESH_EVERY
-        self.occupancy.refresh(
-            self.field,
-            detail=self._detail,
-            cells=slice(None) if turn == 1 else slice(turn % REFRESH_TURNS, None, REFRESH_TURNS),
-            shortest_step=self.marching.shortest_step,
-            growth=self.marching.growth,
-            generator=self.generator,
-        )
-        self.occupied = self._open_cells()
-
-    def _open_cells(self) -> Tensor:
-        """Return the cells that rays look into: those that take away more light than the threshold of this step."""
-        closed = min(1.0, max(self.step / self.field.closing_steps, self.furthest / CLOSING_SHARE))
-        threshold = FIRST_THRESHOLD ** (1.0 - closed) * THRESHOLD**closed
-        occupied = self.occupancy.above(threshold)
-        return occupied if self.covered is None else occupied & self.covered
 
     def _add_up_gradients(self, drawn: Drawn, samples: int) -> int:
         """Add up the gradients and the samples of all ranks, and return the number of samples."""
@@ -357,14 +332,15 @@ class Fitting:
         tensors = {
             **{f"field.{name}": tensor for name, tensor in self.field.state_dict().items()},
             "generator": self.generator.get_state(),
-            **self.occupancy.state(),
-            "occupied": self.occupied,
+            **self.cells.state(),
             **self.optimiser.state(),
         }
         tensors.update({f"parts.{name}": value for name, value in self.parts.state_dict().items()})
         tensors.update(self.parts_optimiser.state())
         if self.error_map is not None:
             tensors["error_map"] = self.error_map.errors
+        if self.movers is not None:
+            tensors["movers"], tensors["moving"] = self.movers.sums, self.movers.moving
         return tensors, {
             "field": self.field.settings.to_json(),
             "step": self.step,
@@ -382,16 +358,16 @@ class Fitting:
             {name.removeprefix("field."): value for name, value in tensors.items() if name.startswith("field.")}
         )
         self.generator.set_state(tensors["generator"].cpu())
-        self.occupancy.restore(tensors)
+        self.cells.restore(tensors)
         self.optimiser.restore(tensors)
         self.parts.load_state_dict({name: tensors[f"parts.{name}"] for name in self.parts.state_dict()})
         self.parts_optimiser.restore(tensors)
         if self.error_map is not None:
             self.error_map.errors = tensors["error_map"]
+        if self.movers is not None:
+            self.movers.sums, self.movers.moving = tensors["movers"], tensors["moving"]
         self.step = description["step"]
         self.samples_per_ray = description["samples_per_ray"]
         self.rate_factor, self.rollbacks = description["rate_factor"], description["rollbacks"]
         self.furthest = description.get("furthest", 1.0)  # all details used to learn from the start
         self.in_step = False
-        # Not opened anew: the threshold moves between two refreshes, the open cells do not.
-        self.occupied = tensors["occupied"]

@@ -18,6 +18,12 @@ from nerfcli.scene import Scene
 # Contracted space ends at infinity; nothing is resolved beyond this many ball radii.
 FARTHEST = 300.0
 NEAREST = 0.02
+# Rays begin at this part of the nearest depth: points miss what has no features, bounds that come with a capture are
+# meant to hold everything. Before it, fog would stay that no other photo contradicts. In a box, points reach up to the
+# cameras. Source for bounds: load_llff.py of the code of NeRF, Mildenhall et al. 2020.
+NEAR_PER_POINT, NEAR_PER_BOUND, NEAR_IN_BOX = 0.7, 0.9, 0.5
+# Where depths are larger than the unit ball, they do not say how near something may stand.
+MOST_NEAR = 0.5
 # The unit ball reaches at least as far as this share of the depth of a typical pixel. Around an object both are about
 # alike, and the cameras decide; a ball that held most points of a desk in a room cost 0.4 dB.
 BALL_PER_DEPTH = 0.75
@@ -45,7 +51,7 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
     radius = max(float(np.median(_distances(scene, centre))), 1e-12)
     if depths is not None:
         radius = max(radius, BALL_PER_DEPTH * float(np.median(depths[:, 1])))
-    return _ball(centre, radius, depths)
+    return _ball(scene, centre, radius, depths)
 
 
 def block_frame(scene: Scene) -> tuple[Similarity, Marching]:
@@ -53,7 +59,7 @@ def block_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
     Cameras may stand outside, and space beyond the ball is contracted: there is the rest of the scene.
     """
-    return _ball(*_box(scene, BLOCK_PERCENTILE), _typical_depths(scene))
+    return _ball(scene, *_box(scene, BLOCK_PERCENTILE), _typical_depths(scene))
 
 
 def object_frame(scene: Scene) -> tuple[Similarity, Marching]:
@@ -88,16 +94,17 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
     centre, radius = _box(scene, BOX_PERCENTILE)
     reach = math.sqrt(3.0)  # the cube's corners
     depths = _typical_depths(scene)
-    near = NEAREST if depths is None else max(0.5 * float(depths[:, 0].min()) / radius, NEAREST)
+    near = NEAREST if depths is None else max(NEAR_IN_BOX * float(depths[:, 0].min()) / radius, NEAREST)
     far = float(_distances(scene, centre).max()) / radius + reach
     similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
     return similarity, Marching(near=near, far=far, shortest_step=2 * reach / 512, growth=0.0)
 
 
-def _ball(centre: np.ndarray, radius: float, depths: np.ndarray | None) -> tuple[Similarity, Marching]:
+def _ball(scene: Scene, centre: np.ndarray, radius: float, depths: np.ndarray | None) -> tuple[Similarity, Marching]:
     """Return the frame of a unit ball with contracted space around it, and its steps; `depths` of `_typical_depths`."""
-    near = NEAREST * 5 if depths is None else 0.5 * float(depths[:, 0].min()) / radius
-    near = min(max(near, NEAREST), 0.5)
+    part = NEAR_PER_POINT if scene.depth_bounds is None else NEAR_PER_BOUND
+    near = NEAREST * 5 if depths is None else part * float(depths[:, 0].min()) / radius
+    near = min(max(near, NEAREST), MOST_NEAR)
     similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
     return similarity, Marching(near=near, far=FARTHEST, shortest_step=1 / 256, growth=1 / 128)
 

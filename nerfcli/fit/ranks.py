@@ -33,6 +33,9 @@ class Alone:
     def add_up_gradients(self, learned: Sequence[Tensor], *, rays: Sequence[Tensor], sink: Tensor | None) -> None:
         """Add up the gradients of parameters, and of rows in a sink; rays only get one, 0 where they have no sample."""
 
+    def keep_largest(self, tensor: Tensor) -> None:
+        """Replace each number of a tensor by the largest over all ranks."""
+
     def total(self, number: int) -> int:
         """Return the sum of a number over all ranks."""
         return number
@@ -72,6 +75,12 @@ class Ranks(Alone):
         self.rank, self.count = rank, count
         self._preparation = preparation
 
+    def leave(self) -> None:
+        """Part from the other processes, at the end of this one: threads that still listen to them would abort it."""
+        del self._preparation
+        if dist.is_initialized():
+            dist.destroy_process_group()
+
     def add_up(self, *tensors: Tensor) -> None:
         with lost_ranks_reported():
             if len(tensors) == 1:
@@ -89,6 +98,10 @@ class Ranks(Alone):
         self.add_up(*(tensor.grad for tensor in learned if tensor.grad is not None))
         if sink is not None:
             self.add_up(sink)
+
+    def keep_largest(self, tensor: Tensor) -> None:
+        with lost_ranks_reported():
+            dist.all_reduce(tensor, op=dist.ReduceOp.MAX)
 
     def total(self, number: int) -> int:
         summed = torch.tensor(number)

@@ -87,7 +87,7 @@ class FirstBad:
 
 def that_must_be_finite(state: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors of a state that must be finite; cells that no step has evaluated yet have infinite density."""
-    return {name: tensor for name, tensor in state.items() if name != "optical_depth"}
+    return {name: tensor for name, tensor in state.items() if name not in ("optical_depth", "fine_depth")}
 
 
 def is_finite(tensor: Tensor) -> bool:

@@ -40,6 +40,8 @@ class Parts(Protocol):
 
     def optical_depth_before(self, density: Tensor, lengths: Tensor, offsets: Tensor) -> Tensor: ...
 
+    def keep_largest(self, cells: Tensor, coordinates: Tensor, values: Tensor) -> None: ...
+
     def interval_weights(self, density: Tensor, lengths: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]: ...
 
     def composite(
@@ -67,6 +69,10 @@ class ComposedBackend(abc.ABC):
     def pixel_rays(self, chosen: Tensor, pixels: PixelTable) -> tuple[Tensor, Tensor, Tensor]:
         return self.parts.pixel_rays(chosen, pixels)
 
+    def light_ends(self, intervals: Intervals, *, shares: tuple[float, ...]) -> LightEnds:
+        density, starts, ends, offsets = intervals
+        return self.parts.light_ends(density, starts, ends, offsets=offsets, shares=shares)
+
     def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, share: float) -> Tensor:
         density, starts, ends, offsets = intervals
         return self.parts.mixture_quantile(
@@ -82,10 +88,13 @@ class ComposedBackend(abc.ABC):
         *,
         background: Tensor,
         sink: Tensor | None = None,
+        visits: Tensor | None = None,
         trace: Trace | None = None,
     ) -> RaySums:
         samples = self._visible(rays.detached(), march, medium)
         starts, ends, offsets = samples.starts, samples.ends, samples.offsets
+        if visits is not None:
+            self.parts.keep_largest(visits, samples.coordinates, samples.density * (ends - starts))
         index = self.parts.ray_indices(offsets) if samples.rays is None else samples.rays
         if torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad):
             samples = samples._replace(coordinates=self._coordinates(rays, samples, march.contraction))

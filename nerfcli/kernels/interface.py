@@ -230,6 +230,7 @@ class Backend(Protocol):
         *,
         background: Tensor,
         sink: Tensor | None = None,
+        visits: Tensor | None = None,
         trace: Trace | None = None,
     ) -> RaySums:
         """Render rays for training, with gradients.
@@ -238,6 +239,7 @@ class Backend(Protocol):
             background: (R, 3) sRGB, without gradient.
             sink: of the table's shape; the gradient with respect to the table is added to it, and autograd gets none: a
                 buffer of megabytes need not be made, filled and added at every step.
+            visits: (C, C, C) over the unit cube; raised to the optical depth of the samples, see `keep_largest`.
             trace: is shown the tensors on the way.
 
         Differentiable in origins, directions, the table and the layers.
@@ -263,6 +265,10 @@ class Backend(Protocol):
             negligible: what samples of a ray together may weigh that are not asked for their colour.
             keep_intervals: whether the samples are wanted; a backend may return them all the same.
         """
+        ...
+
+    def light_ends(self, intervals: Intervals, *, shares: tuple[float, ...]) -> LightEnds:
+        """Return where the light of rays ends, without gradients; see `reference.light_ends`."""
         ...
 
     def mixture_quantile(self, intervals: Intervals, *, rays_per_pixel: int, share: float) -> Tensor:

@@ -22,7 +22,7 @@ KEY = "nerfcli"
 AXES = {"ray": "along the ray", "z": "along the optical axis (z)"}
 QUANTITIES = (
     *("depth", "spread", "disagreement", "coverage", "parallax", "lower", "upper"),
-    *("depth_deviation", "colour_deviation"),
+    *("confidence", "depth_deviation", "colour_deviation"),
 )
 # The convention of what is no depth itself.
 CONVENTION_OF = {
@@ -32,11 +32,17 @@ CONVENTION_OF = {
     "parallax": "largest-angle",
     "lower": "lower",
     "upper": "upper",
+    "confidence": "confidence",
     "depth_deviation": "deviation-of-members",
     "colour_deviation": "deviation-of-members",
 }
 # The unit of what is no length.
-UNIT_OF = {"coverage": "photos", "parallax": "degrees", "colour_deviation": "sRGB from 0 to 1"}
+UNIT_OF = {
+    "coverage": "photos",
+    "parallax": "degrees",
+    "confidence": "fractions of 1",
+    "colour_deviation": "sRGB from 0 to 1",
+}
 
 _IN_WORDS = {
     "conditional": "the mean distance at which light is absorbed, given that it is",
@@ -49,6 +55,8 @@ _IN_WORDS = {
     "photos-that-see": "the number of training photos that see the surface, by the field's own depths",
     "lower": "measured on held-out photos by stereo matching; none where no training photo sees the surface",
     "upper": "measured on held-out photos by stereo matching; none where no training photo sees the surface",
+    "confidence": "the proportion of depths with an error of at most {number} where as many photos see the surface, "
+    "measured on held-out photos by stereo matching; none where no training photo sees the surface",
     "deviation-of-members": "the standard deviation between fields that were trained again; not an error",
     "largest-angle": "the largest angle between the rays of two training photos that see the surface; 0 below two",
 }
@@ -136,14 +144,15 @@ class DepthMeta:
             "parallax": "parallax: largest angle between two of them",
             "depth_deviation": "standard deviation of depth between members",
             "colour_deviation": "standard deviation of colour between members",
-            "lower": f"lower end of the {self._level} interval of depth",
-            "upper": f"upper end of the {self._level} interval of depth",
+            "lower": f"lower end of the {self._percentage} interval of depth",
+            "upper": f"upper end of the {self._percentage} interval of depth",
+            "confidence": f"confidence: proportion of depths with an error of at most {self._percentage}",
         }
         return named.get(self.quantity, f"{self.convention} depth")
 
     @property
-    def _level(self) -> str:
-        """Return the level of an interval as a percentage: "90 %"."""
+    def _percentage(self) -> str:
+        """Return the level of an interval, or the tolerance of a confidence, as a percentage: "90 %"."""
         return f"{100 * float(self.convention.partition(':')[2] or 'nan'):g} %"
 
     def to_json(self) -> dict[str, Any]:
@@ -172,7 +181,8 @@ class DepthMeta:
     def in_words(self) -> str:
         """Return one line for people: "conditional depth along the optical axis (z), in metres (gps): the mean ..."."""
         if self.quantity in UNIT_OF:
-            return f"{self.quantity.replace('_', ' ')}, in {self.unit}: {_IN_WORDS[self.convention]}"
+            meaning = _IN_WORDS[self.convention.partition(":")[0]].format(number=self._percentage)
+            return f"{self.quantity.replace('_', ' ')}, in {self.unit}: {meaning}"
         unit = "metres" if self.unit == "metre" else f"{self.unit} units"
         source = f" (from: {self.unit_source})" if self.unit_source else ""
         convention, _, fraction = self.convention.partition(":")

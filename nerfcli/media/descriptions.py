@@ -40,7 +40,9 @@ def description_of(path: Path) -> dict[str, Any] | None:
     reader = _READERS.get(suffix)
     if reader is None:
         suffixes = ", ".join(sorted(_READERS))
-        raise UserError(f"{path} is not a supported depth, picture or video file", f"give one of: {suffixes}")
+        raise UserError(
+            f"{path} is not a supported depth, picture or video file", f"give its folder, or one of: {suffixes}"
+        )
     try:
         text = reader(path)
     except FileNotFoundError as error:

@@ -36,7 +36,7 @@ from nerfcli.media.srgb import linear_light
 CHANNELS = {
     "depth": "Z",
     **{name: f"{name}.V" for name in ("opacity", "spread", "disagreement", "coverage", "parallax", "lower", "upper")},
-    **{name: f"{name}.V" for name in ("depth_deviation", "colour_deviation")},
+    **{name: f"{name}.V" for name in ("confidence", "depth_deviation", "colour_deviation")},
 }
 
 

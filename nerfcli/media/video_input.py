@@ -20,6 +20,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from nerfcli.errors import UserError
+from nerfcli.media.images import IMAGE_SUFFIXES
 
 T = TypeVar("T")
 
@@ -70,6 +71,8 @@ def open_video(path: Path) -> Video:
     """
     if not path.is_file():
         raise UserError(f"{path} does not exist", "give a video file, or a folder of photos")
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise UserError(f"{path} is a single photo", f"give the folder of the photos: {path.parent}")
     if path.stat().st_size == 0:
         raise UserError(f"{path} is empty (0 bytes)", "copy the video again")
     with _decoding(path, _UPRIGHT, "ppm", more=("-frames:v", "1")) as decoder:

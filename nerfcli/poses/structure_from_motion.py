@@ -60,7 +60,8 @@ def estimate_poses(
         notify: receives messages for the user, one sentence at a time.
         progress: receives (stage, done, total); the stages are "read", "extract", "enlarge" where photos have few
             features, "features" (per photo, of those requested), "pair" where look-alikes are sought, "match",
-            "map", "merge" where the mapper leaves several models, and "check", in this order.
+            "map", "merge" where the mapper leaves several models, "locate" where single photos are left, and
+            "check", in this order.
         limits: see `Limits`.
         planned: receives the plan before the long work starts.
         given: intrinsics that are known beforehand.
@@ -74,9 +75,7 @@ def estimate_poses(
     start = time.perf_counter()
     photos, grouped, pairing, plan = plan_poses(photos_dir, settings=settings, progress=progress, given=given)
     _check_destination(scene_dir, photos_dir)
-    for name, why in photos.unreadable.items():
-        notify(f"{name} is skipped: {why}")
-    for note in grouped.notes:
+    for note in photo_notes(photos, grouped):
         notify(note)
     planned(plan)
     with workspace(scene_dir) as space:
@@ -140,6 +139,11 @@ def plan_poses(
         pairing = read_pairs(Path(settings.pairs_file), photos)
     threads = settings.threads if settings.threads > 0 else os.cpu_count() or 1
     return photos, grouped, pairing, make_plan(photos, pairing, settings, threads=threads)
+
+
+def photo_notes(photos: Photos, grouped: Grouped) -> list[str]:
+    """List which files are skipped and why, and what is known of the cameras of the others."""
+    return [*(f"{name} is skipped: {why}" for name, why in photos.unreadable.items()), *grouped.notes]
 
 
 def is_same_scene(

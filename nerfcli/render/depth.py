@@ -42,6 +42,7 @@ class DepthRequest:
         min_views, min_parallax_deg: coverage and parallax of the median point below which an export removes the depth;
             see `visibility`.
         level: of the interval between the outputs lower and upper, see `depth_errors`.
+        depth_tolerance: relative error up to which the output confidence counts a depth as right.
 
     Raises:
         ValueError: no such convention or axis.
@@ -54,6 +55,7 @@ class DepthRequest:
     min_views: int = 0
     min_parallax_deg: float = 0.0
     level: float = 0.9
+    depth_tolerance: float = 0.02
 
     def __post_init__(self) -> None:
         if not is_convention(self.convention):

@@ -1,4 +1,4 @@
-"""Errors of a field's depth by how many photos see the surface, and the intervals of depth that follow from them."""
+"""Errors of a field's depth by how many photos see the surface, and the intervals and confidence that follow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,14 +22,16 @@ class DepthErrors:
         quantiles: (strata, 201) from the least to the largest; NaN where too little was measured.
         pixels: measured in each stratum.
         photos: that were measured in.
+        matched: proportion of the pixels of these photos that could be matched, and so measured.
     """
 
     quantiles: np.ndarray
     pixels: tuple[int, ...]
     photos: int
+    matched: float
 
     @classmethod
-    def of(cls, errors: np.ndarray, coverage: np.ndarray, photos: np.ndarray) -> Self:
+    def of(cls, errors: np.ndarray, coverage: np.ndarray, photos: np.ndarray, *, matched: float) -> Self:
         """Sum up errors (N,) of pixels with a coverage (N,) in photos with these numbers (N,)."""
         rows, counts = [], []
         for number in range(len(STRATA)):
@@ -37,7 +39,7 @@ class DepthErrors:
             counts.append(int(inside.sum()))
             enough = counts[-1] >= LEAST_PIXELS and len(np.unique(photos[inside])) >= LEAST_PHOTOS
             rows.append(np.quantile(errors[inside], _SHARES) if enough else np.full(len(_SHARES), np.nan))
-        return cls(np.stack(rows), tuple(counts), len(np.unique(photos)))
+        return cls(np.stack(rows), tuple(counts), len(np.unique(photos)), matched)
 
     def bounds(self, median: np.ndarray, coverage: np.ndarray, *, level: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the central interval of depth, (lower, upper) like `median`, that holds `level` of what was measured.
@@ -55,10 +57,20 @@ class DepthErrors:
             sides.append((median * factor).astype(np.float32))
         return sides[0], sides[1]
 
+    def confidence(self, coverage: np.ndarray, *, tolerance: float) -> np.ndarray:
+        """Return the proportion of errors of at most `tolerance` in each pixel's stratum, from 0 to 1, like `coverage`.
+
+        F(tolerance) - F(-tolerance), with the distribution function F between the kept quantiles. NaN as in `bounds`.
+        """
+        number = _stratum(coverage)
+        of_strata = np.array([np.diff(np.interp((-tolerance, tolerance), row, _SHARES))[0] for row in self.quantiles])
+        return np.where(number >= 0, of_strata[number], np.nan).astype(np.float32)
+
     def to_json(self) -> dict[str, Any]:
         """Plain values; null for a stratum without quantiles."""
         rows = [None if np.isnan(row).any() else row.tolist() for row in self.quantiles]
-        return {"strata": list(STRATA), "quantiles": rows, "pixels": list(self.pixels), "photos": self.photos}
+        counts = {"pixels": list(self.pixels), "photos": self.photos, "matched": self.matched}
+        return {"strata": list(STRATA), "quantiles": rows, **counts}
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> Self:
@@ -66,7 +78,7 @@ class DepthErrors:
         rows: Sequence[Any] = content["quantiles"]
         empty = np.full(len(_SHARES), np.nan)
         quantiles = np.stack([empty if row is None else np.array(row) for row in rows])
-        return cls(quantiles, tuple(content["pixels"]), content["photos"])
+        return cls(quantiles, tuple(content["pixels"]), content["photos"], content["matched"])
 
 
 def _stratum(coverage: np.ndarray) -> np.ndarray:

@@ -21,11 +21,19 @@ class Occupancy:
         self.optical_depth = torch.full((side, side, side), torch.inf, device=device)
 
     def above(self, optical_depth: float) -> Tensor:
-        """(side, side, side) bool, indexed [z, y, x]: cells that hold more; those never looked at are among them.
+        """(side, side, side) bool, indexed [z, y, x]: cells that hold more than `least`, and those never looked at.
 
         A cell with NaN counts as holding more: rays look into it, and the loss finds the NaN.
         """
-        return ~(self.optical_depth <= optical_depth)
+        return ~(self.optical_depth <= self.least(optical_depth))
+
+    def least(self, optical_depth: float) -> Tensor:
+        """Return () this optical depth, or the mean of all cells where that is less.
+
+        In a short training, all of space may still be fog that is thinner than any threshold; where no ray looks,
+        nothing is learned any more.
+        """
+        return self.optical_depth.nanmean().clamp_max(optical_depth)
 
     @torch.no_grad()
     def refresh(

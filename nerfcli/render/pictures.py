@@ -60,6 +60,7 @@ class RenderedPicture:
         valid: (H, W) bool; False where the lens has no ray (rgb is then the background, opacity 0).
         coverage, parallax: (H, W) of the points at `median`, see `visibility`; None unless an export adds them.
         lower, upper: (H, W) of an interval of depth, see `depth_errors`; None unless an export adds them.
+        confidence: (H, W) proportion of depths within a tolerance, see `depth_errors`; None unless an export adds it.
         depth_deviation, colour_deviation: (H, W) between the members of a run; None unless an export adds them.
     """
 
@@ -75,6 +76,7 @@ class RenderedPicture:
     parallax: np.ndarray | None = None
     lower: np.ndarray | None = None
     upper: np.ndarray | None = None
+    confidence: np.ndarray | None = None
     depth_deviation: np.ndarray | None = None
     colour_deviation: np.ndarray | None = None
 

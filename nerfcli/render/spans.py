@@ -1,71 +1,100 @@
-"""Rays traced span by span, front to back, for fields whose density backends do not compile.
-
-Marching through such a field cannot stop behind a surface: all samples of a ray are asked for their density at once.
-Spans of a ray are traced one after the other, and only where light still gets to.
-"""
+"""Rays through a field of blocks: each span of a ray that is in one cell is rendered by the field of that block."""
 
 import math
 
 import torch
 from torch import Tensor
 
+from nerfcli.field.blocks_field import BlocksField
 from nerfcli.field.interface import Field
-from nerfcli.kernels import Intervals, March, Rays, RaysSeen, ray_indices, reference
-
-# Intervals of a span: fewer cost more calls, more are computed behind surfaces.
-SPAN = 64
+from nerfcli.kernels import Intervals, March, Rays, RaysSeen, ray_indices
 
 
 def trace_in_spans(
-    field: Field, rays: Rays, march: March, *, background: Tensor, shares: tuple[float, ...], negligible: float
+    field: BlocksField,
+    rays: Rays,
+    march: March,
+    *,
+    background: Tensor,
+    shares: tuple[float, ...],
+    negligible: float,
 ) -> RaysSeen:
     """`Backend.trace_rays` with the samples, of rays without jitter.
 
-    With T the light that passes the spans in front of span k:  colour = sum_k T_k colour_k + T background. Where light
-    ends is computed from the samples of all spans.
+    Spans of intervals are halved until the middles of the first and the last one are in the same cell: cells are
+    convex. With T the light that passes the spans in front of span k:  colour = sum_k T_k colour_k + T background.
+    Where light ends is computed from the samples of all spans.
     """
-    count, device = len(rays.origins), rays.origins.device
-    firsts = range(0, len(march.edges) - 2, SPAN)
+    intervals = len(march.edges) - 2
     rgb, left_out = torch.zeros_like(rays.origins), torch.zeros_like(rays.jitter)
-    transmittance, alive = torch.ones_like(rays.jitter), torch.arange(count, device=device)
+    transmittance = torch.ones_like(rays.jitter)
     stop = math.exp(-march.max_optical_depth) * (1 + 1e-5)  # rounding must not hide a stop
-    spans: list[tuple[Tensor, Intervals]] = []
-    for first in firsts:
-        cuts = march.edges[first : first + SPAN + 1]
-        seen = field.backend.trace_rays(
-            Rays(rays.origins[alive], rays.directions[alive], rays.jitter[alive]),
-            march._replace(edges=torch.cat([cuts, cuts[-1:]])),
-            field.medium(),
-            background=rgb.new_zeros(3),
-            negligible=negligible / len(firsts),
-        )
-        passed, through = transmittance[alive], seen.ends.transmittance
-        rgb[alive] += passed[:, None] * seen.rgb
-        # The span's own stop is one of the whole ray, and counted there.
-        left_out[alive] += passed * (seen.truncation_error - torch.where(through <= stop, through, 0.0)).clamp_min(0.0)
-        transmittance[alive] = passed * through
-        spans.append((alive, seen.intervals))
+    seen_spans: list[tuple[Tensor, Intervals]] = []
+    waiting = [(0, intervals, torch.arange(len(rays.origins), device=rays.origins.device))]
+    while waiting:  # the nearest span of each ray comes first
+        first, last, alive = waiting.pop()
         alive = alive[transmittance[alive] > stop]
-        if len(alive) == 0:
-            break
-    intervals = _joined(spans, count)
-    density, starts, ends, offsets = intervals
-    light = reference.light_ends(density, starts, ends, offsets=offsets, shares=shares)
+        edges = march.edges[first : last + 1]
+        nearest, farthest = (
+            field.block_numbers(rays.origins[alive] + rays.directions[alive] * (edges[k] + edges[k + 1]) / 2)
+            for k in (0, -2)
+        )
+        divided = alive[nearest != farthest]
+        if len(divided) > 0:
+            middle = (first + last) // 2
+            waiting += [(middle, last, divided), (first, middle, divided)]
+        for number in range(len(field.fields)):
+            own = alive[(nearest == number) & (farthest == number)]
+            if len(own) == 0:
+                continue
+            seen = _seen_in_block(
+                field,
+                number,
+                Rays(rays.origins[own], rays.directions[own], rays.jitter[own]),
+                march._replace(edges=torch.cat([edges, edges[-1:]])),
+                negligible * (last - first) / intervals,
+            )
+            passed, through = transmittance[own], seen.ends.transmittance
+            rgb[own] += passed[:, None] * seen.rgb
+            # The span's own stop is one of the whole ray, and counted there.
+            span_error = seen.truncation_error - torch.where(through <= stop, through, 0.0)
+            left_out[own] += passed * span_error.clamp_min(0.0)
+            transmittance[own] = passed * through
+            seen_spans.append((own, seen.intervals))
+    packed = _joined(seen_spans, rays)
+    light = field.backend.light_ends(packed, shares=shares)
     behind = torch.maximum(background, 1.0 - background).amax(-1)
     error = left_out + torch.where(light.transmittance <= stop, light.transmittance * behind, 0.0)
-    return RaysSeen(rgb + light.transmittance[:, None] * background, light, error, intervals)
+    return RaysSeen(rgb + light.transmittance[:, None] * background, light, error, packed)
 
 
-def _joined(spans: list[tuple[Tensor, Intervals]], count: int) -> Intervals:
-    """Return the samples of `count` rays, of which each span has those of some, packed ray after ray."""
-    counts = torch.stack(
-        [intervals.offsets.new_zeros(count).index_copy(0, rays, intervals.offsets.diff()) for rays, intervals in spans]
+def _seen_in_block(field: BlocksField, number: int, rays: Rays, march: March, negligible: float) -> RaysSeen:
+    """Return what rays see on black in the frame of one block, with the samples in the frame of all."""
+    block, own = field.settings.blocks[number], field.fields[number]
+    assert isinstance(own, Field)
+    seen = own.backend.trace_rays(
+        rays._replace(origins=(rays.origins - rays.origins.new_tensor(block.centre)) / block.radius),
+        March(march.edges / block.radius, field.occupancy[number], block.field.contraction, march.max_optical_depth),
+        own.medium(),
+        background=rays.origins.new_zeros(3),
+        negligible=negligible,
     )
-    offsets = torch.nn.functional.pad(counts.sum(0).cumsum(0), (1, 0))
-    begins = offsets[:-1] + counts.cumsum(0) - counts  # (spans, rays)
-    density, starts, ends = (spans[0][1].density.new_empty(int(offsets[-1])) for _ in range(3))
-    for (rays, intervals), begin in zip(spans, begins, strict=True):
-        own = ray_indices(intervals.offsets)
-        places = begin[rays[own]] + torch.arange(len(own), device=own.device) - intervals.offsets[own]
+    density, starts, ends, offsets = seen.intervals
+    in_all = Intervals(density / block.radius, starts * block.radius, ends * block.radius, offsets)
+    return seen._replace(intervals=in_all)
+
+
+def _joined(spans: list[tuple[Tensor, Intervals]], rays: Rays) -> Intervals:
+    """Return the samples of all rays, of which each span has those of some, packed ray after ray."""
+    counts = torch.zeros(len(rays.origins), dtype=torch.int64, device=rays.origins.device)
+    for own, intervals in spans:
+        counts[own] += intervals.offsets.diff()
+    offsets = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    begins = offsets[:-1].clone()
+    density, starts, ends = (rays.origins.new_empty(int(offsets[-1])) for _ in range(3))
+    for own, intervals in spans:
+        ray = ray_indices(intervals.offsets)
+        places = (begins[own] - intervals.offsets[:-1])[ray] + torch.arange(len(ray), device=ray.device)
         density[places], starts[places], ends[places] = intervals.density, intervals.starts, intervals.ends
+        begins[own] += intervals.offsets.diff()
     return Intervals(density, starts, ends, offsets)

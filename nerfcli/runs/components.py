@@ -48,6 +48,7 @@ class Components:
             captures.
         antialias: whether details smaller than a pixel fade out of its view; see `reference.hash_encode`.
         pixels: which ones are drawn: from "anywhere", or half of them where the "error" is; see `error_map`.
+        movers: whether pixels that show something that moves do not count in the loss; see `fit.movers`.
     """
 
     background: str = "auto"
@@ -63,6 +64,7 @@ class Components:
     distortion: float = 0.05
     antialias: bool = False
     pixels: str = "anywhere"
+    movers: bool = False
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -118,6 +120,7 @@ CHOICES = {
     "distortion": Choice("concentrated density along rays, weight", 0.0, 0.05, None),
     "antialias": Choice("fade out details smaller than a pixel", False, True, (False, True)),
     "pixels": Choice("more pixels where the error is large", "anywhere", "error", PIXELS),
+    "movers": Choice("leave out what moves between photos", False, True, (False, True)),
 }
 assert tuple(CHOICES) == tuple(field.name for field in fields(Components))
 

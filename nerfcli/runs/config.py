@@ -16,7 +16,7 @@ from nerfcli.runs.components import Components
 from nerfcli.runs.decisions import Selection
 from nerfcli.runs.files import BLOCKS, CONFIG, RECONSTRUCTION
 from nerfcli.runs.settings import TrainSettings
-from nerfcli.scene import Scene, fingerprint, is_scene
+from nerfcli.scene import Scene, fingerprint, is_scene, photo_folder
 from nerfcli.sealed import read_sealed, write_sealed
 
 
@@ -184,6 +184,8 @@ def no_run(path: Path) -> UserError:
             f"the blocks of {path} are not complete",
             f"train them: nerfcli train SCENE --blocks N -o {path}, with the options that they were begun with",
         )
+    if photos := photo_folder(path):
+        return UserError(f"{photos} is a folder of photos, not a run", f"make a run of it first: nerfcli run {photos}")
     return UserError(f"{path} is not a run folder: it has no {CONFIG}", hint)
 
 

@@ -22,6 +22,7 @@ from nerfcli.field.hash_field import HashField
 from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent
 from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.movers import Movers
 from nerfcli.fit.point_depth import PointDepths, PointRays
 from nerfcli.photos.loading import LoadedPhoto
 from nerfcli.photos.pool import PixelPool
@@ -249,6 +250,7 @@ class Trials:
             points=self._points if components.points else None,
             sky=self._sky if components.background == "sphere" else None,
             error_map=ErrorMap(self._pool) if components.pixels == "error" else None,
+            movers=Movers(self._pool) if components.movers else None,
         )
 
     def _take_up(self, fitting: Fitting, start: TrialStart) -> None:

@@ -68,7 +68,7 @@ class Checkpoints:
         marching = prepared.extent.marching
         return Model(
             fitting.field,
-            fitting.occupied,
+            fitting.cells.coarse,
             marching.stretched(DETAILED_STEP) if fitting.field.settings.detailed else marching,
             fitting.parts.background or alone,
             prepared.extent.training_from_scene,

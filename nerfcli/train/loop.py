@@ -26,6 +26,7 @@ from nerfcli.scene import Scene
 from nerfcli.train.checkpoints import Checkpoints, Totals, decisions_of, restore
 from nerfcli.train.following import END, SETTLE, TIMED_STEPS, WAIT, describe_efficiency, start_others
 from nerfcli.train.live import LiveTraining
+from nerfcli.train.moving_masks import write_moving_masks
 from nerfcli.train.preparation import Prepared, prepare
 from nerfcli.train.sentinel import FAILURES, Sentinel
 from nerfcli.train.waypoints import SHARES, forget_waypoints, keep_waypoint, measure_waypoints
@@ -83,7 +84,8 @@ def train(
     begun = decisions_of(run, settings, saved[1]) if saved is not None else None
     # A training that goes on to a larger budget keeps the rows that it has.
     rows = settings.log2_rows or (saved[1]["field"].get("log2_rows") if saved is not None else None)
-    settings = replace(settings, log2_rows=rows or settings.chosen_log2_rows)
+    of_all_ranks = replace(settings, threads=ranks.count * settings.threads)
+    settings = replace(settings, log2_rows=rows or of_all_ranks.chosen_log2_rows)
     prepared = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
     fitting = prepared.fitting(ranks)
     size = ", ".join(f"{name} {value}" for name, value in fitting.field.settings.to_json().items())
@@ -135,6 +137,8 @@ def train(
         live.end(seconds=_LAST_LOOK_SECONDS)
     if fitting.rollbacks:
         notify(f"numbers became non-finite {fitting.rollbacks} times; the states before that are in {run}/failure-*")
+    if fitting.movers is not None:
+        write_moving_masks(run, fitting.movers, prepared.pool, notify=notify)
     measure_waypoints(checkpoints.frames()[1], run, prepared, notify=notify)
     if ranks.count > 1 and seconds:
         notify(describe_efficiency(fitting, seconds))

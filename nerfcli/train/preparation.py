@@ -17,7 +17,9 @@ from nerfcli.errors import UserError, reason_of
 from nerfcli.fit.coverage import covered_cells
 from nerfcli.fit.error_map import ErrorMap
 from nerfcli.fit.extent import Extent, choose_extent, lacks_depth
-from nerfcli.fit.fitting import OCCUPANCY_SIDE, Fitting
+from nerfcli.fit.fitting import Fitting
+from nerfcli.fit.movers import Movers
+from nerfcli.fit.open_cells import OCCUPANCY_SIDE
 from nerfcli.fit.point_depth import PointDepths, PointRays
 from nerfcli.fit.ranks import ALONE, Alone
 from nerfcli.memory import default_memory_limit
@@ -102,6 +104,7 @@ class Prepared:
             log_focal=self.log_focal,
             points=self.points,
             error_map=ErrorMap(self.pool) if self.settings.components.pixels == "error" else None,
+            movers=Movers(self.pool) if self.settings.components.movers else None,
             covered=self.covered(),
             sky=self.sky,
             ranks=ranks,

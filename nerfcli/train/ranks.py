@@ -1,5 +1,6 @@
 """How the processes that torchrun has started for one training meet."""
 
+import atexit
 import functools
 from datetime import timedelta
 
@@ -32,4 +33,6 @@ def joined_ranks(device: str) -> Alone:
         dist.init_process_group("gloo" if device == "cpu" else "cpu:gloo,cuda:nccl", timeout=STEP)
         preparation = dist.new_group(timeout=PREPARATION)
     assert isinstance(preparation, dist.ProcessGroup)  # this process is in it
-    return Ranks(dist.get_rank(), dist.get_world_size(), preparation)
+    ranks = Ranks(dist.get_rank(), dist.get_world_size(), preparation)
+    atexit.register(ranks.leave)
+    return ranks

@@ -8,6 +8,9 @@ function valueOf(map, { colour, ends, shares }, i, { factor, farthest, minOpacit
   if (map === "moment") return moment * factor;
   if (map === "background") return (moment + (1 - alpha) * farthest) * factor;
   if (alpha < minOpacity || mean < 0) return NaN;
+  const photos = shares[4 * i + 3];
+  if (map === "coverage") return median < 0 ? NaN : Math.floor(photos);
+  if (map === "parallax") return median < 0 ? NaN : 256 * (photos - Math.floor(photos));
   let value = mean;
   if (map === "median") value = median;
   else if (map === "max-weight") value = ends[4 * i + 3];

@@ -2,7 +2,9 @@
 "use strict";
 
 const MAPS = ["colour", "opacity", "conditional", "median", "max-weight", "moment", "background", "quantile", "spread",
-  "disagreement"];
+  "disagreement", "coverage", "parallax"];
+// Maps that are no lengths: ends of their colours, and what follows the last number of the legend.
+const COUNTS = { opacity: [[0, 1], ""], coverage: [[0, 8], " or more photos"], parallax: [[0, 30], " degrees or more"] };
 const ROWS = "RGBA16I";
 
 /** The bytes of an element that `array_element` in page.py wrote. Throws where it is missing or damaged. */
@@ -48,9 +50,10 @@ async function readScene() {
   if (scene.format !== "nerfcli page 1") throw new Error(`this file has the format ${scene.format}`);
   scene.colours = await bytesOf("colours");
   if (scene.live) return scene;
-  const names = ["expected", "table", "networks", "cuts", "occupied", ...(scene.field.sky ? ["sky"] : [])];
+  const names = ["expected", "table", "networks", "cuts", "occupied", "seen", ...(scene.field.sky ? ["sky"] : [])];
   const arrays = Object.fromEntries(await Promise.all(names.map(async name => [name, await bytesOf(name)])));
   scene.expected = new Float32Array(arrays.expected.buffer);
+  scene.seenCells = new Uint16Array(arrays.seen.buffer);
   return withField(scene, arrays);
 }
 
@@ -113,7 +116,7 @@ function shaderSource(scene, body, tableBits) {
     REACH: glslFloat((4 / march.side) * (field.contraction === 0 ? 4 : 7.8)),
     LARGEST_DENSE: field.largestDense, ROW_MASK: `${field.rowMask}u`,
     TABLE_BITS: tableBits, TABLE_WIDTH: 2 ** tableBits,
-    SKY_SIDE: field.sky ? field.sky.side : 0,
+    SKY_SIDE: field.sky ? field.sky.side : 0, SEEN_SIDE: scene.seen || 0,
     RESOLUTIONS: field.resolutions.join(","), FIRST_ROWS: field.firstRows.join(","),
   };
   return glslHead("isampler2D", "usampler3D", "isampler3D")

@@ -5,7 +5,8 @@ const $ = id => document.getElementById(id);
 const WORDS = { colour: "colour", opacity: "opacity", conditional: "mean depth (conditional)", median: "median depth",
   "max-weight": "depth of the heaviest interval (max-weight)", moment: "moment", background: "mean with the background",
   quantile: "quantile", spread: "spread: standard deviation of where light ends",
-  disagreement: "disagreement: |median - mean|" };
+  disagreement: "disagreement: |median - mean|", coverage: "coverage: training photos that see the surface",
+  parallax: "parallax: largest angle between two photos that see it" };
 const state = { map: 0, axis: "z", range: [0, 1], minOpacity: 0.5, gains: [1, 1, 1], share: 0.25, photo: -1, wipe: 0.5,
   compare: "wipe", frusta: true, frustumSize: 1, box: null, showBox: false, clip: false, points: [], picking: false,
   keyframes: [], playing: false, scale: 1, dragged: null };
@@ -69,6 +70,7 @@ class Page {
   constructor(scene, renderer) {
     this.scene = scene;
     this.unit = scene.unit === "metre" ? "m" : "units";
+    this.maps = MAPS.filter(name => scene.seen || !["coverage", "parallax"].includes(name));
     state.box = [...scene.box];
     this.walk = new Walk(scene, () => this.moved(), (x, y) => this.pointAt(x, y)?.middle || null);
     this.overlay = new Overlay($("over"), scene);
@@ -160,8 +162,8 @@ class Page {
     }
     const sorted = values.filter(Number.isFinite).sort((a, b) => a - b);
     const rank = share => sorted[Math.round(share * (sorted.length - 1))] ?? share;
-    const distance = !["opacity", "spread", "disagreement"].includes(map);
-    state.range = map === "opacity" ? [0, 1] : [distance ? rank(0.01) : 0, rank(0.99)];
+    const distance = !["spread", "disagreement"].includes(map);
+    state.range = COUNTS[map]?.[0] || [distance ? rank(0.01) : 0, rank(0.99)];
     $("low").value = Number(state.range[0].toPrecision(4));
     $("high").value = Number(state.range[1].toPrecision(4));
     this.legend();
@@ -172,15 +174,15 @@ class Page {
     $("legend").hidden = map === "colour";
     for (let i = 0; i < 256; i++) bar.data.set([...this.scene.colours.slice(3 * i, 3 * i + 3), 255], 4 * i);
     context.putImageData(bar, 0, 0);
-    const [low, high] = state.range, unit = map === "opacity" ? "" : ` ${this.unit}`;
+    const [low, high] = state.range, [, unit] = COUNTS[map] || [null, ` ${this.unit}`];
     $("ticks").replaceChildren(...[0, 0.25, 0.5, 0.75, 1].map(share => {
       const tick = document.createElement("span");
-      tick.textContent = `${(low + share * (high - low)).toPrecision(3)}${share === 1 ? unit : ""}`;
+      tick.textContent = `${Number((low + share * (high - low)).toPrecision(3))}${share === 1 ? unit : ""}`;
       return tick;
     }));
-    const axis = map === "opacity" ? "" : state.axis === "z" ? ", along the optical axis" : ", along the ray";
+    const axis = COUNTS[map] ? "" : state.axis === "z" ? ", along the optical axis" : ", along the ray";
     const share = map === "quantile" ? ` ${state.share}` : "";
-    const unitWords = map === "opacity" ? "" : this.scene.unit === "metre" ? ", in metres" : ", in units of the scene";
+    const unitWords = COUNTS[map] ? "" : this.scene.unit === "metre" ? ", in metres" : ", in units of the scene";
     $("meaning").textContent = `${WORDS[map]}${share}${axis}${unitWords}; hatched: no value`;
   }
 
@@ -390,7 +392,7 @@ class Page {
   }
 
   fromAddress() {
-    const parameters = new URLSearchParams(location.hash.slice(1)), map = MAPS.indexOf(parameters.get("m"));
+    const parameters = new URLSearchParams(location.hash.slice(1)), map = this.maps.indexOf(parameters.get("m"));
     if (map >= 0) this.choose(map);
     if (["z", "ray"].includes(parameters.get("a"))) $("axis").value = state.axis = parameters.get("a");
     this.walk.read(parameters);
@@ -398,7 +400,7 @@ class Page {
 
   choose(map) {
     state.map = map;
-    const name = MAPS[map], depth = !["colour", "opacity"].includes(name);
+    const name = MAPS[map], depth = name !== "colour" && !COUNTS[name];
     $("map").value = name;
     $("axis-line").hidden = !depth;
     $("share-line").hidden = name !== "quantile";
@@ -411,7 +413,7 @@ class Page {
     const { scene } = this, on = (id, name, act) => $(id).addEventListener(name, act);
     document.title = $("title").textContent = scene.run;
     $("about").textContent = scene.about;
-    for (const name of MAPS) $("map").add(new Option(WORDS[name], name));
+    for (const name of this.maps) $("map").add(new Option(WORDS[name], name));
     on("map", "change", () => this.choose(MAPS.indexOf($("map").value)));
     on("axis", "change", () => { state.axis = $("axis").value; this.legend(); this.request(); });
     $("share").value = state.share;

@@ -144,7 +144,7 @@ def _numbers(model: Model) -> tuple[tuple[int, ...], Tensor, np.ndarray, dict[st
     if isinstance(field, BlocksField):
         raise UserError(
             "the page cannot render several blocks together",
-            "give one of them, RUN/blocks/1, or render pictures and videos: nerfcli render RUN",
+            "give one of them, RUN/blocks/1, or look at all together, rendered by the CPU: nerfcli view RUN",
         )
     raise UserError(
         f"the page cannot render a field of type {field.settings.kind}: its network is too large for a shader",

@@ -40,9 +40,10 @@ class PageNumbers:
     elements: str
 
     @classmethod
-    def of(cls, packed: Packed, proof: Proof) -> "PageNumbers":
-        description = {"field": packed.field, "march": packed.march, "proof": proof.description}
-        arrays = {**packed.arrays, "expected": proof.expected}
+    def of(cls, packed: Packed, proof: Proof, seen: np.ndarray) -> "PageNumbers":
+        """Return the numbers of a field, with its proof and its `seen_cells`."""
+        description = {"field": packed.field, "march": packed.march, "proof": proof.description, "seen": len(seen)}
+        arrays = {**packed.arrays, "expected": proof.expected, "seen": seen}
         return cls(description, "\n".join(starmap(array_element, arrays.items())))
 
 

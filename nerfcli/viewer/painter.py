@@ -112,6 +112,7 @@ def render_tile(model: Model, view: View, tile: Tile) -> np.ndarray:
         background=colours_behind(model.background, rays.directions),
         shares=(MEDIAN, 0.05, 0.95, view.quantile),
         cones=rays.cones,
+        keep_intervals=False,
     )
     ends = seen.ends
     quantiles = ends.quantiles

@@ -94,6 +94,7 @@ class Renderer {
     if (scene.sky) for (let i = 0; i < sky ** 3; i++) for (let c = 0; c < 3; c++) {
       voxels[4 * i + c] = scene.sky[c * sky ** 3 + i];
     }
+    const cells = scene.seen || 1, seen = scene.seenCells || new Uint16Array(1);
     return {
       table: this.texture(0, kind =>
         gl.texImage2D(kind, 0, gl.RGBA16I, width, height, 0, gl.RGBA_INTEGER, gl.SHORT, padded)),
@@ -106,6 +107,8 @@ class Renderer {
         gl.texImage3D(kind, 0, gl.RGBA16I, sky, sky, sky, 0, gl.RGBA_INTEGER, gl.SHORT, voxels), true),
       colours: this.texture(5, kind =>
         gl.texImage2D(kind, 0, gl.RGB8, 256, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, scene.colours)),
+      seen: this.texture(5, kind => gl.texImage3D(kind, 0, gl.R16UI, cells, cells, cells, 0,
+        gl.RED_INTEGER, gl.UNSIGNED_SHORT, seen), true),
     };
   }
 
@@ -156,8 +159,8 @@ class Renderer {
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(...(tile || [0, 0, target.width, target.height]));
     gl.useProgram(program);
-    ["table", "occupied", "blocks", "cuts", "sky"].forEach((name, unit) => gl.uniform1i(places[name], unit));
-    ["table", "occupied", "blocks", "cuts", "sky"].forEach((name, unit) => {
+    ["table", "occupied", "blocks", "cuts", "sky", "seen"].forEach((name, unit) => {
+      gl.uniform1i(places[name], unit);
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(name === "table" || name === "cuts" ? gl.TEXTURE_2D : gl.TEXTURE_3D, this.textures[name]);
     });

@@ -28,6 +28,7 @@ float valueOf(int which, vec4 c, vec4 e, vec4 s, float unit) {
   if (which == 4) return e.w * unit;
   if (which == 7) return s.z < 0.0 ? -1.0 : s.z * unit;
   if (which == 8) return e.y * unit;
+  if (which >= 10) return e.z < 0.0 ? -1.0 : which == 10 ? floor(s.w) : 256.0 * fract(s.w);
   return e.z < 0.0 ? -1.0 : abs(e.z - e.x) * unit;
 }
 

@@ -7,6 +7,7 @@ uniform usampler3D occupied;   // 1 in cells that hold something
 uniform usampler3D blocks;     // 1 in blocks of 4^3 cells that hold something, or touch one that does
 uniform sampler2D cuts;        // distances at which rays are cut
 uniform isampler3D sky;        // background by direction, 16-bit levels of logits
+uniform usampler3D seen;       // coverage + 256 * parallax of the surface in cells, see coverage.py
 layout(std140) uniform Networks { mat4 networks[NETWORKS]; };
 
 uniform mat3 trainingFromCamera;
@@ -27,7 +28,7 @@ uniform vec3 sceneOrigin, boxLow, boxHigh;
 
 layout(location = 0) out vec4 outColour;  // rgb on the background, opacity
 layout(location = 1) out vec4 outEnds;    // mean, spread, median, heaviest
-layout(location = 2) out vec4 outShares;  // quantiles 5 %, 95 %, the chosen one; number of samples
+layout(location = 2) out vec4 outShares;  // quantiles 5 %, 95 %, the chosen one; coverage + parallax / 256 at the median
 
 const int RES[LEVELS] = int[LEVELS](RESOLUTIONS);
 const int FIRST[LEVELS] = int[LEVELS](FIRST_ROWS);
@@ -106,7 +107,7 @@ float density(vec3 p, float width, out Code code) {
   return exp(clamp(code.first.x, -15.0, 15.0));
 }
 
-vec3 colour(Code code, vec3 p, vec4 seen[HIDDEN], vec4 harmonics[4]) {
+vec3 colour(Code code, vec3 p, vec4 directed[HIDDEN], vec4 harmonics[4]) {
   vec4 g[4];
   g[0] = code.first;
   for (int j = 1; j < 4; j++) {
@@ -116,7 +117,7 @@ vec3 colour(Code code, vec3 p, vec4 seen[HIDDEN], vec4 harmonics[4]) {
   }
   vec4 a[HIDDEN];
   for (int j = 0; j < HIDDEN; j++) {
-    vec4 s = seen[j];
+    vec4 s = directed[j];
     for (int i = 0; i < 4; i++) s += networks[C1 + j * 8 + i] * g[i];
     a[j] = max(s, 0.0);
   }
@@ -138,7 +139,7 @@ float density(vec3 p, float width, out Code code) {
   return exp(clamp(code.first.x, -15.0, 15.0));
 }
 
-vec3 colour(Code code, vec3 p, vec4 seen[HIDDEN], vec4 harmonics[4]) {
+vec3 colour(Code code, vec3 p, vec4 directed[HIDDEN], vec4 harmonics[4]) {
   vec3 sum = vec3(0);
   for (int l = 0; l < LEVELS; l++) {
     vec4 v = l == 0 ? code.first : level(l, p, 0.0);
@@ -225,15 +226,15 @@ void main() {
   float cone = 2.0 / (lens.x + lens.y);
   vec4 h[4];
   harmonicsOf(d, h);
-  vec4 seen[HIDDEN];
+  vec4 directed[HIDDEN];
 #if HASH
   for (int j = 0; j < HIDDEN; j++) {
     vec4 s = vec4(0);
     for (int i = 0; i < 4; i++) s += networks[C1 + j * 8 + 4 + i] * h[i];
-    seen[j] = s;
+    directed[j] = s;
   }
 #endif
-  float tau = 0.0, total = 0.0, mean = 0.0, apart = 0.0, largest = 0.0, heaviest = -1.0, count = 0.0;
+  float tau = 0.0, total = 0.0, mean = 0.0, apart = 0.0, largest = 0.0, heaviest = -1.0;
   vec3 rgb = vec3(0);
   vec4 shares = vec4(-1);
   for (int first = 0; first < INTERVALS && tau < deepest; first += 16) {
@@ -250,7 +251,7 @@ void main() {
       Code code;
       float sigma = density(p, cone * middle * stretch(at), code);
       float x = sigma * length, after = tau + x, weight = exp(-tau) * opacityOf(x);
-      rgb += weight * (weight > negligible ? colour(code, p, seen, h) : vec3(0.5));
+      rgb += weight * (weight > negligible ? colour(code, p, directed, h) : vec3(0.5));
       float where = begin + length * meanShare(x);
       if (weight > 0.0) {
         total += weight;
@@ -263,11 +264,18 @@ void main() {
       bvec4 now = bvec4(uvec4(lessThan(shares, vec4(0))) * uvec4(greaterThanEqual(vec4(after), targets)));
       shares = mix(shares, crossing, vec4(now));
       tau = after;
-      count += 1.0;
     }
   }
   float opacity = opacityOf(tau);
   outColour = vec4(clamp(rgb + exp(-tau) * behind(d), 0.0, 1.0), opacity);
   outEnds = total > 0.0 ? vec4(mean, sqrt(max(apart / total, 0.0)), shares.x, heaviest) : vec4(-1);
-  outShares = vec4(shares.yzw, count);
+  float photos = 0.0;
+#if SEEN_SIDE
+  if (shares.x >= 0.0) {
+    ivec3 cell = min(ivec3(clamp(cube(origin + d * shares.x), 0.0, 1.0) * float(SEEN_SIDE)), SEEN_SIDE - 1);
+    uint both = texelFetch(seen, cell, 0).x;
+    photos = float(both & 255u) + float(both >> 8) / 256.0;
+  }
+#endif
+  outShares = vec4(shares.yzw, photos);
 }

@@ -105,7 +105,7 @@ def evaluate_run(
         metrics = evaluate_model(
             model,
             held_out,
-            on_image=lambda done, total: progress(done / total, f"{done}/{total} rays"),
+            on_image=lambda done, total: progress(done / total, f"of {total} rays"),
             extras=Extras(trained.cameras.train, perceptual, billboards, align_poses, keep),
         )
     metrics["training"] = summary.to_json()

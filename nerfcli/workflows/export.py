@@ -13,6 +13,7 @@ from nerfcli.runs.run import Run
 from nerfcli.surface.extent import scene_box
 from nerfcli.surface.grid import check_box
 from nerfcli.surface.settings import SurfaceSettings
+from nerfcli.viewer.coverage import seen_cells
 from nerfcli.viewer.packing import pack_model
 from nerfcli.viewer.page import PageNumbers, page_html
 from nerfcli.viewer.pictures import page_photos
@@ -26,6 +27,7 @@ from nerfcli.workflows.export_geometry import (
 )
 from nerfcli.workflows.machine import device_name, thread_count
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
+from nerfcli.workflows.photo_depths import photo_depths
 
 # What a page may take in all; what the field leaves of it is for photos.
 PAGE_BYTES = 9_700_000
@@ -141,8 +143,14 @@ def _export_page(
     frames = [pinhole_frame(frame) for frame in (*cameras.train, *cameras.test)]
     box = settings.box or scene_box(model, frames)
     proof = make_proof(model, frames)
-    progress(0.2, "photos")
-    numbers = PageNumbers.of(packed, proof)
+    progress(0.1, "depths of the training photos")
+    seen = photo_depths(
+        run,
+        model,
+        on_progress=lambda share: progress(0.1 + 0.3 * share, "depths of the training photos"),
+        notify=notify,
+    )
+    numbers = PageNumbers.of(packed, proof, seen_cells(model, seen))
     text_bytes = len(numbers.elements)
     photos = page_photos(
         model,
@@ -150,7 +158,7 @@ def _export_page(
         cameras.test,
         room_bytes=PAGE_BYTES - text_bytes - 150_000,
         threads=torch.get_num_threads(),
-        on_progress=lambda fraction: progress(0.2 + 0.8 * fraction, "photos"),
+        on_progress=lambda fraction: progress(0.4 + 0.6 * fraction, "photos"),
     )
     if photos.missing:
         notify(f"{photos.missing} photos are missing: the page shows only their cameras")

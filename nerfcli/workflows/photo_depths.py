@@ -17,6 +17,10 @@ from nerfcli.runs.photo_depths import photo_depths_digest, read_photo_depths, wr
 from nerfcli.runs.run import Run
 from nerfcli.workflows.notices import Notify
 
+# Of the pixels of held-out photos. Measured: with 60 % matched, 89 % of the depths lie inside 90 % intervals; with
+# 3.5 %, 69 %.
+LEAST_MATCHED = 0.2
+
 
 def photo_depths(
     run: Run, model: Model, *, on_progress: Callable[[float], None], notify: Notify
@@ -71,7 +75,14 @@ def depth_errors(
             notify(f"the errors of depth are not kept: {error.message}")
     for least, pixels, quantiles in zip(STRATA, errors.pixels, errors.quantiles, strict=True):
         if np.isnan(quantiles).any():
-            notify(f"no intervals where {least} photos see the surface: only {pixels} pixels could be measured")
+            notify(
+                f"no intervals or confidence where {least} photos see the surface: only {pixels} pixels were measured"
+            )
+    notify(
+        f"errors of depth measured at {100.0 * errors.matched:.1f} % of the pixels of {errors.photos} held-out photos"
+    )
+    if errors.matched < LEAST_MATCHED:
+        notify("what cannot be matched is usually worse: expect more errors than intervals and confidence say")
     return errors
 
 

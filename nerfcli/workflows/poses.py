@@ -9,7 +9,7 @@ from nerfcli.poses.input.plan import Outlook, Plan, duration
 from nerfcli.poses.input.settings import Limits, PoseSettings
 from nerfcli.poses.input.video_frames import extract_frames, frames_folder
 from nerfcli.poses.model.cameras import USES, GivenIntrinsics
-from nerfcli.poses.structure_from_motion import is_same_scene, plan_poses
+from nerfcli.poses.structure_from_motion import is_same_scene, photo_notes, plan_poses
 from nerfcli.scene import SCENE_FILE
 from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, warn_python
 
@@ -23,6 +23,7 @@ _STAGES = {
     "match": "pairs compared",
     "map": "photos registered",
     "merge": "sub-models, merging them",
+    "locate": "trials to locate single photos",
     "check": "checks of the poses",
 }
 
@@ -118,13 +119,13 @@ def plan_scene(
     Raises:
         UserError: see `plan_poses`.
     """
-    _, grouped, _, plan = plan_poses(
+    photos, grouped, _, plan = plan_poses(
         folder,
         settings=settings,
         progress=lambda stage, done, total: progress(done / max(total, 1), _STAGES[stage]),
         given=intrinsics,
     )
-    for note in grouped.notes:
+    for note in photo_notes(photos, grouped):
         notify(note)
     return plan
 

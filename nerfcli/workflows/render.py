@@ -125,7 +125,7 @@ def render_run(
     def on_rays(rays: int) -> None:
         nonlocal done
         done += rays
-        progress(done / total, f"{len(chosen)} frames")
+        progress(done / total, f"of {len(chosen)} frames")
 
     progress(0.0, "")
     thread_safe = torch_device != "cpu" or model.thread_safe

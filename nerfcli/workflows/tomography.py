@@ -136,10 +136,11 @@ def _fit(
     begun = time.perf_counter()
     decisions: list[str] = []
     views = scan.training_views
+    # Correcting the geometry takes seconds, and hardly changes the number of voxels.
+    _fits_memory(grid_of_scan(scan.geometry, settings.voxel_size) if earlier is None else earlier.grid)
     centre, tilt = _geometry(scan, settings, earlier, decisions, progress)
     geometry = corrected_by(scan.geometry, centre, tilt)
     grid = earlier.grid if earlier is not None else grid_of_scan(geometry, settings.voxel_size)
-    _fits_memory(grid)
     if earlier is not None:
         strength, model_error = float(earlier.used["strength"]), float(earlier.used["model_error"])
     else:

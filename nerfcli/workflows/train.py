@@ -105,7 +105,7 @@ def _trained(
     view: bool = False,
 ) -> Run:
     """See `train_scene`."""
-    loaded = _load(folder, settings, holdout)
+    loaded = scene_for(settings, folder, holdout=holdout)
     if loaded.missing:
         listed = ", ".join(loaded.missing[:NAMES_SHOWN])
         more = f" and {len(loaded.missing) - NAMES_SHOWN} more" if len(loaded.missing) > NAMES_SHOWN else ""
@@ -153,7 +153,7 @@ def was_interrupted(scene: Path, run: Path, settings: TrainSettings, *, holdout:
     trained = Run(run)
     if not trained.is_trained:
         return False
-    loaded = _load(scene, settings, holdout)
+    loaded = scene_for(settings, scene, holdout=holdout)
     return trained.is_trained_from(loaded, settings) and not trained.is_complete(settings)
 
 
@@ -189,7 +189,7 @@ def train_again(
             f"the scene of {run.path} is missing: {folder}",
             "run the command from the folder in which the run was trained, or train again",
         )
-    loaded = _load(folder, config.settings, config.holdout)
+    loaded = scene_for(config.settings, folder, holdout=config.holdout)
     if scenes.fingerprint(loaded) != config.scene_fingerprint:
         raise UserError(f"{folder} has changed since {run.path} was trained on it", "train again with --overwrite")
     if config.settings.blocks and not config.settings.block:
@@ -262,8 +262,8 @@ def other_seeds(run: Run, count: int, *, device: str, threads: int) -> dict[Path
     return {run.path / "seeds" / str(seed): replace(first, seed=seed) for seed in seeds}
 
 
-def _load(folder: Path, settings: TrainSettings, holdout: str | None) -> Scene:
-    """Load the scene with the training photos that these settings use."""
+def scene_for(settings: TrainSettings, folder: Path, *, holdout: str | None) -> Scene:
+    """Load a scene with the training photos that a training of these settings uses."""
     loaded = scenes.load(folder, holdout=holdout)
     if settings.block:
         loaded = divide(loaded, settings.blocks).scenes[settings.block - 1]

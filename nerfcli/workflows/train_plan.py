@@ -7,8 +7,8 @@ from typing import Any
 
 from nerfcli import scene as scenes
 from nerfcli.photos.storage import InFiles, field_bytes, needs_of, storage_for
-from nerfcli.runs.blocks import divide
 from nerfcli.runs.settings import TrainSettings, automatic_downscale
+from nerfcli.workflows.train import scene_for
 
 # The field (1), the state with both moments of the optimiser (3), and the previous state until the next is whole (3).
 _FIELDS_ON_DISK = 7
@@ -68,9 +68,7 @@ def plan_training(
     Raises:
         UserError: the scene cannot be read, has no training photo, or does not fit into memory.
     """
-    loaded = scenes.load(Path(scene), holdout=holdout)
-    if settings.block:
-        loaded = divide(loaded, settings.blocks).scenes[settings.block - 1]
+    loaded = scene_for(settings, Path(scene), holdout=holdout)
     scenes.refuse_without_training_photos(loaded)
     first = loaded.train_frames[0].camera
     factor = settings.downscale or automatic_downscale(first.width, first.height)

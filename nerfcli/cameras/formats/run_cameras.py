@@ -16,8 +16,8 @@ from nerfcli.sealed import SEAL, read_sealed, write_sealed
 CAMERAS = "cameras.json"
 # What to do about a damaged file of a run.
 MEND = f"train again with --overwrite, or restore the file; if you edited it yourself, remove its entry {SEAL}"
-# In an entry: camera and pose as the scene had them.
-_GIVEN = "given"
+# In an entry: camera and pose as the scene had them. Beside the entries: the run's absolute path.
+_GIVEN, _WRITTEN_AT = "given", "written_at"
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def write_cameras(
     """
     frames = {"train": train, "test": test}
     content = {name: [_frame_to_json(frame, run, given or {}) for frame in frames[name]] for name in frames}
-    write_sealed(run / CAMERAS, content)
+    write_sealed(run / CAMERAS, {**content, _WRITTEN_AT: os.path.abspath(run)})
 
 
 def read_cameras(run: Path) -> RunCameras:
@@ -85,9 +85,11 @@ def _read_frames(path: Path, *, given: bool) -> RunCameras:
     run = path.parent
     try:
         content = read_sealed(path)
+        written_at = Path(content.get(_WRITTEN_AT, run))
         train, test = (
             tuple(
-                _frame_from_json({**entry, **(entry.get(_GIVEN, {}) if given else {})}, run) for entry in content[name]
+                _frame_from_json({**entry, **(entry.get(_GIVEN, {}) if given else {})}, run, written_at)
+                for entry in content[name]
             )
             for name in ("train", "test")
         )
@@ -106,7 +108,7 @@ def _frame_to_json(frame: Frame, run: Path, given: Mapping[str, Frame]) -> dict[
         "name": frame.name,
         **_view_to_json(frame),
         **({} if before is None else {_GIVEN: _view_to_json(before)}),
-        # Relative, so that scene and run can be moved together.
+        # Relative, so that scene and run can be moved together; if the run alone was, `written_at` leads to them.
         "image": None if frame.image is None else os.path.relpath(frame.image, run),
         "mask": None if frame.mask is None else os.path.relpath(frame.mask, run),
     }
@@ -116,7 +118,7 @@ def _view_to_json(frame: Frame) -> dict[str, Any]:
     return {"camera": frame.camera.to_json(), "world_from_cam": frame.world_from_cam.tolist()}
 
 
-def _frame_from_json(entry: dict[str, Any], run: Path) -> Frame:
+def _frame_from_json(entry: dict[str, Any], run: Path, written_at: Path) -> Frame:
     pose = np.array(entry["world_from_cam"], dtype=np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError(f"world_from_cam of {entry['name']} is not 4 rows of 4 finite numbers")
@@ -124,6 +126,12 @@ def _frame_from_json(entry: dict[str, Any], run: Path) -> Frame:
         name=entry["name"],
         camera=Camera.from_json(entry["camera"]),
         world_from_cam=pose,
-        image=None if entry["image"] is None else run / entry["image"],
-        mask=None if entry["mask"] is None else run / entry["mask"],
+        image=None if entry["image"] is None else _found(entry["image"], run, written_at),
+        mask=None if entry["mask"] is None else _found(entry["mask"], run, written_at),
     )
+
+
+def _found(file: str, run: Path, written_at: Path) -> Path:
+    """Return where a file is by its path from the run, or else from where the run was written."""
+    here, there = run / file, Path(os.path.normpath(written_at / file))
+    return there if there.exists() and not here.exists() else here

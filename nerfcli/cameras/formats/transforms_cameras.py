@@ -11,14 +11,6 @@ from nerfcli.cameras.formats.fields import malformed
 from nerfcli.cameras.formats.limits import stated_camera
 from nerfcli.cameras.formats.unsupported import distortion, projection
 
-# All the keys that are read here, of a frame or of the whole file.
-CAMERA_KEYS = frozenset(
-    (
-        *("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"),
-        *("camera_model", "is_fisheye", "camera_angle_x", "camera_angle_y"),
-    )
-)
-
 _INTRINSICS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 _PERSPECTIVE_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")

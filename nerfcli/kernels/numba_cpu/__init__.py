@@ -9,7 +9,7 @@ from nerfcli.kernels.numba_cpu.compositing import composite, distortion, interva
 from nerfcli.kernels.numba_cpu.coordinates import sample_coordinates
 from nerfcli.kernels.numba_cpu.depth import light_ends, mixture_quantile
 from nerfcli.kernels.numba_cpu.hash_grid import can_hash_encode, hash_encode
-from nerfcli.kernels.numba_cpu.marching import occupied_samples
+from nerfcli.kernels.numba_cpu.marching import keep_largest, occupied_samples
 from nerfcli.kernels.numba_cpu.networks import can_radiance, density, radiance
 from nerfcli.kernels.numba_cpu.pixels import pixel_rays
 from nerfcli.kernels.numba_cpu.projection import back_project, project
@@ -32,6 +32,7 @@ __all__ = [
     "hash_encode",
     "interval_weights",
     "is_compiled",
+    "keep_largest",
     "light_ends",
     "mixture_quantile",
     "occupied_samples",
@@ -84,6 +85,7 @@ def _run_all() -> None:
     _, _, _, encoded, points, *_ = visible_samples(rays, along, grid)
     trace_rays(rays, along, grid, background=torch.zeros(3), shares=(0.5,), negligible=0.0)
     occupied_samples(rays, along)
+    keep_largest(torch.zeros(2, 2, 2), points, lengths[: len(points)])
     spans = (starts, starts + 1)
     sample_coordinates(direction, direction, *spans, offsets=offsets, contraction="l2", known=None)
     ray = direction.clone().requires_grad_()

@@ -53,6 +53,29 @@ def _write(
                     at += 1
 
 
+@numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
+def _keep_largest(cells: Any, coordinates: Any, values: Any, threads: Any) -> None:
+    """`keep_largest`; each thread owns layers of cells, so that none is written by two."""
+    side = cells.shape[0]
+    scale, zero, most = np.float32(side), np.float32(0), np.float32(side - 1)
+    for thread in numba.prange(threads):
+        first, last = thread * side // threads, (thread + 1) * side // threads
+        for i in range(values.shape[0]):
+            z = np.int64(min(max(coordinates[i, 2] * scale, zero), most))
+            if first <= z < last:
+                y = np.int64(min(max(coordinates[i, 1] * scale, zero), most))
+                x = np.int64(min(max(coordinates[i, 0] * scale, zero), most))
+                if values[i] > cells[z, y, x]:
+                    cells[z, y, x] = values[i]
+
+
+def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
+    """See `reference.keep_largest`; float32 on the CPU."""
+    _keep_largest(
+        cells.numpy(), coordinates.detach().contiguous().numpy(), values.detach().contiguous().numpy(), use_threads()
+    )
+
+
 def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """See `reference.occupied_samples`; float32 on the CPU."""
     use_threads()

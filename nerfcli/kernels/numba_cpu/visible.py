@@ -22,27 +22,45 @@ from nerfcli.kernels.numba_cpu.threads import use_threads
 LANES = 256
 AHEAD = 4
 ROUND = LANES * AHEAD
-# Cells of the grid along a side of a block of them; empty blocks are stepped over as a whole.
-BLOCK_SIDE = 4
+# Empty blocks of cells are stepped over as a whole: so many along a side of the grid, of this many cells at least.
+BLOCKS, LEAST_BLOCK = 16, 4
+
+
+@numba.njit(inline="always")
+def _block_side(side: Any) -> Any:
+    """Return how many cells a block is wide."""
+    return max(side // BLOCKS, LEAST_BLOCK)
 
 
 @numba.njit(inline="always")
 def _block(x: Any, side: Any) -> Any:
     """Return the block of a coordinate along one axis; of the nearest one inside the cube."""
-    return min(np.int64(min(max(x, np.float32(0)), np.float32(1)) * np.float32(side)), side - 1) // BLOCK_SIDE
+    return min(np.int64(min(max(x, np.float32(0)), np.float32(1)) * np.float32(side)), side - 1) // _block_side(side)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _is_occupied(occupied: Any, z: Any, y: Any, x: Any, width: Any) -> Any:
+    """Return whether a block that begins in a cell has an occupied one."""
+    side = occupied.shape[0]
+    for k in range(z, min(z + width, side)):
+        for j in range(y, min(y + width, side)):
+            for i in range(x, min(x + width, side)):
+                if occupied[k, j, i]:
+                    return True
+    return False
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def occupied_blocks(occupied: Any) -> Any:
     """Return which blocks of cells are occupied, or touch one that is."""
     side = occupied.shape[0]
-    blocks = (side + BLOCK_SIDE - 1) // BLOCK_SIDE
+    width = _block_side(side)
+    blocks = (side + width - 1) // width
     own = np.zeros((blocks, blocks, blocks), np.bool_)
-    for z in range(side):
-        for y in range(side):
-            for x in range(side):
-                if occupied[z, y, x]:
-                    own[z // BLOCK_SIDE, y // BLOCK_SIDE, x // BLOCK_SIDE] = True
+    for z in range(blocks):
+        for y in range(blocks):
+            for x in range(blocks):
+                own[z, y, x] = _is_occupied(occupied, z * width, y * width, x * width, width)
     near = np.zeros_like(own)
     for z in range(blocks):
         for y in range(blocks):
@@ -98,10 +116,8 @@ def new_round() -> Any:
 
 @numba.njit(inline="always")
 def block_reach(side: Any, contraction: Any) -> Any:
-    """Return the longest interval of which `_may_hold_something` knows where it goes:
-    a block is BLOCK_SIDE / side wide.
-    """
-    return np.float32(BLOCK_SIDE / side * (4.0 if contraction == 0 else 7.8))
+    """Return the longest interval of which `_may_hold_something` knows where it goes."""
+    return np.float32(_block_side(side) / side * (4.0 if contraction == 0 else 7.8))
 
 
 @numba.njit(nogil=True, error_model="numpy")

@@ -17,7 +17,13 @@ from nerfcli.kernels.reference.compositing import (
 )
 from nerfcli.kernels.reference.depth import light_ends, mixture_quantile
 from nerfcli.kernels.reference.encoding import corner_rows, hash_encode
-from nerfcli.kernels.reference.marching import march, occupied_samples, sample_coordinates, visible_samples
+from nerfcli.kernels.reference.marching import (
+    keep_largest,
+    march,
+    occupied_samples,
+    sample_coordinates,
+    visible_samples,
+)
 from nerfcli.kernels.reference.networks import density, geometry, radiance
 from nerfcli.kernels.reference.pixels import pixel_rays
 from nerfcli.kernels.reference.projection import back_project, project
@@ -36,6 +42,7 @@ __all__ = [
     "geometry",
     "hash_encode",
     "interval_weights",
+    "keep_largest",
     "light_ends",
     "march",
     "mixture_quantile",

@@ -57,6 +57,19 @@ def occupied_samples(rays: Rays, along: March) -> tuple[Tensor, Tensor, Tensor, 
     return starts, ends, coordinates, offsets
 
 
+def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
+    """Raise each cell of a grid over the unit cube to the largest of the values that lie in it; NaN counts for none.
+
+    Args:
+        cells: (C, C, C), indexed [z, y, x]; changed in place.
+        coordinates: (N, 3) in the unit cube.
+        values: (N,).
+    """
+    side = len(cells)
+    x, y, z = (coordinates * side).long().clamp(0, side - 1).unbind(-1)
+    cells.view(-1).scatter_reduce_(0, (z * side + y) * side + x, values.nan_to_num(-torch.inf), "amax")
+
+
 @torch.no_grad()
 def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
     """Return the samples of `march` in front of which the optical depth is below a limit, with their encoding.

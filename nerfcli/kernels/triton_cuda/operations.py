@@ -3,7 +3,7 @@
 from torch import Tensor
 
 from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
-from nerfcli.kernels.reference import mixture_quantile
+from nerfcli.kernels.reference import keep_largest, mixture_quantile
 from nerfcli.kernels.triton_cuda import marching, row_adam
 from nerfcli.kernels.triton_cuda.compositing import composite, distortion, interval_weights, optical_depth_before
 from nerfcli.kernels.triton_cuda.depth import light_ends
@@ -18,6 +18,7 @@ __all__ = [
     "distortion",
     "hash_encode",
     "interval_weights",
+    "keep_largest",
     "light_ends",
     "mixture_quantile",
     "occupied_samples",

@@ -11,7 +11,7 @@ from pathlib import Path
 import pycolmap
 
 from nerfcli.poses.engine.mapped import COMPONENTS, FIRST, Mapped, mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.second_chance import is_contradicted, second_chance
+from nerfcli.poses.engine.second_chance import Chance, grow, is_contradicted, second_chance
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.stages import read_stage, write_stage
 from nerfcli.poses.judge.checks import Checks
@@ -62,13 +62,15 @@ def choose_component(
 def _largest(mapped: Mapped, report: Report, tell: Tell, *, checks: Callable[[], Checks]) -> Chosen:
     known = _numbered(mapped) or mapped
     examined = examine(known.models[:1], known.job, report, localised=known.localised, checks=checks())
-    if not is_contradicted(examined.verdict):
-        if known is mapped:
+    if is_contradicted(examined.verdict):
+        chance = second_chance(mapped, examined, report, tell, checks=checks)
+    elif examined.verdict.accepted and known is mapped:
+        chance = grow(mapped, examined, report, tell, checks=checks)
+    else:
+        chance = Chance(known, examined)
+    if chance.examined is examined or not chance.examined.verdict.accepted:
+        if known is mapped or chance.mapped is not known:
             _keep_numbers(mapped.job, FIRST)
-        return Chosen(known, examined)
-    chance = second_chance(mapped, examined, report, tell, checks=checks)
-    if not chance.examined.verdict.accepted:
-        _keep_numbers(mapped.job, FIRST)
         return Chosen(chance.mapped, chance.examined)
     first, *found = chance.mapped.models
     numbered = replace(chance.mapped, models=[first, *_with_photos_of_their_own(first, [*found, *mapped.models[1:]])])

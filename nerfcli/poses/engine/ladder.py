@@ -5,6 +5,7 @@ for more matches and more features.
 """
 
 import math
+import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -18,7 +19,7 @@ from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.initial_focal import with_focal_lengths
 from nerfcli.poses.engine.mapped import Mapped
-from nerfcli.poses.engine.mapping import MapperOptions, map_photos
+from nerfcli.poses.engine.mapping import MapperOptions, limit_seconds, map_photos
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import duration, extraction_seconds, mapping_seconds, matching_seconds
@@ -45,6 +46,8 @@ _MOST_FULL_SIZE = 150
 _MORE_FEATURES = 8192
 # Searching larger pictures may take so many times as long as the first search, times the share of photos missing.
 _MOST_FOR_MORE = 5.0
+# A focal length that differs from EXIF's by more than this factor (its logarithm) is reported.
+_FAR_FROM_EXIF = 0.1
 # A perspective lens from here on may be a fisheye.
 _WIDE_DEG = 100.0
 # Each takes some seconds; where more are missing, it is not single photos that are.
@@ -87,7 +90,10 @@ class _Ladder:
         if self.rungs:
             self.announce(what)
         number = len(self.rungs)
+        began = time.perf_counter()
         models = map_photos(job, self._report, attempt=number, start=start)
+        if time.perf_counter() - began > limit_seconds(self._photos):
+            self._tell(f"{what}: stopped after {duration(limit_seconds(self._photos))}, longer than most captures take")
         self._take(what, models, job)
         if len(models) > 1:
             output = Path(job.folder) / f"merged_{number}"
@@ -138,7 +144,7 @@ class _Ladder:
         if not 0 < len(left) <= _MOST_SINGLE_PHOTOS:
             return
         self.announce(what)
-        grown, attempts = localise(models[0], job, image_ids=left)
+        grown, attempts = localise(models[0], job, image_ids=left, report=self._report)
         placed = tuple(attempt.image_id for attempt in attempts if not attempt.refused)
         names = dict(zip(job.image_ids, job.names, strict=True))
         found = [{"name": names[one.image_id], **asdict(one)} for one in attempts]
@@ -171,7 +177,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     `localise`). Where the camera only turned, nothing more is tried. If the first attempt is not the last, `tell`
     receives each attempt and its result.
     """
-    job = with_focal_lengths(job, tell)
+    job = given = with_focal_lengths(job, tell)
     ladder = _Ladder(job, report, tell)
     ladder.attempt("default thresholds", job, MapperOptions())
     featured = sum(photo["features"] >= FEW_FEATURES for photo in evidence(job))
@@ -193,7 +199,23 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     ladder.find_left_out("remaining photos one by one, from the 3D points they see")
     if len(ladder.rungs) > 1:
         ladder.tell_results()
+    _tell_of_exif(given, ladder.best, tell)
     return replace(ladder.best, attempts=ladder.rungs)
+
+
+def _tell_of_exif(given: Job, best: Mapped, tell: Tell) -> None:
+    """Say where the focal length of the result is not EXIF's, which was set aside: where the camera moves straight
+    ahead, the photos determine it poorly.
+    """
+    for number, (group, used) in enumerate(zip(given.groups, best.job.groups, strict=True), start=1):
+        if group.focal_px is None or used.focal_px is not None or not best.models:
+            continue
+        found_px = best.models[0].camera(number).mean_focal_length()
+        if abs(math.log(found_px / group.focal_px)) > _FAR_FROM_EXIF:
+            tell(
+                f"EXIF's focal length ({group.focal_px:.0f} px) was not used, since few photos registered with it; the "
+                f"photos give {found_px:.0f} px: if EXIF is right, give --intrinsics"
+            )
 
 
 def _only_turns(job: Job) -> bool:

@@ -12,8 +12,12 @@ import pycolmap
 
 from nerfcli.poses.engine.mapped import file_keys, mapping_key, read_models, write_models
 from nerfcli.poses.input.job import Job, Report
+from nerfcli.poses.input.plan import mapping_seconds
 from nerfcli.poses.input.stages import file_key, stage_key
 from nerfcli.poses.model.reasons import FEW_MATCHES
+
+# So many times the planned seconds, or the least: most captures take a third of these to twice, on a busy machine more.
+_MOST_TIMES_PLANNED, _LEAST_LIMIT_SECONDS = 10, 120
 
 
 @dataclass(frozen=True)
@@ -106,12 +110,19 @@ def map_photos(
         base.write(str(base_folder))
     key = stage_key(mapping_key(job), attempt, asdict(start), base is not None and file_keys(base_folder))
     if (found := read_models(output, key)) is None:
-        models = _run_mapper(job, report, _options(job, attempt=attempt, start=start), base and base_folder)
+        placed = 0 if base is None else base.num_reg_images()
+        options = _options(job, attempt=attempt, start=start)
+        models = _run_mapper(job, report, options, base and base_folder, placed=placed)
         write_models(output, models, key)
         found = read_models(output, key)
     if found is None:
         raise OSError(f"cannot read back the models in {output}")
     return found[0]
+
+
+def limit_seconds(photos: int) -> int:
+    """Return after how many seconds one run of the mapper ends, with the photos that are placed by then."""
+    return max(round(_MOST_TIMES_PLANNED * mapping_seconds(photos)), _LEAST_LIMIT_SECONDS)
 
 
 def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
@@ -147,24 +158,31 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
     options.mapper.init_max_forward_motion = start.init_max_forward_motion
     options.mapper.filter_min_tri_angle = start.filter_min_tri_angle
     options.mapper.abs_pose_min_num_inliers = FEW_MATCHES
+    options.max_runtime_seconds = limit_seconds(len(job.files))
     if start.init_pair:
         options.init_image_id1, options.init_image_id2 = start.init_pair
+        options.init_num_trials = 1  # every trial would begin with this pair
     return options
 
 
 def _run_mapper(
-    job: Job, report: Report, options: pycolmap.IncrementalPipelineOptions, base_folder: Path | None
+    job: Job, report: Report, options: pycolmap.IncrementalPipelineOptions, base_folder: Path | None, *, placed: int
 ) -> list[pycolmap.Reconstruction]:
-    placed = most = 0
+    beginnings = iter([placed] if placed else [])  # of a given model; each other one begins with two photos
+    most = 0
 
     def started() -> None:
         nonlocal placed
-        placed = 1
-        placed_one()
+        placed = next(beginnings, 2)
+        tell()
 
     def placed_one() -> None:
-        nonlocal placed, most
+        nonlocal placed
         placed += 1
+        tell()
+
+    def tell() -> None:
+        nonlocal most
         # Of the largest model so far: another one begins with two photos again, of the few that are left.
         most = max(most, min(placed, len(job.files)))
         report("map", most, len(job.files))

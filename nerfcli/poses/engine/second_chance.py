@@ -24,6 +24,7 @@ from nerfcli.poses.input.stages import stage_key
 from nerfcli.poses.judge.acceptance import MIN_MATCHES, Verdict
 from nerfcli.poses.judge.checks import Checks
 from nerfcli.poses.judge.examine import Examined, examine
+from nerfcli.poses.judge.parallax import NO_PARALLAX_PX
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.two_views import agreements, read_verified_pairs
 from nerfcli.poses.model.view_graph import consistent_groups
@@ -37,6 +38,8 @@ _NEAR_IN_ORDER = 10
 _ALL_AT_ONCE = "all photos at once (global mapper)"
 # All hypotheses together may take so many times as long as the first mapping.
 _MOST_TIME = 2.0
+# Photos in smaller models, as a share of those in the accepted one, for which these are placed from it.
+_LEAST_APART = 0.05
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,8 @@ def second_chance(
     start = time.perf_counter()
     pairs = first.verdict.measures["pairs"]
     against = f"{pairs['contradicting']} of {pairs['judged']} pairs of photos contradict the poses"
+    if not pairs["contradicting"]:
+        against = first.verdict.failures[0].evidence
     which = "" if component == 1 else f" the photos of component {component}"
     scratch = mapped.seconds
     most = _MOST_TIME * scratch
@@ -125,6 +130,69 @@ def second_chance(
     return Chance(replace(mapped, attempts=attempts), first)
 
 
+def grow(
+    mapped: Mapped,
+    first: Examined,
+    report: Report,
+    tell: Tell,
+    *,
+    checks: Callable[[], Checks],
+) -> Chance:
+    """Place the photos of smaller models from an accepted model, where these are many and match its photos.
+
+    The mapper gives up a part of a capture where a few photos fail in a row, and begins another model there; from the
+    adjusted model, with its lens, they often fit.
+
+    Args:
+        mapped, report, tell, checks: see `second_chance`.
+        first: the accepted model; there may be none.
+
+    Returns:
+        A larger accepted model, or what was given.
+    """
+    given = Chance(mapped, first)
+    model = first.model
+    if model is None:  # no photo was placed at all
+        return given
+    placed = set(model.reg_image_ids())
+    apart = {photo for other in mapped.models[1:] for photo in other.reg_image_ids()} - placed
+    if len(apart) < _LEAST_APART * len(placed) or not _match(placed, apart, mapped.job):
+        return given
+    what = "from the accepted model"
+    takes = mapped.seconds * len(apart) / (len(placed) + len(apart))
+    tell(f"{len(apart)} photos are in smaller models, next: {what} (about {duration(takes)})")
+
+    def make() -> Mapped:
+        base = _Core(pycolmap.Reconstruction(model), frozenset())
+        return _mapped_without(mapped, base, report, attempt=_FIRST_ATTEMPT, base=base.model)
+
+    runner = checks()
+    found = runner.run(what, partial(_kept, mapped.job, "grown", make), otherwise=None)
+    if found is None or not found.models:
+        tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
+        return given
+    if found.models[0].num_reg_images() <= len(placed):
+        tell(f"{what}: no further photo registered")
+        return given
+    examined = examine(found.models[:1], found.job, report, checks=runner)
+    size = 0 if examined.model is None else examined.model.num_reg_images()
+    verdict = "accepted" if examined.verdict.accepted else examined.verdict.failures[0].kind
+    tell(f"{what}: {size} of {len(mapped.job.files)} photos registered, {verdict}")
+    attempts = [*mapped.attempts, {"what": what, "models": [size, *(m.num_reg_images() for m in found.models[1:])]}]
+    if not examined.verdict.accepted or size <= len(placed):
+        return Chance(replace(mapped, attempts=attempts), first)
+    return Chance(replace(found, attempts=attempts), examined)
+
+
+def _match(some: set[int], others: set[int], job: Job) -> bool:
+    """Return whether photos, by image id, match some of others."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        pairs = read_verified_pairs(database, min_matches=MIN_MATCHES)
+    return any(
+        (pair.one in some and pair.other in others) or (pair.one in others and pair.other in some) for pair in pairs
+    )
+
+
 def _job_of(model: pycolmap.Reconstruction, job: Job) -> Job:
     """Return the job without the pairs of photos that the model does not place."""
     photos = set(photo_numbers(model, job))
@@ -132,7 +200,13 @@ def _job_of(model: pycolmap.Reconstruction, job: Job) -> Job:
 
 
 def is_contradicted(verdict: Verdict) -> bool:
-    """Return whether pairs of photos contradict the model, rather than the capture as a whole."""
+    """Return whether pairs of photos contradict the model, rather than the capture as a whole.
+
+    Of a camera that only turned, no model can be right.
+    """
+    parallax = verdict.measures["parallax_px"]
+    if parallax is not None and parallax < NO_PARALLAX_PX:
+        return False
     kinds = [failure.kind for failure in verdict.failures]
     return any("contradict" in kind or "look alike" in kind for kind in kinds)
 
@@ -194,6 +268,8 @@ def _mapped_without(
     mapped: Mapped, core: _Core, report: Report, *, attempt: int, base: pycolmap.Reconstruction | None
 ) -> Mapped:
     job = _with_own_database(mapped.job, without=core.suspects)
+    if base is not None:
+        _set_cameras(job, base)
     start = MapperOptions() if base is not None else SMALLER_BASELINE
     models = map_photos(job, report, attempt=attempt, start=start, base=base)
     job.database.unlink()
@@ -203,13 +279,19 @@ def _mapped_without(
 def _all_at_once(mapped: Mapped, core: _Core) -> Mapped | None:
     """Rotations, then positions, of all photos together; with the intrinsics of the core."""
     job = _with_own_database(mapped.job, without=frozenset())
-    with closing(pycolmap.Database.open(str(job.database))) as database:
-        for camera in core.model.cameras.values():
-            camera.has_prior_focal_length = True
-            database.update_camera(camera)
+    for camera in core.model.cameras.values():
+        camera.has_prior_focal_length = True
+    _set_cameras(job, core.model)
     models = map_globally(job)
     job.database.unlink()
     return Mapped(models, mapped.job, mapped.attempts)
+
+
+def _set_cameras(job: Job, model: pycolmap.Reconstruction) -> None:
+    """Write a model's cameras into the job's database: the mapper goes on only from a model with the same lenses."""
+    with closing(pycolmap.Database.open(str(job.database))) as database:
+        for camera in model.cameras.values():
+            database.update_camera(camera)
 
 
 def _with_own_database(job: Job, *, without: frozenset[tuple[int, int]]) -> Job:

@@ -25,6 +25,7 @@ _STAGES = {
     "match": "matching photos",
     "map": "placing photos",
     "merge": "merging sub-models",
+    "locate": "locating single photos",
     "check": "checking the poses",
 }
 _GO_ON = "completed work is kept; run the same command again to continue"

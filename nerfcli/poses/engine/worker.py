@@ -23,7 +23,7 @@ import pycolmap
 from nerfcli.child import take_stdout
 from nerfcli.finite import finite
 from nerfcli.poses.engine.chosen import choose_component
-from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images
+from nerfcli.poses.engine.database import discard_if_damaged, evidence, name_images, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
@@ -152,6 +152,7 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
     mapped = read_mapped(job, key)
     if mapped is not None:
         tell("the photos are already mapped: running the checks")
+        register_photos(mapped.job)  # a complete call has given the images the photos' own names
         return mapped
     with _timed(seconds, "extract"):
         extract(job, report)

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,7 @@ class Job:
         """pycolmap's database of features and matches; it stays beside the model."""
         return database_path(Path(self.folder), self.rung)
 
-    @property
+    @cached_property
     def image_ids(self) -> tuple[int, ...]:
         """The photos' ids in the database, by number; pycolmap's ids start at 1."""
         return tuple(int(Path(file).stem) + 1 for file in self.files)

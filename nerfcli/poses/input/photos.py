@@ -9,6 +9,7 @@ from pathlib import Path
 from nerfcli.errors import TOO_FEW_PHOTOS, UserError
 from nerfcli.media.focal_evidence import focal_evidence
 from nerfcli.media.images import IMAGE_SUFFIXES, Exif, list_images, read_exif, read_image
+from nerfcli.media.unsupported_photos import unsupported_photos
 
 # Three views fix a scene up to scale, but nothing then checks any of them; four are the least that do.
 MIN_PHOTOS = 4
@@ -55,12 +56,12 @@ def find_photos(folder: Path, progress: Callable[[int, int], None] | None = None
     if not folder.exists():
         raise UserError(f"the folder {folder} does not exist", "give a folder of photos, or a video file")
     if not folder.is_dir():
-        raise UserError(f"{folder} is a file, not a folder", "put the photos into a folder and give that folder")
-    paths = list_images(folder)
-    if not paths:
+        raise UserError(f"{folder} is a file, not a folder of photos", "give the folder that contains the photos")
+    paths, unsupported = list_images(folder), unsupported_photos(folder)
+    if not paths and not unsupported:
         raise UserError(f"no photos in {folder}", _where_photos_may_be(folder))
     photos: list[Photo] = []
-    unreadable: dict[str, str] = {}
+    unreadable = {path.name: f"{path.suffix} files are not supported; convert them to JPEG" for path in unsupported}
     with ThreadPoolExecutor(_READERS) as readers:
         for index, found in enumerate(readers.map(_examine, paths)):
             if isinstance(found, Photo):
@@ -119,14 +120,16 @@ def _too_few(folder: Path, photos: list[Photo], unreadable: dict[str, str]) -> s
     if not unreadable:
         return f"{folder} has only {total} photo{'s' if total > 1 else ''}; at least {MIN_PHOTOS} are needed"
     name, reason = next(iter(unreadable.items()))
-    readable = f"only {len(photos)} of {total} photos in {folder} can be read; at least {MIN_PHOTOS} are needed"
+    few = f"only {len(photos)}" if photos else "none"
+    readable = f"{few} of {total} photos in {folder} can be read; at least {MIN_PHOTOS} are needed"
     return f"{readable} ({name}: {reason})"
 
 
 def _more_photos_hint(unreadable: dict[str, str]) -> str:
+    add = "20 or more that overlap by two thirds work well"
     if unreadable:
-        return "copy the damaged files again, or add photos; 20 or more that overlap by two thirds work well"
-    return "add photos from other viewpoints; 20 or more that overlap by two thirds work well"
+        return f"convert these files to JPEG or copy them again, or add photos; {add}"
+    return f"add photos from other viewpoints; {add}"
 
 
 def _where_photos_may_be(folder: Path) -> str:

@@ -25,11 +25,16 @@ _FEATURES_PER_PIXEL = 0.015
 _MAP_SECONDS_PER_PHOTO, _MAP_SECONDS_PER_TWO = 0.38, 0.0005
 # Of mapping, what merging its sub-models takes.
 _MERGE_SHARE = 0.2
+# Of a photo that is located by 3D points.
+_SECONDS_PER_LOCATED = 0.7
 # Of the global mapper.
 _AT_ONCE_SECONDS_PER_PHOTO = 0.5
 _CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
 # How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
 _GROWTH = {"map": 1.3}
+# Memory: of the libraries and of each photo in the mapper, and of a pixel that a thread searches in enlarged pictures.
+# Fitted to 50 photos of 270x480 (0.60 GB), 18 of 4000x2250 on one thread and on two (0.67, 0.77), and 1,000 (2.0).
+_BYTES, _BYTES_PER_PHOTO, _BYTES_PER_PIXEL = 500_000_000, 1_500_000, 70
 # Of a stage, the share after which its speed says something; what one sub-model took says nothing of the next.
 _TELLING, _TELLING_OF_MERGE = 0.05, 1.0
 
@@ -37,7 +42,7 @@ _TELLING, _TELLING_OF_MERGE = 0.05, 1.0
 @dataclass(frozen=True)
 class Plan:
     """photos: how many. rule and pairs: see `Pairing`; pairs is the most that may come of it. seconds: per stage, where
-    a photo has `features`.
+    a photo has `features`. memory_bytes: of the process that does the work, at its peak.
     """
 
     photos: int
@@ -47,6 +52,7 @@ class Plan:
     pairs: int
     seconds: dict[str, float]
     features: int = _FEATURES_PER_PAIR
+    memory_bytes: int = 0
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -56,7 +62,8 @@ class Plan:
         """Return one sentence."""
         times = ", ".join(f"{_WORDS[stage]} {duration(seconds)}" for stage, seconds in self.seconds.items())
         about = f"about {duration(sum(self.seconds.values()))}"
-        return f"{self.photos} photos, {self.pairs} pairs to match ({self.rule}), {about}: {times}"
+        memory = f"{self.memory_bytes / 1e9:.1f} GB of memory"
+        return f"{self.photos} photos, {self.pairs} pairs to match ({self.rule}), {about}: {times}; {memory}"
 
 
 # In the order of the work.
@@ -69,8 +76,8 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
     all_pairs = count * (count - 1) // 2
     pairs = min(len(pairing.pairs) + pairing.neighbours * count, all_pairs)
     sizes = [(photo.width, photo.height) for photo in photos.photos]
-    searched = sum(_searched_pixels(sizes, max_image_size=settings.max_image_size))
-    features = min(settings.max_features, round(_FEATURES_PER_PIXEL * searched / max(count, 1)))
+    searched = _searched_pixels(sizes, max_image_size=settings.max_image_size)
+    features = min(settings.max_features, round(_FEATURES_PER_PIXEL * sum(searched) / max(count, 1)))
     seconds = {
         "extract": extraction_seconds(sizes, max_image_size=settings.max_image_size) / threads,
         "pair": looking_seconds(count) / threads if pairing.neighbours else 0.0,
@@ -86,6 +93,7 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
         pairs=pairs,
         seconds={stage: round(value, 1) for stage, value in seconds.items() if value > 0},
         features=features,
+        memory_bytes=round(_BYTES + count * _BYTES_PER_PHOTO + threads * max(searched, default=0.0) * _BYTES_PER_PIXEL),
     )
 
 
@@ -125,8 +133,8 @@ class Outlook:
     later stages by the least that any stage was. The machine slows all of them, whereas what makes one of them slow is
     its own (matches of shiny things, poses of a dense walk). Work that an earlier call has done counts for nothing.
     Which photos are enlarged to find more features in them is known only after the first search, how many features
-    the matcher compares after the second, and whether there are sub-models to merge after mapping; where that adds
-    work, the share that is done stands still until it is true again.
+    the matcher compares after the second, and whether there are sub-models to merge or single photos to locate after
+    mapping; where that adds work, the share that is done stands still until it is true again.
 
     Args:
         plan: for the stages that have not begun.
@@ -156,7 +164,9 @@ class Outlook:
         if stage == "enlarge":
             self._plan_enlarging(total)
         if stage == "merge":
-            self._plan_merging()
+            self._plan_before_checks(stage, _MERGE_SHARE * self._plan.seconds.get("map", 0.0))
+        if stage == "locate":
+            self._plan_before_checks(stage, _SECONDS_PER_LOCATED * total)
         ratio = (done / total) ** _GROWTH.get(stage, 1.0) if total else 1.0
         if self._begins_again(stage, ratio):
             self._share = 0.0
@@ -204,11 +214,10 @@ class Outlook:
         later = {stage: seconds for stage, seconds in self._plan.seconds.items() if stage != "extract"}
         self._seconds = {"extract": extract, "enlarge": enlarge, **later}
 
-    def _plan_merging(self) -> None:
-        """Put the merger of sub-models before the checks."""
-        before = {stage: seconds for stage, seconds in self._seconds.items() if stage not in ("merge", "check")}
-        merge = _MERGE_SHARE * self._plan.seconds.get("map", 0.0)
-        self._seconds = {**before, "merge": merge, "check": self._plan.seconds.get("check", 0.0)}
+    def _plan_before_checks(self, stage: str, seconds: float) -> None:
+        """Put a stage that no plan foresees before the checks."""
+        before = {name: planned for name, planned in self._seconds.items() if name not in (stage, "check")}
+        self._seconds = {**before, stage: seconds, "check": self._plan.seconds.get("check", 0.0)}
 
 
 def _telling(stage: str) -> float:

@@ -83,6 +83,7 @@ def judge(
     names: Mapping[str, str],
     seed: int,
     threads: int,
+    held: Sequence[VerifiedPair] = (),
     given: Collection[int] = (),
     fixed: Sequence[int] = (),
     checks: Checks | None = None,
@@ -98,6 +99,7 @@ def judge(
         names: what the user calls each photo of the model.
         seed: of random draws.
         threads: of the adjustment, -1 for all.
+        held: what holds photos that were placed by points of the model, see `localise.shared_pairs`.
         given: ids of cameras whose intrinsics were known beforehand, whatever focal length they have.
         fixed: ids of cameras whose intrinsics stay as they are.
         checks: runs the checks.
@@ -109,13 +111,13 @@ def judge(
         "rotations of pairs", lambda: rotation_errors(model, pairs, seed=seed), otherwise=nothing
     )
     contradictions: list[Contradiction] = run(
-        "contradictions", lambda: strong_contradictions(model, found), otherwise=nothing
+        "contradictions", lambda: strong_contradictions(model, [*found, *agreements(model, held)]), otherwise=nothing
     )
     total = sum(a.matches for a in found)
     share = sum(c.matches for c in contradictions) / total if total else 0.0
     geometry = run("geometry of points and cameras", lambda: _geometry(model), otherwise=_UNKNOWN_GEOMETRY)
     focal = [_focal_measure(camera) for camera in _cameras_in_use(model)]
-    held = run(
+    unused = run(
         "unused observations",
         lambda: _held_out_measure(model, seed=seed, threads=threads, fixed=fixed),
         otherwise=_UNKNOWN_HELD_OUT,
@@ -128,7 +130,7 @@ def judge(
         "parallax_px": None if turn is None else turn.parallax_px,
         **geometry,
         "focal_over_longer_side": focal,
-        "held_out": held,
+        "held_out": unused,
         "observations_per_photo": _observation_measure(model),
     }
     failures = [

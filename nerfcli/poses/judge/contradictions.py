@@ -19,6 +19,8 @@ _RIVAL_OF_EQUALS = 2.0
 # Share of the photos that may be left out because they contradict the others, which then still are a whole.
 _MOST_LEFT_OUT = 0.2
 _FARTHEST = 10.0
+# A pair whose rays meet at a smaller angle, in the median, says little about how far away its cameras are.
+_LEAST_ANGLE_DEG = 2.0
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def leave_out_contradicting(
     found = agreements(model, pairs)
     placed = sorted(model.reg_image_ids())
     contradicting = [c for c in strong_contradictions(model, found) if c.outweighs]
-    far = _far_away(model)
+    far = {photo: reason for photo, reason in _far_away(model).items() if not _is_held(photo, found)}
     if not contradicting and not far:
         return model, {}
     sound = _spanning_tree(placed, found)
@@ -104,6 +106,13 @@ def _spanning_tree(placed: Sequence[int], found: Sequence[Agreement]) -> list[Ag
             for photo in joined:
                 chains[photo] = joined
     return taken
+
+
+def _is_held(photo: int, found: Sequence[Agreement]) -> bool:
+    """Return whether more matches of a photo determine its place than contradict it."""
+    own = [a for a in found if photo in (a.one, a.other)]
+    supporting = sum(a.matches for a in own if not a.contradicts and a.angle_deg > _LEAST_ANGLE_DEG)
+    return supporting > sum(a.matches for a in own if a.contradicts)
 
 
 def _far_away(model: pycolmap.Reconstruction) -> dict[int, str]:

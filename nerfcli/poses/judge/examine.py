@@ -18,7 +18,7 @@ from nerfcli.poses.judge.uncertainty import pose_blur_px
 from nerfcli.poses.model.intrinsics import Lenses, choose_lenses
 from nerfcli.poses.model.localise import shared_pairs
 from nerfcli.poses.model.reasons import FEW_MATCHES
-from nerfcli.poses.model.two_views import read_verified_pairs
+from nerfcli.poses.model.two_views import VerifiedPair, read_verified_pairs
 
 # From here on the covariance of all poses together takes minutes.
 _MOST_PHOTOS_FOR_BLUR = 500
@@ -72,12 +72,15 @@ def examine(
     numbers = {image_id: number for number, image_id in enumerate(job.image_ids)}
     report("check", 0, 4)
     mapped = with_pose_only(models[0])
-
-    def without_contradicting() -> tuple[pycolmap.Reconstruction, dict[int, str]]:
-        held = shared_pairs(mapped, localised, min_matches=MIN_MATCHES)
-        return leave_out_contradicting(mapped, [*pairs, *held])
-
-    model, left_out = checks.run("contradicting photos", without_contradicting, otherwise=(mapped, {}))
+    nothing: list[VerifiedPair] = []
+    held = checks.run(
+        "points of single photos",
+        lambda: shared_pairs(mapped, localised, min_matches=MIN_MATCHES),
+        otherwise=nothing,
+    )
+    model, left_out = checks.run(
+        "contradicting photos", lambda: leave_out_contradicting(mapped, [*pairs, *held]), otherwise=(mapped, {})
+    )
     report("check", 1, 4)
     lenses = checks.run("lens models", lambda: _with_lenses(model, job), otherwise=Lenses(model, [], {}))
     model = lenses.model
@@ -86,6 +89,7 @@ def examine(
     verdict = judge(
         model,
         pairs,
+        held=held,
         turn=turn,
         names=dict(zip(job.files, job.names, strict=True)),
         seed=job.seed,

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from nerfcli.poses.input.job import usual_focal_px
 from nerfcli.poses.model.lens_evidence import (
@@ -178,14 +178,14 @@ def _relative_distance(
         return 0.0
     if group == _PRINCIPAL_POINT and not is_centred(_camera(camera, found, named=True)):
         return 0.0
-    return found.distance(group) / float(chi2.isf(_CHANCE, len(group)))
+    return found.distance(group) / float(chdtri(len(group), _CHANCE))
 
 
 def _with_or_without_distortion(
     evidence: LensEvidence, free: list[str], found: Estimate, camera: pycolmap.Camera, steps: list[Step]
 ) -> tuple[list[str], Estimate]:
     """Return the free parameters without k1, if it is neither sure nor harmless."""
-    distance = found.distance(["k1"]) / float(chi2.isf(_CHANCE, 1))
+    distance = found.distance(["k1"]) / float(chdtri(1, _CHANCE))
     if _is_harmless(evidence, found, camera) or distance > 1:
         return free, found
     free = [name for name in free if name != "k1"]
@@ -230,7 +230,7 @@ def has_open_distortion(
         found = evidence.estimate(["k1"])
     except (UndeterminedError, np.linalg.LinAlgError):
         return True
-    return not _is_harmless(evidence, found, camera) and found.distance(["k1"]) <= float(chi2.isf(_CHANCE, 1))
+    return not _is_harmless(evidence, found, camera) and found.distance(["k1"]) <= float(chdtri(1, _CHANCE))
 
 
 def _is_harmless(evidence: LensEvidence, found: Estimate, camera: pycolmap.Camera) -> bool:

@@ -78,6 +78,7 @@ def adjust(
     focal_lengths: bool = True,
     fixed: Sequence[int] = (),
     robust_px: float | None = None,
+    tolerance: float = 1e-9,
 ) -> pycolmap.CeresBundleAdjuster:
     """Bundle adjustment of a whole model, in place, until it no longer moves; the adjuster, for the covariance.
 
@@ -88,21 +89,21 @@ def adjust(
         focal_lengths: whether they are adjusted too.
         fixed: camera ids whose intrinsics stay as they are.
         robust_px: where observations begin to count less (Cauchy's loss); None: all count by their square.
+        tolerance: the relative change of the cost, in one iteration, at which it ends. By default that is the very end:
+            of two models that are compared, the one that was adjusted longer must not look better for that.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_principal_point = principal_points
     options.refine_focal_length = focal_lengths
     options.ceres.solver_options.num_threads = threads
-    # To the end: of two models that are compared, the one that was adjusted longer must not look better for that.
     options.ceres.solver_options.max_num_iterations = 200
-    options.ceres.solver_options.function_tolerance = 1e-9
+    options.ceres.solver_options.function_tolerance = tolerance
     if robust_px is not None:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = robust_px
-        # It creeps towards its end for a hundred steps that change nothing any more.
+        # It creeps towards its end for hundreds of steps that change nothing any more.
         options.ceres.solver_options.max_num_iterations = 40
-        options.ceres.solver_options.function_tolerance = 1e-6
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         config.add_image(image_id)

@@ -8,6 +8,7 @@ larger than its own uncertainty; the principal point is freed by the same measur
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,9 @@ _LEAST_PHOTOS = 3
 _MOST_DESCRIBED = 8
 # As in pycolmap's mapper.
 _LEAST_ANGLE_DEG = 1.5
+# Where the two adjustments of `settle` end. Measured on 261 frames of a walk: the robust one ends after 19 iterations
+# instead of 328, with cameras within 4e-5 of the radius of where these would take them; at 1e-4 it is 1.3e-4.
+_TOLERANCE, _ROBUST_TOLERANCE = 1e-6, 1e-5
 _FIT_GRID = 15
 
 
@@ -242,10 +246,11 @@ def settle(
     The last adjustment is robust: highlights and things that move are seldom far enough off to be dropped, and are
     wrong in the same way in many photos; counted by their square, they would pull the lens.
     """
-    held_out.adjust(model, threads=threads, principal_points=principal_points, fixed=fixed)
+    adjust = partial(held_out.adjust, model, threads=threads, principal_points=principal_points, fixed=fixed)
+    adjust(tolerance=_TOLERANCE)
     pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
     scale_px = held_out.loss_scale_px(held_out.observation_errors_px(model))
-    held_out.adjust(model, threads=threads, principal_points=principal_points, fixed=fixed, robust_px=scale_px)
+    adjust(robust_px=scale_px, tolerance=_ROBUST_TOLERANCE)
     pycolmap.ObservationManager(model).filter_all_points3D(_CLIP_PX, _LEAST_ANGLE_DEG)
     model.update_point_3d_errors()
 

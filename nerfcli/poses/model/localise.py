@@ -17,7 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from nerfcli.poses.input.job import Job
+from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
@@ -106,13 +106,23 @@ class _Placed:
 
 
 def localise(
-    model: pycolmap.Reconstruction, job: Job, *, image_ids: Sequence[int]
+    model: pycolmap.Reconstruction,
+    job: Job,
+    *,
+    image_ids: Sequence[int],
+    report: Report = lambda stage, done, total: None,
 ) -> tuple[pycolmap.Reconstruction, list[Attempt]]:
     """Return a copy of the model with those of the photos placed that its points tell the place of,
     adjusted; what was tried.
 
     Photos that a placed one makes possible are tried again, so that a chain of them is followed. One whose own matches
     with other photos, however few, contradict its place is not kept.
+
+    Args:
+        model: with points; it is not changed.
+        job: whose features and matches are used.
+        image_ids: of the photos to place.
+        report: called with ("locate", done, total), in trials, of which each photo may have several.
     """
     grown = pycolmap.Reconstruction(model)
     if model.num_points3D() < _LEAST_FOUND:
@@ -121,10 +131,12 @@ def localise(
     left = sorted(image_ids)
     files = dict(zip(job.image_ids, job.files, strict=True))
     with closing(pycolmap.Database.open(str(job.database))) as database:
-        for _ in range(_ROUNDS):
+        total = _ROUNDS * len(left)
+        for turn in range(_ROUNDS):
             known = _known(grown, database)
             placed_now = []
-            for image_id in left:
+            for number, image_id in enumerate(left):
+                report("locate", turn * len(image_ids) + number, total)
                 photo = _photo(grown, database, image_id)
                 if photo is None:
                     attempts[image_id] = Attempt(image_id, refused="its camera is unknown")
@@ -136,6 +148,7 @@ def localise(
             left = [image_id for image_id in left if image_id not in placed_now]
             if not left or not placed_now:
                 break
+        report("locate", total, total)
         pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
     if any(not attempt.refused for attempt in attempts.values()):
         settle(grown, threads=job.threads, fixed=job.fixed_cameras)
@@ -309,12 +322,12 @@ def _expected(
     pixels[before] = np.asarray(photo.camera.img_from_cam(local[before]), dtype=np.float64).reshape(-1, 2)
     pixels += photo.tolerance_px * beside
     with np.errstate(invalid="ignore"):
-        seen = np.all((pixels >= 0) & (pixels < (photo.camera.width, photo.camera.height)), axis=1)
-    pixels[~seen] = -1e6  # where no feature is
-    near = KDTree(photo.pixels).query_ball_point(pixels, within * photo.tolerance_px)
-    counts = np.array([len(features) for features in near])[known.of]
-    looks = np.repeat(np.arange(len(known.of)), counts)
-    features = np.array([feature for point in known.of for feature in near[point]], dtype=np.int64)
+        seen = np.flatnonzero(np.all((pixels >= 0) & (pixels < (photo.camera.width, photo.camera.height)), axis=1))
+    found = KDTree(photo.pixels).query_ball_point(pixels[seen], within * photo.tolerance_px)
+    near = {int(point): features for point, features in zip(seen, found, strict=True) if features}
+    looks = np.flatnonzero(np.isin(known.of, np.array(list(near), dtype=np.int64)))
+    features = np.array([feature for point in known.of[looks] for feature in near[int(point)]], dtype=np.int64)
+    looks = np.repeat(looks, np.array([len(near[int(point)]) for point in known.of[looks]], dtype=np.int64))
     distances = np.empty(len(features))
     for start in range(0, len(features), _BLOCK * 64):
         rows = slice(start, start + _BLOCK * 64)

@@ -36,7 +36,7 @@ def reason(evidence: Evidence) -> str:
 
 
 _ADVICE = {
-    "unreadable": "copy the damaged files again",
+    "unreadable": "convert the files to JPEG or copy them again",
     "too few features": "take sharper photos of a textured scene",
     "matches no other photo well": "take photos with more overlap, two thirds from one to the next",
     "in another model": "take photos that connect the parts of the scene",

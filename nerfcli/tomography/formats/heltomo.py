@@ -70,15 +70,6 @@ def read_heltomo(path: Path, given: Given = Given()) -> Scan:
     )
 
 
-def is_heltomo(path: Path) -> bool:
-    """Return whether a .mat file holds such a struct."""
-    try:
-        _struct(path)
-    except UserError:
-        return False
-    return True
-
-
 def _struct(path: Path) -> tuple[str, Any]:
     import scipy.io
 

@@ -35,7 +35,7 @@ def read_transmission_transforms(path: Path, given: Given = Given()) -> Scan:
     folder = path if path.is_dir() else path.parent
     stated = read_object(folder / NAME, hint=_HINT)
     frames, lens = _frames(folder)
-    pitch = _pitch(stated)
+    pitch = stated.positive("detector_pitch")
     distance = stated.positive("source_detector_distance")
     expected = stated.value("n_projections")
     if isinstance(expected, int) and expected != len(frames):
@@ -105,10 +105,6 @@ def _values(path: Path, folder: Path, frames: list[dict[str, Any]]) -> tuple[np.
         kind = "line_integral" if "line_integral" in path.stem else "transmission"
         return values, kind, float(photons[1]) if photons and kind == "transmission" else None
     return read_stack([folder / str(frame["file_path"]) for frame in frames]) / WHITE, "transmission", None
-
-
-def _pitch(stated: Statement) -> float:
-    return stated.positive("detector_pitch")
 
 
 def _truth(folder: Path, stated: Statement) -> dict[str, Any]:

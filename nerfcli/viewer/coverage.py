@@ -1,0 +1,51 @@
+"""How many photos see the surface, and from how different directions, in the cells of a page."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from nerfcli.kernels import grid_coordinates
+from nerfcli.render.model import Model
+from nerfcli.render.visibility import DepthMap, coverage_and_parallax
+
+# Cells along each axis of the unit cube. Large cells mix what no photo sees with what is seen; of small ones, some that
+# are seen lie between the pixels of all depths. The first with so many pixels per cell on average is taken.
+SIDES, _LEAST_PIXELS = (192, 128, 96, 64, 48, 32), 10
+_MOST_PIXELS = 4_000_000
+_MOST_PHOTOS = 255
+
+
+def seen_cells(model: Model, photos: Sequence[DepthMap]) -> np.ndarray:
+    """Return coverage and parallax of the surface in the cells of the unit cube: those of one of its points per cell.
+
+    Args:
+        model: whose contraction maps the scene to the cube.
+        photos: depths of all training photos.
+
+    Returns:
+        uint16 (side, side, side), indexed [z, y, x], with a side of `SIDES`: coverage, 255 at most, + 256 times the
+        parallax in whole degrees; 0 where no photo sees a surface.
+    """
+    step = 1 + sum(int(np.isfinite(view.distances).sum()) for view in photos) // _MOST_PIXELS
+    points = np.concatenate([view.points()[::step] for view in photos])
+    in_training = torch.from_numpy(model.training_from_scene.apply(points))
+    places = grid_coordinates(in_training, model.contraction).numpy()
+    inside = ((places >= 0) & (places <= 1)).all(axis=1)
+    points, places = points[inside], places[inside]
+    side = next((side for side in SIDES if _pixels_per_cell(places, side) >= _LEAST_PIXELS), SIDES[-1])
+    keys, first = np.unique(_cells_of(places, side), return_index=True)
+    coverage, parallax = coverage_and_parallax(photos, points[first])
+    cells = np.zeros(side**3, "<u2")
+    cells[keys] = np.minimum(coverage, _MOST_PHOTOS) + 256 * np.rint(parallax)
+    return cells.reshape(side, side, side)
+
+
+def _cells_of(places: np.ndarray, side: int) -> np.ndarray:
+    """Return the numbers (N,) of the cells that points (N, 3) of the unit cube lie in."""
+    x, y, z = np.minimum((places * side).astype(np.int64), side - 1).T
+    return (z * side + y) * side + x
+
+
+def _pixels_per_cell(places: np.ndarray, side: int) -> float:
+    return len(places) / max(1, len(np.unique(_cells_of(places, side))))

@@ -1,0 +1,226 @@
+"""nerfcli.fit.open_cells: which cells training rays look into, against fields and samples that are known."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from nerfcli import kernels
+from nerfcli.field.hash_field import HashField, HashFieldSettings
+from nerfcli.fit.open_cells import FINE_SIDE, LOOK_AROUND_EVERY, OCCUPANCY_SIDE, REFRESH_EVERY, OpenCells
+from nerfcli.fit.ranks import ALONE, Alone
+from nerfcli.kernels import March, Rays, numba_cpu, reference
+from nerfcli.render.model import Marching
+
+CPU = torch.device("cpu")
+MARCHING = Marching(0.1, 10.0, 0.05, 0.0)
+KEEPERS = {"reference": reference.keep_largest, "numba_cpu": numba_cpu.keep_largest}
+
+
+@dataclass(frozen=True)
+class Size:
+    contraction: str = "none"
+    detailed: bool = True
+
+
+class Slab:
+    """A field of optical depth 1 per step up to x = 1/2 of the unit cube, and empty behind; its own medium."""
+
+    closing_steps = 1
+
+    def __init__(self, detailed: bool = True):
+        self.settings = Size(detailed=detailed)
+        self.backend = kernels.backend_for(CPU, torch.float64)
+
+    def medium(self, detail: float) -> "Slab":
+        return self
+
+    def density(self, coordinates: Tensor) -> Tensor:
+        return torch.where(coordinates[:, 0] < 0.5, 20.0, 0.0)
+
+
+def cells_of(field: Any, covered: Tensor | None = None) -> OpenCells:
+    return OpenCells(field, CPU, covered=covered)
+
+
+def refresh(cells: OpenCells, step: int, ranks: Alone = ALONE) -> None:
+    generator = torch.Generator().manual_seed(step)
+    cells.refresh(step, share=1.0, detail=1.0, marching=MARCHING, generator=generator, ranks=ranks)
+
+
+def visit(cells: OpenCells, where: tuple[int, int, int], depth: float) -> None:
+    assert cells.visits is not None
+    cells.visits[where] = max(float(cells.visits[where]), depth)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("name", KEEPERS)
+def test_the_largest_value_of_a_cell_is_kept(name, threads):
+    """Against NumPy's `maximum.at`, with places on and beyond the border, several in a cell, and none in most."""
+    g = torch.Generator().manual_seed(threads)
+    coordinates = torch.rand(500, 3, generator=g) * 1.2 - 0.1
+    coordinates[0], coordinates[1], coordinates[2] = 0.0, 1.0, torch.tensor([0.0, 1.0, 0.5])
+    values, before = torch.randn(500, generator=g), torch.randn(5, 5, 5, generator=g)
+    expected = before.numpy().copy()
+    place = np.clip(np.floor(coordinates.numpy() * np.float32(5)).astype(int), 0, 4)
+    np.maximum.at(expected, (place[:, 2], place[:, 1], place[:, 0]), values.numpy())
+    torch_threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(threads)
+        KEEPERS[name](before, coordinates, values)
+    finally:
+        torch.set_num_threads(torch_threads)
+    assert np.array_equal(before.numpy(), expected)
+
+
+@pytest.mark.parametrize("name", KEEPERS)
+def test_nan_is_no_value_and_no_sample_changes_nothing(name):
+    cells = torch.full((2, 2, 2), 0.5)
+    KEEPERS[name](cells, torch.full((3, 3), 0.9), torch.tensor([torch.nan, 0.1, torch.nan]))
+    KEEPERS[name](cells, torch.zeros(0, 3), torch.zeros(0))
+    assert (cells == 0.5).all()
+    KEEPERS[name](cells, torch.full((2, 3), 0.9), torch.tensor([torch.nan, 0.7]))
+    assert cells[1, 1, 1] == 0.7
+
+
+@pytest.mark.parametrize("wanted", ["reference", "numba_cpu"])
+def test_rendering_notes_the_optical_depths_of_its_samples(wanted):
+    """Against the samples that the tracing of a step shows."""
+    torch.manual_seed(0)
+    field = HashField(HashFieldSettings(contraction="l2", log2_rows=8, coarsest=4, finest=16))
+    with torch.no_grad():
+        field.table.normal_(0.0, 0.5)
+    field.backend = kernels.backend_for(CPU, torch.float32, wanted=wanted)
+    origins, directions = torch.zeros(9, 3), torch.nn.functional.normalize(torch.randn(9, 3), dim=-1)
+    edges = torch.linspace(0.0, 2.0, 22)  # steps of 2/21
+    march = March(edges, torch.ones(4, 4, 4, dtype=torch.bool), "l2", 5.0)
+    visits, shown = torch.full((6, 6, 6), -1.0), dict[str, Tensor]()
+    field.backend.render_rays(
+        Rays(origins, directions, torch.zeros(9)), march, field.medium(), background=torch.zeros(9, 3), visits=visits,
+        trace=lambda name, values, rays: shown.update({name: values.detach()}),
+    )  # fmt: skip
+    expected = torch.full((6, 6, 6), -1.0)
+    reference.keep_largest(expected, shown["coordinates of samples"], shown["density of samples"] * 2 / 21)
+    torch.testing.assert_close(visits, expected, rtol=1e-4, atol=1e-6)
+    assert 0.1 < (visits < 0).float().mean() < 0.95
+
+
+def test_cells_close_where_samples_found_nothing_and_only_there():
+    cells = cells_of(Slab())
+    full, empty = (3, 4, 5), (3, 4, 6)
+    visit(cells, full, 0.5)
+    visit(cells, empty, 1e-3)
+    refresh(cells, REFRESH_EVERY)
+    fine, coarse = cells.at(1), cells.at(LOOK_AROUND_EVERY)
+    assert fine.shape == (FINE_SIDE,) * 3
+    assert coarse.shape == (OCCUPANCY_SIDE,) * 3
+    assert coarse[:, :, : OCCUPANCY_SIDE // 2].all()
+    assert not coarse[:, :, OCCUPANCY_SIDE // 2 :].any()
+    # All other cells are as open as the coarse ones that they are part of.
+    assert fine[full]
+    assert not fine[empty]
+    assert int(fine.sum()) == FINE_SIDE**3 // 2 - 1
+
+
+def test_fine_cells_of_thin_fog_stay_open():
+    """As the coarse ones: of a short training everything is thinner than the threshold."""
+
+    class Fog(Slab):
+        def density(self, coordinates: Tensor) -> Tensor:
+            return torch.where(coordinates[:, 0] < 0.5, 0.02, 0.0)  # optical depths of 1e-3 and 0, 5e-4 on average
+
+    cells = cells_of(Fog())
+    visit(cells, (0, 0, 0), 1e-3)
+    visit(cells, (0, 0, 1), 1e-4)
+    refresh(cells, REFRESH_EVERY)
+    assert cells.at(1)[0, 0, 0]
+    assert not cells.at(1)[0, 0, 1]
+
+
+def test_a_closed_cell_opens_as_soon_as_a_sample_finds_something():
+    cells, place = cells_of(Slab()), (0, 0, 0)
+    visit(cells, place, 0.0)
+    refresh(cells, REFRESH_EVERY)
+    assert not cells.at(1)[place]
+    visit(cells, place, 0.02)
+    refresh(cells, 2 * REFRESH_EVERY)
+    assert cells.at(1)[place]
+
+
+def test_what_samples_found_fades_where_they_find_less_and_stays_where_none_is():
+    cells, seen, unseen = cells_of(Slab()), (0, 0, 0), (0, 0, 1)
+    visit(cells, seen, 0.02)
+    visit(cells, unseen, 0.02)
+    for turn in range(1, 6):  # 0.02 * 0.8^4 is below the threshold of 0.01
+        refresh(cells, turn * REFRESH_EVERY)
+        assert cells.at(1)[unseen]
+        assert cells.at(1)[seen] == (turn < 5)
+        visit(cells, seen, 0.0)
+
+
+def test_nothing_is_looked_at_between_refreshes_nor_before_the_first_step():
+    cells = cells_of(Slab())
+    for step in (0, 1, REFRESH_EVERY - 1):
+        refresh(cells, step)
+        assert cells.at(step).all()
+
+
+def test_a_field_without_detail_has_the_coarse_cells_alone():
+    cells = cells_of(Slab(detailed=False))
+    refresh(cells, REFRESH_EVERY)
+    assert cells.visits is None
+    assert cells.at(1) is cells.coarse
+    assert set(cells.state()) == {"optical_depth", "occupied"}
+
+
+def test_cells_that_may_not_be_filled_stay_closed():
+    covered = torch.ones((OCCUPANCY_SIDE,) * 3, dtype=torch.bool)
+    covered[0, 0, 0] = False
+    cells = cells_of(Slab(), covered)
+    for step in (0, REFRESH_EVERY):
+        refresh(cells, step)
+        assert not cells.coarse[0, 0, 0]
+        assert not cells.at(1)[:2, :2, :2].any()
+        assert cells.at(1)[:2, :2, 2].all()
+
+
+def test_the_samples_of_every_rank_count():
+    class Two(Alone):
+        def keep_largest(self, tensor: Tensor) -> None:
+            tensor[0, 0, 0] = max(float(tensor[0, 0, 0]), 0.0)  # the other one found this cell empty
+
+    cells = cells_of(Slab())
+    refresh(cells, REFRESH_EVERY, ranks=Two())
+    assert not cells.at(1)[0, 0, 0]
+    assert cells.at(1)[0, 0, 1]
+
+
+def test_a_restored_state_goes_on_as_the_saved_one():
+    """What was found since the last refresh is part of it."""
+    first, second = cells_of(Slab()), cells_of(Slab())
+    visit(first, (0, 0, 0), 0.02)
+    refresh(first, REFRESH_EVERY)
+    visit(first, (0, 0, 1), 0.0)
+    second.restore({name: tensor.clone() for name, tensor in first.state().items()})
+    for turn in (1, 2):
+        if turn == 2:
+            refresh(first, turn * REFRESH_EVERY)
+            refresh(second, turn * REFRESH_EVERY)
+        for step in (1, LOOK_AROUND_EVERY):
+            assert torch.equal(first.at(step), second.at(step))
+    assert not second.at(1)[0, 0, 1]
+
+
+def test_a_checkpoint_without_fine_cells_is_continued_with_all_of_them_open():
+    cells = cells_of(Slab())
+    refresh(cells, REFRESH_EVERY)
+    old = {name: tensor for name, tensor in cells.state().items() if not name.startswith("fine_")}
+    restored = cells_of(Slab())
+    restored.restore(old)
+    assert restored.at(1).all()
+    assert torch.equal(restored.coarse, cells.coarse)
+    refresh(restored, 2 * REFRESH_EVERY)
+    assert torch.equal(restored.at(1), cells.at(1))
