@@ -70,14 +70,14 @@ def extract_frames(
     Args:
         path: the video.
         folder: gets frame_000123.jpg... and frames.json, all or nothing.
-        count: how many; None for 120, or all that a shorter video has.
+        count: how many; None for 120. A video that has fewer gives all that it has.
         overwrite: replace frames that were made from another video or with another count.
         notify: receives messages for the user, one sentence at a time.
         progress: receives (share done in 0...1, what is being done).
 
     Raises:
-        UserError: the video cannot be read or is cut short, has fewer frames than `count` or shows fewer than four
-            different pictures; or other things stand at `folder`.
+        UserError: the video cannot be read or is cut short, or shows fewer than four different pictures; or other
+            things stand at `folder`.
     """
     video = open_video(path)
     request = {"video": _identity(path), "frames": count, "selection": 1}
@@ -96,7 +96,7 @@ def extract_frames(
         notify(f"{path.name} is damaged in {measured.errors} places; nearby frames may show block artifacts")
     total = len(measured.values)
     if count is not None and count > total:
-        raise UserError(f"{path} has only {total} frames, but --frames is {count}", f"use --frames {total} or fewer")
+        notify(f"{path.name} has only {total} frames, but --frames is {count}: using all of them")
     numbers = choose_frames(measured.seconds, measured.values, count=min(count or DEFAULT_FRAMES, total))
     with atomic_folder(folder) as partial:
         frames = _write(
