@@ -4,6 +4,7 @@ The model is the truth of `synthetic_captures`, with half a pixel of noise in wh
 points, as descriptors of real photos do.
 """
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,9 @@ from synthetic_captures import WIDE, View, looking_at
 
 from nerfcli.poses.input.job import Job
 from nerfcli.poses.judge.contradictions import leave_out_contradicting
+from nerfcli.poses.model import localise as localising
 from nerfcli.poses.model.localise import Attempt, left_out, localise, shared_pairs
+from nerfcli.poses.model.point_looks import KnownPoints, PhotoFeatures
 
 POINTS = synthetic.boulder(700, seed=0)
 VIEWS = synthetic.ring(7, [WIDE], seed=0, turn_deg=180)
@@ -112,6 +115,30 @@ def test_a_place_that_the_photos_own_matches_contradict_is_not_kept(tmp_path: Pa
     grown, (attempt,) = localise(model, job, image_ids=[LAST])
     assert attempt.refused == "40 verified matches contradict its pose"
     assert LAST not in grown.reg_image_ids()
+
+
+def test_only_a_photo_that_resembles_a_placed_one_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Three are left: one that is placed, one of something else, and one that shows 15 points of the first, too few."""
+    model, job = capture(tmp_path, shown(VIEWS[3]))
+    pixels, looks = shown(VIEWS[3])
+    few = np.where(np.arange(len(looks)) < 15, looks, -1)
+    with pycolmap.Database.open(str(job.database)) as database:
+        synthetic.write_image(database, LAST, 1, keypoints=pixels, looks=np.full(len(looks), -1))
+        synthetic.write_image(database, LAST + 1, 1, keypoints=pixels, looks=few)
+    views = [*VIEWS, VIEWS[0], VIEWS[0], VIEWS[0]]
+    job = synthetic.synthetic_job(tmp_path / "three", views, seed=0)
+    shutil.copy(tmp_path / "database.db", job.database)
+    tried: list[int] = []
+    votes = localising.votes
+
+    def counted(photo: PhotoFeatures, known: KnownPoints) -> tuple[np.ndarray, np.ndarray]:
+        tried.append(photo.image_id)
+        return votes(photo, known)
+
+    monkeypatch.setattr(localising, "votes", counted)
+    _, attempts = localise(model, job, image_ids=[LAST, LAST + 1, LAST + 2])
+    assert [attempt.refused == "" for attempt in attempts] == [True, False, False]
+    assert tried == [LAST, LAST + 1, LAST + 2, LAST + 2]
 
 
 def test_nothing_is_placed_without_a_known_lens(tmp_path: Path):

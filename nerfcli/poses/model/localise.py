@@ -19,21 +19,23 @@ from scipy.spatial import KDTree
 
 from nerfcli.poses.input.job import Job, Report
 from nerfcli.poses.model.intrinsics import settle
+from nerfcli.poses.model.point_looks import (
+    ALIKE,
+    BLOCK,
+    KnownPoints,
+    PhotoFeatures,
+    known_points,
+    photo_features,
+    resembling,
+    votes,
+)
 from nerfcli.poses.model.reasons import FEW_FEATURES, FEW_MATCHES
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# How far a point may be seen from where it is expected, as a share of the longer side, and pixels at least.
-_TOLERANCE_SHARE, _LEAST_TOLERANCE_PX = 0.004, 3.0
-# A vote counts if the nearest other point looks this much less alike. Measured on photos 40 degrees apart: at 0.8 one
-# vote in four is right and there are too few, at 0.95 one in thirty.
-_RATIO = 0.9
-_MOST_VOTES = 600
 _TRIALS = 40_000
-# Where a point is expected, a feature is the point if descriptors of length 1 are this near.
-_ALIKE = 0.5
 # Fewer agreeing votes, or features found, than these place nothing.
 _LEAST_VOTES = 10
 _LEAST_FOUND = 25
@@ -50,9 +52,6 @@ _RIVAL_SHARE = 0.5
 _LEAST_AREA = 0.05
 # Standard deviations of a pose: of its angles, and of its place relative to the distance of what it sees.
 _MOST_TURN_DEG, _MOST_SHIFT = 0.5, 0.02
-# What is compared with; more of the points' descriptors take time and memory.
-_MOST_DESCRIPTORS = 150_000
-_BLOCK = 256
 # Of the features that place a photo, the share that must be left after the adjustment.
 _LEAST_KEPT = 0.6
 # A photo that was placed may make others possible.
@@ -77,28 +76,6 @@ class Attempt:
 
 
 @dataclass(frozen=True)
-class _Known:
-    """What a model's points look like: their ids (points,) and places, the descriptors, and the point of each."""
-
-    ids: Indices
-    places: Array
-    descriptors: NDArray[np.float32]
-    of: Indices  # (descriptors,) index of the point
-
-
-@dataclass(frozen=True)
-class _Photo:
-    image_id: int
-    camera: pycolmap.Camera
-    pixels: Array
-    descriptors: NDArray[np.float32]
-
-    @property
-    def tolerance_px(self) -> float:
-        return max(_TOLERANCE_SHARE * max(self.camera.width, self.camera.height), _LEAST_TOLERANCE_PX)
-
-
-@dataclass(frozen=True)
 class _Placed:
     pose: pycolmap.Rigid3d
     features: Indices
@@ -115,8 +92,8 @@ def localise(
     """Return a copy of the model with those of the photos placed that its points tell the place of,
     adjusted; what was tried.
 
-    Photos that a placed one makes possible are tried again, so that a chain of them is followed. One whose own matches
-    with other photos, however few, contradict its place is not kept.
+    Photos that resemble what a placed one shows are tried again, so that a chain of them is followed. One whose own
+    matches with other photos, however few, contradict its place is not kept.
 
     Args:
         model: with points; it is not changed.
@@ -132,14 +109,18 @@ def localise(
     files = dict(zip(job.image_ids, job.files, strict=True))
     with closing(pycolmap.Database.open(str(job.database))) as database:
         total = _ROUNDS * len(left)
+        placed_before: list[int] = []
         for turn in range(_ROUNDS):
-            known = _known(grown, database)
+            known = known_points(grown, database)
+            fresh = np.isin(known.photos, placed_before)
             placed_now = []
             for number, image_id in enumerate(left):
                 report("locate", turn * len(image_ids) + number, total)
-                photo = _photo(grown, database, image_id)
+                photo = photo_features(grown, database, image_id)
                 if photo is None:
                     attempts[image_id] = Attempt(image_id, refused="its camera is unknown")
+                    continue
+                if turn > 0 and resembling(photo, known.descriptors[fresh]) < _LEAST_VOTES:
                     continue
                 placed, attempts[image_id] = _place(photo, known, seed=job.seed)
                 if placed is not None:
@@ -148,6 +129,7 @@ def localise(
             left = [image_id for image_id in left if image_id not in placed_now]
             if not left or not placed_now:
                 break
+            placed_before = placed_now
         report("locate", total, total)
         pairs = read_verified_pairs(database, min_matches=FEW_MATCHES)
     if any(not attempt.refused for attempt in attempts.values()):
@@ -201,44 +183,9 @@ def _doubt(model: pycolmap.Reconstruction, image_id: int, pairs: Sequence[Verifi
     return f"{against[0].matches} verified matches contradict its pose" if against else ""
 
 
-def _known(model: pycolmap.Reconstruction, database: pycolmap.Database) -> _Known:
-    ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
-    most = max(1, _MOST_DESCRIPTORS // max(len(ids), 1))
-    features: dict[int, tuple[list[int], list[int]]] = {}  # by photo: features, and the points they are of
-    for index, point_id in enumerate(ids):
-        for element in model.point3D(int(point_id)).track.elements[:most]:
-            numbers, points = features.setdefault(element.image_id, ([], []))
-            numbers.append(element.point2D_idx)
-            points.append(index)
-    photos = sorted(features)
-    return _Known(
-        ids,
-        np.array([model.point3D(int(point_id)).xyz for point_id in ids]).reshape(-1, 3),
-        np.concatenate([_descriptors(database, photo)[features[photo][0]] for photo in photos]),
-        np.concatenate([np.array(features[photo][1], dtype=np.int64) for photo in photos]),
-    )
-
-
-def _photo(model: pycolmap.Reconstruction, database: pycolmap.Database, image_id: int) -> _Photo | None:
-    """None where the focal length is neither known beforehand nor found with other photos of the same camera."""
-    camera_id = database.read_image(image_id).camera_id
-    in_use = {model.image(placed).camera_id for placed in model.reg_image_ids()}
-    camera = model.camera(camera_id) if camera_id in in_use else database.read_camera(camera_id)
-    if camera_id not in in_use and not camera.has_prior_focal_length:
-        return None
-    pixels = np.asarray(database.read_keypoints(image_id), dtype=np.float64)[:, :2]
-    return _Photo(image_id, camera, pixels, _descriptors(database, image_id))
-
-
-def _descriptors(database: pycolmap.Database, image_id: int) -> NDArray[np.float32]:
-    """Return descriptors of length 1."""
-    found = np.asarray(database.read_descriptors(image_id).data, dtype=np.float32)
-    return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1.0)
-
-
-def _place(photo: _Photo, known: _Known, *, seed: int) -> tuple[_Placed | None, Attempt]:
+def _place(photo: PhotoFeatures, known: KnownPoints, *, seed: int) -> tuple[_Placed | None, Attempt]:
     """Return where a photo was taken and what it sees, or None; and how that was found or why not."""
-    features, points = _votes(photo, known)
+    features, points = votes(photo, known)
     first = _pose(photo, known, features, points, seed=seed)
     agreeing = 0 if first is None else len(first.features)
     attempt = Attempt(photo.image_id, len(features), agreeing)
@@ -270,28 +217,7 @@ def _place(photo: _Photo, known: _Known, *, seed: int) -> tuple[_Placed | None, 
     return placed, attempt
 
 
-def _votes(photo: _Photo, known: _Known) -> tuple[Indices, Indices]:
-    """Features and the points that they choose, each point once."""
-    nearest = np.empty(len(photo.pixels), dtype=np.int64)
-    ratios, cosines = np.empty(len(nearest)), np.empty(len(nearest))
-    for start in range(0, len(nearest), _BLOCK):
-        alike = photo.descriptors[start : start + _BLOCK] @ known.descriptors.T  # (block, descriptors)
-        rows = np.arange(len(alike))
-        best = alike.argmax(axis=1)
-        points, cosine = known.of[best], alike[rows, best]
-        alike[known.of[None, :] == points[:, None]] = -1.0
-        second = alike.max(axis=1)
-        block = slice(start, start + len(alike))
-        nearest[block], cosines[block] = points, cosine
-        ratios[block] = np.sqrt(np.maximum(2 - 2 * cosine, 0) / np.maximum(2 - 2 * second, 1e-12))
-    features = np.flatnonzero(ratios < _RATIO)
-    features = features[np.argsort(ratios[features], kind="stable")]
-    _, first = np.unique(nearest[features], return_index=True)
-    features = features[np.sort(first)][:_MOST_VOTES]
-    return features, nearest[features]
-
-
-def _pose(photo: _Photo, known: _Known, features: Indices, points: Indices, *, seed: int) -> _Placed | None:
+def _pose(photo: PhotoFeatures, known: KnownPoints, features: Indices, points: Indices, *, seed: int) -> _Placed | None:
     """Return the pose that most of the features agree on, and which do."""
     if len(features) < _LEAST_VOTES:
         return None
@@ -310,7 +236,7 @@ def _pose(photo: _Photo, known: _Known, features: Indices, points: Indices, *, s
 
 
 def _expected(
-    photo: _Photo, known: _Known, pose: pycolmap.Rigid3d, *, within: float = 1.0, beside: Array = _HERE
+    photo: PhotoFeatures, known: KnownPoints, pose: pycolmap.Rigid3d, *, within: float = 1.0, beside: Array = _HERE
 ) -> tuple[Indices, Indices]:
     """Features that look like the points that a pose expects there, and these points.
 
@@ -329,13 +255,13 @@ def _expected(
     features = np.array([feature for point in known.of[looks] for feature in near[int(point)]], dtype=np.int64)
     looks = np.repeat(looks, np.array([len(near[int(point)]) for point in known.of[looks]], dtype=np.int64))
     distances = np.empty(len(features))
-    for start in range(0, len(features), _BLOCK * 64):
-        rows = slice(start, start + _BLOCK * 64)
+    for start in range(0, len(features), BLOCK * 64):
+        rows = slice(start, start + BLOCK * 64)
         cosines = np.einsum("ij,ij->i", photo.descriptors[features[rows]], known.descriptors[looks[rows]])
         distances[rows] = np.sqrt(np.maximum(2 - 2 * cosines, 0))
     points = known.of[looks]
     order = np.argsort(distances, kind="stable")
-    order = order[distances[order] < _ALIKE]
+    order = order[distances[order] < ALIKE]
     for ids in (points, features):  # of each point the likest feature, and of each feature the likest point
         _, first = np.unique(ids[order], return_index=True)
         order = order[np.sort(first)]
@@ -348,13 +274,13 @@ def _steps() -> list[Array]:
     return [_BESIDE[i % 2] * np.array([np.cos(angle), np.sin(angle)]) for i, angle in enumerate(angles)]
 
 
-def _area(photo: _Photo, features: Indices) -> float:
+def _area(photo: PhotoFeatures, features: Indices) -> float:
     """Share of the picture that the features lie in: an ellipse of their spread."""
     spread = np.sqrt(max(np.linalg.det(np.cov(photo.pixels[features].T)), 0.0))
     return float(4 * np.pi * spread / (photo.camera.width * photo.camera.height))
 
 
-def _alike(one: _Placed, other: _Placed, known: _Known) -> bool:
+def _alike(one: _Placed, other: _Placed, known: KnownPoints) -> bool:
     """Return whether two poses are the same but for noise."""
     turned = np.degrees((one.pose.rotation * other.pose.rotation.inverse()).angle())
     places = [np.asarray(placed.pose.inverse().translation) for placed in (one, other)]
@@ -362,7 +288,7 @@ def _alike(one: _Placed, other: _Placed, known: _Known) -> bool:
     return bool(turned < 5 and np.linalg.norm(places[0] - places[1]) < 0.1 * distance)
 
 
-def _deviations(photo: _Photo, known: _Known, placed: _Placed) -> tuple[float, float]:
+def _deviations(photo: PhotoFeatures, known: KnownPoints, placed: _Placed) -> tuple[float, float]:
     """Standard deviations of a pose: of its angles, degrees, and of its place by the distance of what it sees."""
     refined = pycolmap.refine_absolute_pose(
         placed.pose,
@@ -383,7 +309,9 @@ def _deviations(photo: _Photo, known: _Known, placed: _Placed) -> tuple[float, f
     return float(np.degrees(spread[:3].max())), float(spread[3:].max() / distance)
 
 
-def _add(model: pycolmap.Reconstruction, photo: _Photo, placed: _Placed, *, known: _Known, name: str) -> None:
+def _add(
+    model: pycolmap.Reconstruction, photo: PhotoFeatures, placed: _Placed, *, known: KnownPoints, name: str
+) -> None:
     """Put a photo with what it sees into a model."""
     if not model.exists_camera(photo.camera.camera_id):
         model.add_camera_with_trivial_rig(photo.camera)
