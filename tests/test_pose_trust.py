@@ -340,7 +340,7 @@ def test_the_mapper_counts_the_photos_that_it_goes_on_from(solved: Solved, tmp_p
 
 def test_a_run_of_the_mapper_ends_at_its_limit(solved: Solved, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Ten times the plan's 0.38 + 0.0005 n seconds a photo, two minutes at least; what it has placed is kept."""
-    assert [mapping.limit_seconds(photos) for photos in (10, 300)] == [120, 1590]
+    assert [mapping.mapper_limit_seconds(photos) for photos in (10, 300)] == [120, 1590]
     shutil.copytree(solved.job.database.parent, tmp_path / "again")
     job = replace(solved.job, folder=str(tmp_path / "again" / "work"))
     (tmp_path / "again" / "work" / "models_0.json").unlink(missing_ok=True)
@@ -352,11 +352,13 @@ def test_a_run_of_the_mapper_ends_at_its_limit(solved: Solved, tmp_path: Path, m
         return real(*arguments, options=options, **more)
 
     monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", watched)
-    monkeypatch.setattr(ladder, "limit_seconds", lambda photos: 0)
+    monkeypatch.setattr(ladder, "mapper_limit_seconds", lambda photos: 0)
     notes: list[str] = []
-    assert climb(job, lambda *progress: None, notes.append).models[0].num_reg_images() == 10
+    climbed = climb(job, lambda *progress: None, notes.append)
+    assert climbed.models[0].num_reg_images() == 10
     assert limits[0] == 120
-    assert notes[0] == "default thresholds: stopped after 0 s, longer than most captures take"
+    stopped = "default thresholds: stopped after 0 s, longer than most captures take"
+    assert (climbed.cut_short, notes[0]) == ((stopped,), f"cut short: {stopped}")
 
 
 def test_groups_hold_together_against_what_speaks_against_them():

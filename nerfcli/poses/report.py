@@ -44,6 +44,7 @@ class PosesReport:
     strict: how held-out photos were placed afterwards, see `strict.place_held_out`. components: each model's photos and
     why it is apart from the largest, in the order of sizes, by which `--component` counts. not_computed: checks that
     could not be computed, and why. not_finite: where the report has null for a number that was not finite.
+    cut_short: what was stopped because it took far longer than planned.
     moving_foreground: an object that turns before a still background, and its masks, in numbers; see `turntable`.
     """
 
@@ -69,6 +70,7 @@ class PosesReport:
     not_computed: dict[str, str] = field(default_factory=dict)
     not_finite: dict[str, str] = field(default_factory=dict)
     moving_foreground: dict[str, Any] | None = None
+    cut_short: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and dictionaries."""
@@ -119,6 +121,7 @@ def make_report(
         not_computed=result["not_computed"],
         not_finite=result["not_finite"],
         moving_foreground=result.get("moving_foreground"),
+        cut_short=tuple(result.get("cut_short", ())),
     )
 
 
@@ -148,6 +151,7 @@ def closing_notes(report: PosesReport) -> list[str]:
             f"{certain['focal_percent']:.1f} %, distortion ± {certain['distortion_border_px']:.1f} px at the corners): "
             "give --intrinsics"
         )
+    notes += [f"cut short: {what}" for what in report.cut_short]
     for check, why in report.not_computed.items():
         notes.append(f"could not compute a check ({check}): {why}")
     return notes

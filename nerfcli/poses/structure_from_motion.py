@@ -206,11 +206,10 @@ def _work(
             )
             return
         except WorkerDiedError as error:
-            if not (work / UNDERWAY).exists():
+            if error.check is None:
                 raise
-            check = _read_json(work / UNDERWAY)["check"]
-            notify(f"could not compute a check ({check}): {error.message}; continuing with the others")
-            job = replace(job, skipped_checks=(*job.skipped_checks, (check, error.message)))
+            notify(f"could not compute a check ({error.check}): {error.message}; continuing with the others")
+            job = replace(job, skipped_checks=(*job.skipped_checks, (error.check, error.message)))
 
 
 def _prepare(

@@ -2,6 +2,7 @@
 
 import math
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from itertools import repeat
@@ -11,6 +12,7 @@ import pycolmap
 
 from nerfcli.poses.engine.database import clear_matches, forget_features, keep_geometries, register_photos
 from nerfcli.poses.input.job import Job, LaidOutMask, Report
+from nerfcli.poses.input.plan import duration, limit_seconds, matching_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 
 # A photo with this share of the requested features is rich enough; measured poses are no better with more.
@@ -19,6 +21,9 @@ _RICH_SHARE = 0.5
 _MOST_FEATURES_FOR_MASK = 8
 # Matches are written, and so progress is seen and kept, after each block.
 _PAIRS_PER_BLOCK = 128
+# The time is looked at after so many pairs; matching may take so many seconds, however few they are.
+_PAIRS_PER_CALL = 8 * _PAIRS_PER_BLOCK
+_LEAST_LIMIT_SECONDS = 300
 # To be changed with anything here that changes the features of the same photo, or the matches of the same features.
 _FEATURES_VERSION = "octaves 0, then -1 below half"
 _MATCHES_VERSION = "ratio 0.8, cross-checked"
@@ -72,11 +77,16 @@ def start_matching(job: Job, pairs: Sequence[tuple[int, int]]) -> None:
     keep_geometries(job, pairs)
 
 
-def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
+def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> str | None:
     """Descriptor matches of the pairs that have none yet, verified by two-view geometry.
 
     Each pair's random numbers start from the seed, so its result does not depend on what was done before.
+
+    Returns:
+        What was cut short, where the pairs took ten times as long as planned; the last of them have no matches then.
     """
+    planned = matching_seconds(len(pairs), max_features=job.max_features) / max(job.threads, 1)
+    most, start = limit_seconds(planned, least=_LEAST_LIMIT_SECONDS), time.perf_counter()
     options = pycolmap.FeatureMatchingOptions()
     options.num_threads = job.threads
     options.use_gpu = False
@@ -86,8 +96,8 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(pair_list)
     pairing.block_size = _PAIRS_PER_BLOCK
-    pair_list.write_text("\n".join(f"{job.files[i]} {job.files[j]}" for i, j in pairs), encoding="utf-8")
     ids = job.image_ids
+    cut_short = None
     with closing(pycolmap.Database.open(str(job.database))) as database:
         pending = {(ids[i], ids[j]) for i, j in pairs}
 
@@ -96,13 +106,21 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
             return len(pairs) - len(pending)
 
         with _watched("match", done, len(pairs), report):
-            pycolmap.match_image_pairs(
-                str(job.database),
-                matching_options=options,
-                pairing_options=pairing,
-                verification_options=verification,
-                device=pycolmap.Device.cpu,
-            )
+            for first in range(0, len(pairs), _PAIRS_PER_CALL):
+                if time.perf_counter() - start > most:
+                    left = len(pairs) - done()
+                    cut_short = f"matching: {left} of {len(pairs)} pairs are not matched after {duration(most)}"
+                    break
+                part = pairs[first : first + _PAIRS_PER_CALL]
+                pair_list.write_text("\n".join(f"{job.files[i]} {job.files[j]}" for i, j in part), encoding="utf-8")
+                pycolmap.match_image_pairs(
+                    str(job.database),
+                    matching_options=options,
+                    pairing_options=pairing,
+                    verification_options=verification,
+                    device=pycolmap.Device.cpu,
+                )
+    return cut_short
 
 
 def feature_counts(job: Job) -> list[int]:

@@ -6,7 +6,7 @@ for more matches and more features.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,7 +19,7 @@ from nerfcli.poses.engine.database import evidence, register_photos
 from nerfcli.poses.engine.features import extract, feature_counts, match, start_matching
 from nerfcli.poses.engine.initial_focal import with_focal_lengths
 from nerfcli.poses.engine.mapped import Mapped
-from nerfcli.poses.engine.mapping import MapperOptions, limit_seconds, map_photos
+from nerfcli.poses.engine.mapping import MapperOptions, map_photos, mapper_limit_seconds
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import all_pairs
 from nerfcli.poses.input.plan import duration, extraction_seconds, mapping_seconds, matching_seconds
@@ -68,6 +68,7 @@ class _Ladder:
         self._photos = len(job.files)
         self._results_reported = 0
         self._announced = ""
+        self._cut_short: list[str] = []
 
     def announce(self, what: str, *, takes: float = 0.0) -> None:
         """Report the results so far, and once what comes next."""
@@ -90,10 +91,7 @@ class _Ladder:
         if self.rungs:
             self.announce(what)
         number = len(self.rungs)
-        began = time.perf_counter()
-        models = map_photos(job, self._report, attempt=number, start=start)
-        if time.perf_counter() - began > limit_seconds(self._photos):
-            self._tell(f"{what}: stopped after {duration(limit_seconds(self._photos))}, longer than most captures take")
+        models = self._map(what, job, start)
         self._take(what, models, job)
         if len(models) > 1:
             output = Path(job.folder) / f"merged_{number}"
@@ -104,7 +102,9 @@ class _Ladder:
                 seed=job.seed,
                 threads=job.threads,
                 fixed=job.fixed_cameras,
+                seconds=mapper_limit_seconds(self._photos),
                 report=self._report,
+                tell=self._cut,
             )
             if _placed(merged) > _placed(models):
                 self._take("sub-models merged", merged, job)
@@ -131,7 +131,7 @@ class _Ladder:
         if not models:
             return
         self.announce(what)
-        grown = map_photos(job, self._report, attempt=len(self.rungs), start=start, base=models[0])
+        grown = self._map(what, job, start, base=models[0])
         if grown:
             self._take(what, [grown[0], *models[1:]], job)
 
@@ -153,6 +153,29 @@ class _Ladder:
         self.rungs[-1]["photos"] = found
         if placed:
             self.best = replace(self.best, localised=placed)
+
+    def match(self, job: Job, pairs: Sequence[tuple[int, int]]) -> None:
+        """Match pairs of photos, and remember if that was cut short."""
+        unmatched = match(job, pairs, self._report)
+        if unmatched is not None:
+            self._cut(unmatched)
+
+    def result(self) -> Mapped:
+        """Return the best models with all that was tried."""
+        return replace(self.best, attempts=self.rungs, cut_short=tuple(self._cut_short))
+
+    def _map(
+        self, what: str, job: Job, start: MapperOptions, *, base: pycolmap.Reconstruction | None = None
+    ) -> list[pycolmap.Reconstruction]:
+        most, began = mapper_limit_seconds(self._photos), time.perf_counter()
+        models = map_photos(job, self._report, attempt=len(self.rungs), start=start, base=base)
+        if time.perf_counter() - began > most:
+            self._cut(f"{what}: stopped after {duration(most)}, longer than most captures take")
+        return models
+
+    def _cut(self, what: str) -> None:
+        self._tell(f"cut short: {what}")
+        self._cut_short.append(what)
 
     def _take(self, what: str, models: list[pycolmap.Reconstruction], job: Job) -> None:
         self.rungs.append({"what": what, "models": [model.num_reg_images() for model in models]})
@@ -184,7 +207,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     if ladder.share(featured) < _GOOD_SHARE and _only_turns(job):
         ladder.tell_results()
         tell("not trying anything else: the camera turned on the spot")
-        return replace(ladder.best, attempts=ladder.rungs)
+        return ladder.result()
     job = _without_exif(ladder, job, report, tell, share=ladder.share(featured))
     job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
     _other_starts(ladder, job, tell)
@@ -192,7 +215,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     if 0 < math.comb(len(job.files), 2) - len(compared) <= _MOST_PAIRS and ladder.share(featured) < _GOOD_SHARE:
         rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
         job = replace(job, pairs=(*job.pairs, *rest))
-        match(job, rest, report)
+        ladder.match(job, rest)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)
     if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE:
         _with_more_features(ladder, job, report, tell, missing=1 - ladder.share(featured))
@@ -200,7 +223,7 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     if len(ladder.rungs) > 1:
         ladder.tell_results()
     _tell_of_exif(given, ladder.best, tell)
-    return replace(ladder.best, attempts=ladder.rungs)
+    return ladder.result()
 
 
 def _tell_of_exif(given: Job, best: Mapped, tell: Tell) -> None:
@@ -242,7 +265,7 @@ def _with_more_features(ladder: _Ladder, job: Job, report: Report, tell: Tell, *
     ladder.announce(what, takes=_search_seconds(more) / so_far)
     extract(more, report)
     start_matching(more, more.pairs)
-    match(more, more.pairs, report)
+    ladder.match(more, more.pairs)
     ladder.attempt(what, more, MapperOptions())
     _other_starts(ladder, more, tell)
 
@@ -283,13 +306,13 @@ def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, shar
     what = "without EXIF's focal length"
     ladder.announce(what)
     register_photos(bare)  # which takes out what was verified with the other focal length
-    match(bare, bare.pairs, report)
+    ladder.match(bare, bare.pairs)
     bare = with_focal_lengths(bare, tell)
     ladder.attempt(what, bare, MapperOptions())
     if ladder.best.job is bare:
         return bare
     register_photos(job)
-    match(job, job.pairs, report)
+    ladder.match(job, job.pairs)
     return job
 
 
@@ -304,12 +327,12 @@ def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) ->
         return job
     ladder.announce("start from a fisheye lens")
     register_photos(fisheye)  # which takes out what was verified with another lens
-    match(fisheye, fisheye.pairs, report)
+    ladder.match(fisheye, fisheye.pairs)
     ladder.attempt_instead("start from a fisheye lens", fisheye, MapperOptions())
     if ladder.best.job is fisheye:
         return fisheye
     register_photos(job)
-    match(job, job.pairs, report)
+    ladder.match(job, job.pairs)
     return job
 
 

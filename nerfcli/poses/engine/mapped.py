@@ -31,7 +31,8 @@ class Mapped:
 
     attempts: what was tried, in order: {"what", "models": sizes, largest first}; the one that looks for single photos
     has "photos" too: what was found for each. localised: ids of images that are placed by the model's points, without
-    a pair that holds them. seconds: that mapping took.
+    a pair that holds them. seconds: that mapping took. cut_short: what was stopped because it took far longer than
+    planned.
     """
 
     models: list[pycolmap.Reconstruction]
@@ -39,12 +40,13 @@ class Mapped:
     attempts: list[dict[str, Any]]
     localised: tuple[int, ...] = ()
     seconds: float = 0.0
+    cut_short: tuple[str, ...] = ()
 
 
 def write_mapped(mapped: Mapped, key: str, *, name: str = FIRST) -> None:
     """Write models and stage into the work folder, in place of earlier ones of this name."""
     content = {"job": asdict(mapped.job), "attempts": mapped.attempts, "localised": list(mapped.localised)}
-    content["seconds"] = mapped.seconds
+    content |= {"seconds": mapped.seconds, "cut_short": list(mapped.cut_short)}
     write_models(Path(mapped.job.folder) / name, mapped.models, key, also=content)
 
 
@@ -71,7 +73,14 @@ def read_mapped(job: Job, key: str, *, name: str = FIRST) -> Mapped | None:
     )
     if not there.database.exists():
         return None
-    return Mapped(models, there, content["attempts"], tuple(content["localised"]), content["seconds"])
+    return Mapped(
+        models,
+        there,
+        content["attempts"],
+        tuple(content["localised"]),
+        content["seconds"],
+        tuple(content.get("cut_short", ())),
+    )
 
 
 def write_models(

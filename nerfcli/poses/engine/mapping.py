@@ -12,12 +12,12 @@ import pycolmap
 
 from nerfcli.poses.engine.mapped import file_keys, mapping_key, read_models, write_models
 from nerfcli.poses.input.job import Job, Report
-from nerfcli.poses.input.plan import mapping_seconds
+from nerfcli.poses.input.plan import limit_seconds, mapping_seconds
 from nerfcli.poses.input.stages import file_key, stage_key
 from nerfcli.poses.model.reasons import FEW_MATCHES
 
-# So many times the planned seconds, or the least: most captures take a third of these to twice, on a busy machine more.
-_MOST_TIMES_PLANNED, _LEAST_LIMIT_SECONDS = 10, 120
+# One run of the mapper may take so many seconds, however few the photos.
+_LEAST_LIMIT_SECONDS = 120
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,9 @@ def map_photos(
     return found[0]
 
 
-def limit_seconds(photos: int) -> int:
+def mapper_limit_seconds(photos: int) -> int:
     """Return after how many seconds one run of the mapper ends, with the photos that are placed by then."""
-    return max(round(_MOST_TIMES_PLANNED * mapping_seconds(photos)), _LEAST_LIMIT_SECONDS)
+    return round(limit_seconds(mapping_seconds(photos), least=_LEAST_LIMIT_SECONDS))
 
 
 def map_globally(job: Job) -> list[pycolmap.Reconstruction]:
@@ -158,7 +158,7 @@ def _options(job: Job, *, attempt: int, start: MapperOptions) -> pycolmap.Increm
     options.mapper.init_max_forward_motion = start.init_max_forward_motion
     options.mapper.filter_min_tri_angle = start.filter_min_tri_angle
     options.mapper.abs_pose_min_num_inliers = FEW_MATCHES
-    options.max_runtime_seconds = limit_seconds(len(job.files))
+    options.max_runtime_seconds = mapper_limit_seconds(len(job.files))
     if start.init_pair:
         options.init_image_id1, options.init_image_id2 = start.init_pair
         options.init_num_trials = 1  # every trial would begin with this pair

@@ -16,7 +16,13 @@ import pycolmap
 from nerfcli.poses.engine.database import keep_geometries
 from nerfcli.poses.engine.ladder import SMALLER_BASELINE
 from nerfcli.poses.engine.mapped import Mapped, mapping_key, read_mapped, write_mapped
-from nerfcli.poses.engine.mapping import MapperOptions, map_globally, map_photos, photo_numbers
+from nerfcli.poses.engine.mapping import (
+    MapperOptions,
+    map_globally,
+    map_photos,
+    mapper_limit_seconds,
+    photo_numbers,
+)
 from nerfcli.poses.input.job import Job, Report, Tell
 from nerfcli.poses.input.pairs import capture_order
 from nerfcli.poses.input.plan import at_once_seconds, duration, mapping_seconds
@@ -33,6 +39,8 @@ from nerfcli.poses.model.view_graph import consistent_groups
 _FIRST_ATTEMPT = 100
 # Of the photos that were placed, the share that must agree with itself to be built upon.
 _LEAST_CORE = 0.3
+# A hypothesis that nothing else bounds may take so many seconds, however little time is left.
+_LEAST_LIMIT_SECONDS = 120
 # In an ordered capture, photos so near in the order are taken to be neighbours in space.
 _NEAR_IN_ORDER = 10
 _ALL_AT_ONCE = "all photos at once (global mapper)"
@@ -114,7 +122,8 @@ def second_chance(
             continue
         tell(f"next: {what}" + (f" (about {duration(takes)})" if takes else ""))
         runner = checks()
-        found = runner.run(what, partial(_kept, mapped.job, f"{names}-{number}", make), otherwise=None)
+        limit = max(left, _LEAST_LIMIT_SECONDS) if what == _ALL_AT_ONCE else _mapping_limit_seconds(mapped.job)
+        found = runner.run(what, partial(_kept, mapped.job, f"{names}-{number}", make), otherwise=None, seconds=limit)
         if found is None or not found.models:
             tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
             continue
@@ -167,7 +176,8 @@ def grow(
         return _mapped_without(mapped, base, report, attempt=_FIRST_ATTEMPT, base=base.model)
 
     runner = checks()
-    found = runner.run(what, partial(_kept, mapped.job, "grown", make), otherwise=None)
+    limit = _mapping_limit_seconds(mapped.job)
+    found = runner.run(what, partial(_kept, mapped.job, "grown", make), otherwise=None, seconds=limit)
     if found is None or not found.models:
         tell(f"{what}: {runner.not_computed.get(what, 'nothing to map')}")
         return given
@@ -182,6 +192,11 @@ def grow(
     if not examined.verdict.accepted or size <= len(placed):
         return Chance(replace(mapped, attempts=attempts), first)
     return Chance(replace(found, attempts=attempts), examined)
+
+
+def _mapping_limit_seconds(job: Job) -> float:
+    """Return how long a run of the mapper and what belongs to it may take; the mapper ends by itself before."""
+    return 2.0 * mapper_limit_seconds(len(job.files))
 
 
 def _match(some: set[int], others: set[int], job: Job) -> bool:

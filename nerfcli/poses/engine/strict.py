@@ -87,7 +87,7 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     held_out = frozenset(job.held_out)
     across = tuple((i, j) for i, j in job.pairs if (i in held_out) != (j in held_out))
     start_matching(job, [(i, j) for i, j in job.pairs if not {i, j} <= held_out])
-    match(job, across, report)
+    unmatched = match(job, across, report)
     model = pycolmap.Reconstruction(folder)
     before = fingerprint(model)
     placed: dict[int, Placed] = {}
@@ -108,6 +108,8 @@ def place_held_out(job: Job, training: Job, result: dict[str, Any], report: Repo
     whole["left_out"] |= reasons
     whole["evidence"] = evidence(job)
     whole["pairs"] = result["pairs"] + len(across)
+    if unmatched is not None:
+        whole["cut_short"] = [*whole["cut_short"], unmatched]
     whole["strict"] = {
         "held_out": [job.names[number] for number in job.held_out],
         "placed": {found.name: {"inliers": found.inliers, "error_px": found.error_px} for found in placed.values()},

@@ -2,6 +2,7 @@
 failed.
 """
 
+import json
 import os
 import shutil
 import signal
@@ -11,11 +12,14 @@ import time
 from collections.abc import Callable
 from errno import ENOSPC
 from pathlib import Path
+from typing import Any
 
 from nerfcli import child
 from nerfcli.errors import GATE_NOT_MET, OUT_OF_MEMORY, UserError
 from nerfcli.memory import resident_bytes
+from nerfcli.poses.input.plan import duration
 from nerfcli.poses.input.settings import Limits
+from nerfcli.poses.judge.checks import UNDERWAY
 
 _STAGES = {
     "extract": "finding features",
@@ -37,7 +41,12 @@ _FULL_DISK_BYTES = 2_000_000
 
 
 class WorkerDiedError(UserError):
-    """The worker ended by itself, neither at a limit nor for want of room on the disk."""
+    """The worker ended by itself, neither at a limit nor for want of room on the disk; or a check took too long.
+
+    check: the name of the check that it was computing, if it was.
+    """
+
+    check: str | None = None
 
 
 def run_worker(
@@ -62,7 +71,8 @@ def run_worker(
         notify: receives messages for the user, one sentence at a time.
 
     Raises:
-        WorkerDiedError: the worker died; the text says while doing what, and its last words.
+        WorkerDiedError: the worker died; the text says while doing what, and its last words. Or it was ended because a
+            check took longer than it may.
         UserError: it was ended at a limit, or the disk is full.
     """
     log = job_path.with_name("worker.log")
@@ -75,7 +85,8 @@ def run_worker(
             threads=threads,
             descriptors=() if lock is None else (lock,),
         )
-        guard = _Guard(worker, limits, time.monotonic() if since is None else since)
+        underway = job_path.with_name(UNDERWAY)
+        guard = _Guard(worker, limits, time.monotonic() if since is None else since, underway=underway)
         messages = child.messages(worker)
         try:
             for message in messages:
@@ -89,10 +100,17 @@ def run_worker(
             guard.stop()
     if worker.returncode == 0:
         return
+    if guard.reached == "check":
+        overdue = WorkerDiedError(f"it took longer than {duration(guard.check['seconds'])}", _GO_ON)
+        overdue.check = guard.check["check"]
+        raise overdue
     if guard.reached is not None:
         raise _limit_reached(guard.reached, limits, stage)
     free_bytes = shutil.disk_usage(job_path.parent).free
-    raise explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"), free_bytes)
+    error = explain_death(worker.returncode, stage, log.read_text(encoding="utf-8", errors="replace"), free_bytes)
+    if isinstance(error, WorkerDiedError) and underway.exists():
+        error.check = json.loads(underway.read_text(encoding="utf-8"))["check"]
+    raise error
 
 
 def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> UserError:
@@ -124,10 +142,16 @@ def explain_death(returncode: int, stage: str, log: str, free_bytes: int) -> Use
 
 
 class _Guard:
-    """Watches a worker from a thread, and ends it when it goes beyond a limit; `reached` then says which."""
+    """Watches a worker from a thread, and ends it when it goes beyond a limit; `reached` then says which.
 
-    def __init__(self, worker: subprocess.Popen[bytes], limits: Limits, since: float):
+    check: the content of `UNDERWAY`, as it was last seen.
+    """
+
+    def __init__(self, worker: subprocess.Popen[bytes], limits: Limits, since: float, *, underway: Path):
         self.reached: str | None = None
+        self.check: dict[str, Any] = {}
+        self._underway = underway
+        self._check_written, self._check_seen = 0, 0.0
         self._worker = worker
         self._limits = limits
         self._end = None if limits.seconds is None else since + limits.seconds
@@ -146,9 +170,23 @@ class _Guard:
                 self.reached = "time"
             elif self._limits.memory_bytes is not None and self._resident() > self._limits.memory_bytes:
                 self.reached = "memory"
+            elif self._is_overdue():
+                self.reached = "check"
             if self.reached is not None:
                 self._worker.kill()
                 return
+
+    def _is_overdue(self) -> bool:
+        """Return whether the check at hand takes longer than it may."""
+        try:
+            written = self._underway.stat().st_mtime_ns
+            if written != self._check_written:
+                self.check = json.loads(self._underway.read_text(encoding="utf-8"))
+                self._check_written, self._check_seen = written, time.monotonic()
+        except OSError:  # no check is under way, or it has just ended
+            return False
+        most = self.check["seconds"]
+        return most is not None and time.monotonic() - self._check_seen > most
 
     def _resident(self) -> int:
         return resident_bytes(self._worker.pid)

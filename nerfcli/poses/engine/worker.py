@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +34,14 @@ from nerfcli.poses.engine.separate_models import describe_components
 from nerfcli.poses.engine.strict import place_held_out, training_part
 from nerfcli.poses.engine.turntable import recalled, with_object_masks
 from nerfcli.poses.input.job import Job, Report, Tell, read_job
+from nerfcli.poses.input.plan import checking_seconds, limit_seconds
 from nerfcli.poses.input.stages import read_stage, stage_key, write_stage
 from nerfcli.poses.judge.checks import Checks
 
 # The last stage's file: what the report needs. The model stands beside it, in sparse/0.
 RESULT = "result.json"
+# Each check may take so many seconds, however few the photos.
+_LEAST_LIMIT_SECONDS = 300
 
 
 def main(job_path: str) -> None:
@@ -87,7 +91,7 @@ def _looked_at(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float
     discard_if_damaged(job.database)
     with _timed(seconds, "extract"):
         extract(training_part(job), report)
-    checks, name = Checks(Path(job.folder), skip=dict(job.skipped_checks)), "moving foreground"
+    checks, name = _checks(job), "moving foreground"
     with _timed(seconds, "motions"):
         found = checks.run(name, lambda: with_object_masks(job, training_part(job), tell), otherwise=None)
     if found is None:
@@ -110,10 +114,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     """Write `sparse/0` if there is a model, and return what the report needs."""
     seconds = {"extract": 0.0, "match": 0.0, "map": 0.0, "check": 0.0}
     mapped = _mapped(job, report, tell, seconds=seconds)
-
-    def checks() -> Checks:
-        return Checks(Path(job.folder), skip=dict(job.skipped_checks))
-
+    checks = partial(_checks, job)
     with _timed(seconds, "check"):
         chosen = choose_component(mapped, report, tell, component=job.component, checks=checks)
     mapped, examined = chosen.mapped, chosen.examined
@@ -123,6 +124,7 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     result: dict[str, Any] = {
         "seconds": seconds,
         "attempts": mapped.attempts,
+        "cut_short": list(mapped.cut_short),
         "evidence": evidence(mapped.job),
         "pairs": len(mapped.job.pairs),
         "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
@@ -161,15 +163,24 @@ def _mapped(job: Job, report: Report, tell: Tell, *, seconds: dict[str, float]) 
     with _timed(seconds, "match"):
         matched = with_neighbours(job, report)
         start_matching(matched, matched.pairs)
-        match(matched, matched.pairs, report)
+        unmatched = match(matched, matched.pairs, report)
+        if unmatched is not None:
+            tell(f"cut short: {unmatched}")
     with _timed(seconds, "map"):
         start = time.perf_counter()
         climbed = climb(matched, report, tell)
-        write_mapped(replace(climbed, seconds=time.perf_counter() - start), key)
+        cut_short = climbed.cut_short if unmatched is None else (unmatched, *climbed.cut_short)
+        write_mapped(replace(climbed, seconds=time.perf_counter() - start, cut_short=cut_short), key)
     mapped = read_mapped(job, key)
     if mapped is None:
         raise OSError(f"cannot read back the models in {job.folder}")
     return mapped
+
+
+def _checks(job: Job) -> Checks:
+    """Make the runner of the checks of one model."""
+    most = limit_seconds(checking_seconds(len(job.files)), least=_LEAST_LIMIT_SECONDS)
+    return Checks(Path(job.folder), skip=dict(job.skipped_checks), seconds=most)
 
 
 def _coloured(model: pycolmap.Reconstruction, job: Job, checks: Checks) -> pycolmap.Reconstruction:

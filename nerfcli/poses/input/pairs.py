@@ -112,11 +112,12 @@ def looked_at_features(photos: int) -> int:
 
 
 def in_blocks(pairs: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """Return the pairs in an order in which few photos are in use at a time,
-    since the matcher keeps what it used last.
+    """Return the pairs in an order in which few photos are in use at a time, since the matcher keeps what it used last.
+
+    Photos near each other in the order come first: these are matched where the time does not suffice for all.
     """
     block = 16
-    return tuple(sorted(pairs, key=lambda pair: (pair[0] // block, pair[1] // block, pair)))
+    return tuple(sorted(pairs, key=lambda pair: (abs(pair[1] // block - pair[0] // block), pair[0] // block, pair)))
 
 
 def order_of_capture(photos: Sequence[Photo]) -> list[int] | None:

@@ -32,6 +32,8 @@ _AT_ONCE_SECONDS_PER_PHOTO = 0.5
 _CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
 # How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
 _GROWTH = {"map": 1.3}
+# So many times the planned seconds are the most: most captures take a third of these to twice, on a busy machine more.
+_MOST_TIMES_PLANNED = 10
 # Memory: of the libraries and of each photo in the mapper, and of a pixel that a thread searches in enlarged pictures.
 # Fitted to 50 photos of 270x480 (0.60 GB), 18 of 4000x2250 on one thread and on two (0.67, 0.77), and 1,000 (2.0).
 _BYTES, _BYTES_PER_PHOTO, _BYTES_PER_PIXEL = 500_000_000, 1_500_000, 70
@@ -83,7 +85,7 @@ def make_plan(photos: Photos, pairing: Pairing, settings: PoseSettings, *, threa
         "pair": looking_seconds(count) / threads if pairing.neighbours else 0.0,
         "match": matching_seconds(pairs, max_features=features) / threads,
         "map": mapping_seconds(count),
-        "check": _CHECK_SECONDS + count * _CHECK_SECONDS_PER_PHOTO,
+        "check": checking_seconds(count),
     }
     return Plan(
         photos=count,
@@ -124,6 +126,16 @@ def mapping_seconds(photos: int) -> float:
 def at_once_seconds(photos: int) -> float:
     """CPU seconds to place so many photos with the global mapper."""
     return photos * _AT_ONCE_SECONDS_PER_PHOTO
+
+
+def limit_seconds(planned: float, *, least: float) -> float:
+    """Return after how many seconds a step is stopped: what takes so many times as long as planned may never end."""
+    return max(_MOST_TIMES_PLANNED * planned, least)
+
+
+def checking_seconds(photos: int) -> float:
+    """CPU seconds to check the poses of so many photos."""
+    return _CHECK_SECONDS + photos * _CHECK_SECONDS_PER_PHOTO
 
 
 class Outlook:

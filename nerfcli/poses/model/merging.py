@@ -5,6 +5,8 @@ Matches between a photo of the one and a photo of the other whose pixels are poi
 similarity that brings many of them together joins the models.
 """
 
+import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from nerfcli.cameras.alignment import align as similarity
 from nerfcli.cameras.rigid import Similarity
+from nerfcli.poses.input.plan import duration
 from nerfcli.poses.model.intrinsics import settle
 from nerfcli.poses.model.two_views import VerifiedPair, agreements, read_verified_pairs
 
@@ -46,7 +49,9 @@ def merge_models(
     seed: int,
     threads: int,
     fixed: Sequence[int] = (),
+    seconds: float = math.inf,
     report: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> list[pycolmap.Reconstruction]:
     """Return the models, largest first, each joined with the ones before where they have enough in common.
 
@@ -59,14 +64,21 @@ def merge_models(
         seed: of the search for the similarity.
         threads: -1 for all.
         fixed: ids of cameras whose intrinsics stay as they are.
+        seconds: after which the rest of the models stay as they are.
         report: called with ("merge", models done, in all).
+        tell: called with what was cut short, if anything was.
     """
     with pycolmap.Database.open(str(database)) as opened:
         pairs = read_verified_pairs(opened, min_matches=1)
         tracks = _matched_keypoints(opened)
     merged: list[pycolmap.Reconstruction] = []
+    start = time.perf_counter()
     for number, model in enumerate(models):
         report("merge", number, len(models))
+        if time.perf_counter() - start > seconds:
+            merged.extend(models[number:])
+            tell(f"merging: {len(models) - number} of {len(models)} sub-models are left after {duration(seconds)}")
+            break
         if any(set(model.reg_image_ids()) <= set(base.reg_image_ids()) for base in merged):
             continue  # nothing that is not there already
         for index, base in enumerate(merged):

@@ -1,0 +1,139 @@
+"""What never ends is ended: matching, merging and each check stop far beyond their plan, and the result says so."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pycolmap
+import pytest
+import synthetic_captures as synthetic
+from corner import NAMES, write_capture
+from synthetic_captures import WIDE, Noise
+
+from nerfcli import scene as scenes
+from nerfcli.poses.engine import features
+from nerfcli.poses.engine.database import clear_matches
+from nerfcli.poses.engine.ladder import climb
+from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
+from nerfcli.poses.input.job import Job
+from nerfcli.poses.input.pairs import all_pairs, in_blocks
+from nerfcli.poses.input.plan import checking_seconds, limit_seconds
+from nerfcli.poses.input.settings import PoseSettings
+from nerfcli.poses.model import merging
+from nerfcli.poses.structure_from_motion import estimate_poses
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Job:
+    """Eight photos with features and matches."""
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    folder = tmp_path_factory.mktemp("capture")
+    views = synthetic.ring(8, [WIDE], seed=0, turn_deg=160)
+    synthetic.write_database(folder / "database.db", views, synthetic.boulder(700, seed=0), noise=Noise(), seed=0)
+    return synthetic.synthetic_job(folder, views, seed=0)
+
+
+def looked_at(job: Job) -> set[tuple[int, int]]:
+    """The pairs that the matcher has been at, with or without a result."""
+    with pycolmap.Database.open(str(job.database)) as database:
+        return {(i, j) for i, j in all_pairs(8) if database.exists_two_view_geometry(i + 1, j + 1)}
+
+
+def test_limits_are_ten_times_the_plan():
+    """In closed form: 1,000 photos are checked in 5 + 0.13 * 1000 s."""
+    assert limit_seconds(checking_seconds(1000), least=300) == pytest.approx(1350)
+    assert limit_seconds(checking_seconds(100), least=300) == 300
+
+
+def test_pairs_of_photos_near_in_the_order_come_first():
+    pairs = in_blocks(all_pairs(70))
+    assert sorted(pairs) == sorted(all_pairs(70))
+    apart = [j // 16 - i // 16 for i, j in pairs]
+    assert apart == sorted(apart)
+
+
+def test_matching_ends_at_its_limit_and_the_next_call_does_the_rest(
+    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A clock on which every look at the time is 200 s after the last, and a limit of 300 s: one part of 10 pairs."""
+    shutil.copytree(job.database.parent, tmp_path / "again")
+    job = replace(job, folder=str(tmp_path / "again" / "work"))
+    clear_matches(job, "matches", "two_view_geometries")
+    pairs = sorted(all_pairs(8))
+    with monkeypatch.context() as patched:
+        now = iter(range(0, 10_000, 200))
+        patched.setattr(features, "_PAIRS_PER_CALL", 10)
+        patched.setattr(features.time, "perf_counter", lambda: next(now))
+        said = features.match(job, pairs, lambda *progress: None)
+    assert said == "matching: 18 of 28 pairs are not matched after 5 min"
+    assert looked_at(job) == set(pairs[:10])
+    assert features.match(job, pairs, lambda *progress: None) is None
+    assert looked_at(job) == set(pairs)
+
+
+def test_what_was_cut_short_is_kept_with_the_models(job: Job):
+    mapped = climb(job, lambda *progress: None)
+    assert mapped.cut_short == ()
+    write_mapped(replace(mapped, cut_short=("matching: 1 of 28 pairs",)), mapping_key(job), name="cut")
+    again = read_mapped(job, mapping_key(job), name="cut")
+    assert again is not None
+    assert again.cut_short == ("matching: 1 of 28 pairs",)
+
+
+def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
+    """Without time, models that would be one stay two; with time, they do not."""
+    whole = climb(job, lambda *progress: None).models[0]
+    first, second = pycolmap.Reconstruction(whole), pycolmap.Reconstruction(whole)
+    for photo in range(1, 9):
+        if photo > 5:
+            first.deregister_frame(first.image(photo).frame_id)
+        if photo < 5:
+            second.deregister_frame(second.image(photo).frame_id)
+    sizes, said = {}, []
+    for seconds in (-1.0, 1e9):
+        merged = merging.merge_models(
+            [first, second],
+            job.database,
+            output=tmp_path / "merged",
+            seed=0,
+            threads=1,
+            seconds=seconds,
+            tell=said.append,
+        )
+        sizes[seconds] = [model.num_reg_images() for model in merged]
+    assert sizes == {-1.0: [5, 4], 1e9: [8]}
+    assert said == ["merging: 2 of 2 sub-models are left after -1 s"]
+
+
+def test_a_check_that_never_ends_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It may take half a second, and sleeps for an hour; the scene is there, mapped once, and says what it lacks."""
+    photos = tmp_path / "corner"
+    write_capture(photos)
+    (photos / "notes.jpg").unlink()
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(
+        "import time\n"
+        "from nerfcli.poses.judge import checks, uncertainty\n"
+        "uncertainty.pose_blur_px = lambda *a, **o: time.sleep(3600)\n"
+        "run = checks.Checks.run\n"
+        "def bounded(self, name, compute, *, otherwise, seconds=None):\n"
+        "    most = 0.5 if name == 'pose uncertainty' else seconds\n"
+        "    return run(self, name, compute, otherwise=otherwise, seconds=most)\n"
+        "checks.Checks.run = bounded\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "site"))
+    notes: list[str] = []
+    stages: list[tuple[str, int]] = []
+    settings = PoseSettings(max_features=300, threads=1, camera_model="SIMPLE_RADIAL")
+    report = estimate_poses(
+        photos,
+        tmp_path / "scene",
+        settings=settings,
+        notify=notes.append,
+        progress=lambda stage, done, total: stages.append((stage, done)),
+    )
+    assert report.registered == len(NAMES)
+    assert report.not_computed == {"pose uncertainty": "it took longer than 0 s"}
+    assert sum("could not compute a check (pose uncertainty): it took longer" in note for note in notes) == 2
+    assert stages.count(("map", 2)) == 1
+    assert scenes.load(tmp_path / "scene").frames
