@@ -11,7 +11,7 @@ from corner import NAMES, write_capture
 from synthetic_captures import WIDE, Noise
 
 from nerfcli import scene as scenes
-from nerfcli.poses.engine import features
+from nerfcli.poses.engine import features, ladder
 from nerfcli.poses.engine.database import clear_matches
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
@@ -78,6 +78,33 @@ def test_what_was_cut_short_is_kept_with_the_models(job: Job):
     again = read_mapped(job, mapping_key(job), name="cut")
     assert again is not None
     assert again.cut_short == ("matching: 1 of 28 pairs",)
+
+
+def test_no_attempt_begins_after_the_time_for_all(job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Two of eight photos are not placed, and other starts would be tried; the clock goes 100 s at each look.
+
+    One run may take 120 s and all 240 s: the third look is too late.
+    """
+    shutil.copytree(job.database.parent, tmp_path / "again")
+    job = replace(job, folder=str(tmp_path / "again" / "work"))
+    real = ladder.map_photos
+
+    def without_two(*arguments, **options) -> list[pycolmap.Reconstruction]:
+        models = real(*arguments, **options)
+        for photo in {7, 8} & set(models[0].reg_image_ids()):
+            models[0].deregister_frame(models[0].image(photo).frame_id)
+        return models
+
+    now = iter(range(0, 100_000, 100))
+    monkeypatch.setattr(ladder, "map_photos", without_two)
+    monkeypatch.setattr(ladder.time, "perf_counter", lambda: next(now))
+    notes: list[str] = []
+    climbed = climb(job, lambda *progress: None, notes.append)
+    assert climbed.attempts[0]["what"] == "default thresholds"
+    assert not any("start from" in attempt["what"] for attempt in climbed.attempts)
+    said = "no further attempts to place photos after 4 min"
+    assert climbed.cut_short == (said,)
+    assert notes.count(f"cut short: {said}") == 1
 
 
 def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):

@@ -46,6 +46,8 @@ _MOST_FULL_SIZE = 150
 _MORE_FEATURES = 8192
 # Searching larger pictures may take so many times as long as the first search, times the share of photos missing.
 _MOST_FOR_MORE = 5.0
+# All attempts together may take so many times as long as one run of the mapper may.
+_MOST_RUNS = 2
 # A focal length that differs from EXIF's by more than this factor (its logarithm) is reported.
 _FAR_FROM_EXIF = 0.1
 # A perspective lens from here on may be a fisheye.
@@ -69,6 +71,16 @@ class _Ladder:
         self._results_reported = 0
         self._announced = ""
         self._cut_short: list[str] = []
+        self._start = time.perf_counter()
+        self._is_over = False
+
+    def has_time(self) -> bool:
+        """Return whether another attempt may begin. Where none may, that is said once."""
+        most = _MOST_RUNS * mapper_limit_seconds(self._photos)
+        if not self._is_over and time.perf_counter() - self._start > most:
+            self._is_over = True
+            self._cut(f"no further attempts to place photos after {duration(most)}")
+        return not self._is_over
 
     def announce(self, what: str, *, takes: float = 0.0) -> None:
         """Report the results so far, and once what comes next."""
@@ -88,6 +100,8 @@ class _Ladder:
 
     def attempt(self, what: str, job: Job, start: MapperOptions) -> None:
         """Map once; the result counts if it places more photos than the best so far."""
+        if self.rungs and not self.has_time():
+            return
         if self.rungs:
             self.announce(what)
         number = len(self.rungs)
@@ -128,7 +142,7 @@ class _Ladder:
     def go_on(self, what: str, start: MapperOptions) -> None:
         """Try to place the rest from the best model as it is."""
         models, job = self.best.models, self.best.job
-        if not models:
+        if not models or not self.has_time():
             return
         self.announce(what)
         grown = self._map(what, job, start, base=models[0])
@@ -197,8 +211,8 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     a pair with a smaller baseline, from the strongest pair that was left out,
     and with low angles; of many photos, only if a quarter is left out. Then all pairs are compared that were not, and
     more features are sought in the photos' full size. Last, single photos are placed by the points that they show (see
-    `localise`). Where the camera only turned, nothing more is tried. If the first attempt is not the last, `tell`
-    receives each attempt and its result.
+    `localise`). Where the camera only turned, nothing more is tried; nor is it after twice the time that one run of the
+    mapper may take. If the first attempt is not the last, `tell` receives each attempt and its result.
     """
     job = given = with_focal_lengths(job, tell)
     ladder = _Ladder(job, report, tell)
@@ -212,12 +226,13 @@ def climb(job: Job, report: Report, tell: Tell = lambda text: None) -> Mapped:
     job = _with_fisheye(ladder, job, report, share=ladder.share(featured))
     _other_starts(ladder, job, tell)
     compared = set(job.pairs)
-    if 0 < math.comb(len(job.files), 2) - len(compared) <= _MOST_PAIRS and ladder.share(featured) < _GOOD_SHARE:
+    few_more = 0 < math.comb(len(job.files), 2) - len(compared) <= _MOST_PAIRS
+    if few_more and ladder.share(featured) < _GOOD_SHARE and ladder.has_time():
         rest = [pair for pair in all_pairs(len(job.files)) if pair not in compared]
         job = replace(job, pairs=(*job.pairs, *rest))
         ladder.match(job, rest)
         ladder.attempt("match all pairs", job, SMALLER_BASELINE)
-    if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE:
+    if _can_have_more_features(job) and ladder.share(featured) < _FEW_SHARE and ladder.has_time():
         _with_more_features(ladder, job, report, tell, missing=1 - ladder.share(featured))
     ladder.find_left_out("remaining photos one by one, from the 3D points they see")
     if len(ladder.rungs) > 1:
@@ -301,7 +316,7 @@ def _other_starts(ladder: _Ladder, job: Job, tell: Tell) -> None:
 def _without_exif(ladder: _Ladder, job: Job, report: Report, tell: Tell, *, share: float) -> Job:
     """Start without EXIF's focal lengths, if little is placed with them; the job of the better result."""
     bare = replace(job, groups=tuple(group.without_exif() for group in job.groups))
-    if share >= _LITTLE_SHARE or bare.groups == job.groups:
+    if share >= _LITTLE_SHARE or bare.groups == job.groups or not ladder.has_time():
         return job
     what = "without EXIF's focal length"
     ladder.announce(what)
@@ -323,7 +338,7 @@ def _with_fisheye(ladder: _Ladder, job: Job, report: Report, *, share: float) ->
     if share >= _GOOD_SHARE and not ladder.is_wide():
         return job
     fisheye = as_fisheye(job)
-    if fisheye is None:
+    if fisheye is None or not ladder.has_time():
         return job
     ladder.announce("start from a fisheye lens")
     register_photos(fisheye)  # which takes out what was verified with another lens

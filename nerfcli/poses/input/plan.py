@@ -32,8 +32,8 @@ _AT_ONCE_SECONDS_PER_PHOTO = 0.5
 _CHECK_SECONDS, _CHECK_SECONDS_PER_PHOTO = 5.0, 0.13
 # How the time of a stage grows with what it has done, as a power: the mapper's photos take longer and longer.
 _GROWTH = {"map": 1.3}
-# Of the checks, the share of their time after each of the four: single photos 2 %, lens models half. Measured on 11, 16,
-# 20 and 50 photos.
+# Of the checks, the share of their time that is over after each of the four: single photos 2 %, lens models half.
+# Measured on 11, 16, 20 and 50 photos.
 _CHECK_SHARES = (0.0, 0.02, 0.5, 0.8, 1.0)
 # So many times the planned seconds are the most: most captures take a third of these to twice, on a busy machine more.
 _MOST_TIMES_PLANNED = 10
