@@ -1,5 +1,6 @@
 """What never ends is ended: matching, merging and each check stop far beyond their plan, and the result says so."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from corner import NAMES, write_capture
 from synthetic_captures import WIDE, Noise
 
 from nerfcli import scene as scenes
-from nerfcli.poses.engine import features, ladder
+from nerfcli.poses.engine import features, ladder, worker
 from nerfcli.poses.engine.database import clear_matches
 from nerfcli.poses.engine.ladder import climb
 from nerfcli.poses.engine.mapped import mapping_key, read_mapped, write_mapped
@@ -107,6 +108,22 @@ def test_no_attempt_begins_after_the_time_for_all(job: Job, tmp_path: Path, monk
     assert notes.count(f"cut short: {said}") == 1
 
 
+def test_a_way_to_map_that_was_ended_is_reported_and_a_check_once(
+    job: Job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Two names by which the worker was ended before: one is a check of the accepted model, the other is not."""
+    shutil.copytree(job.database.parent, tmp_path / "again")
+    ended = (("pose uncertainty", "it took longer than 5 min"), ("global mapper", "it took longer than 2 min"))
+    job = replace(job, folder=str(tmp_path / "again" / "work"), skipped_checks=ended)
+    # There are no photos: their features are in the database already.
+    monkeypatch.setattr(worker, "extract", lambda job, report: None)
+    monkeypatch.setattr(worker, "with_object_masks", lambda job, training, tell: (job, None))
+    worker.solve(job, lambda *progress: None, lambda note: None)
+    content = json.loads((Path(job.folder) / "result.json").read_text(encoding="utf-8"))["content"]
+    assert content["not_computed"] == {"pose uncertainty": "it took longer than 5 min"}
+    assert content["cut_short"] == ["global mapper: it took longer than 2 min"]
+
+
 def test_merging_ends_at_its_limit(job: Job, tmp_path: Path):
     """Without time, models that would be one stay two; with time, they do not."""
     whole = climb(job, lambda *progress: None).models[0]
@@ -161,6 +178,7 @@ def test_a_check_that_never_ends_is_left_out(tmp_path: Path, monkeypatch: pytest
     )
     assert report.registered == len(NAMES)
     assert report.not_computed == {"pose uncertainty": "it took longer than 0 s"}
+    assert report.cut_short == ()
     assert sum("could not compute a check (pose uncertainty): it took longer" in note for note in notes) == 2
     assert stages.count(("map", 2)) == 1
     assert scenes.load(tmp_path / "scene").frames

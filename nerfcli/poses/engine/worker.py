@@ -121,10 +121,14 @@ def _estimate(job: Job, report: Report, tell: Tell) -> dict[str, Any]:
     others = [*mapped.models[: job.component - 1], *mapped.models[job.component :]]
     model = examined.model
     placed = [] if model is None else photo_numbers(model, job)
+    lacking = examined.details["not_computed"]  # of this model; ways to map it were ended too
     result: dict[str, Any] = {
         "seconds": seconds,
         "attempts": mapped.attempts,
-        "cut_short": list(mapped.cut_short),
+        "cut_short": [
+            *mapped.cut_short,
+            *(f"{what}: {why}" for what, why in job.skipped_checks if what not in lacking),
+        ],
         "evidence": evidence(mapped.job),
         "pairs": len(mapped.job.pairs),
         "versions": {"pycolmap": pycolmap.__version__, "ceres": pycolmap.__ceres_version__},
