@@ -143,6 +143,17 @@ def read_json(path: Path, *, needed: tuple[str, ...], hint: str) -> dict[str, An
     return content
 
 
+def refuse_read_only(path: Path) -> None:
+    """Refuse a place where nothing can be written, before the work rather than after it.
+
+    Raises:
+        UserError: the nearest folder above `path` that exists may not be written.
+    """
+    home = next(folder for folder in path.absolute().parents if folder.exists())
+    if not os.access(home, os.W_OK):
+        raise UserError(f"cannot write {path}: no write permission", f"make {home} writable, or use a folder that is")
+
+
 def cannot_write(path: Path, error: OSError) -> UserError:
     """Return the two-line error for a result that could not be written."""
     reason = error.strerror or str(error)

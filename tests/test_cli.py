@@ -133,7 +133,7 @@ def test_a_line_that_does_not_parse_is_noticed():
     for line, message in (
         ("nerfcli trian x", "trian"),
         ("nerfcli train x --stepz 3", "stepz"),
-        ("nerfcli train x --steps 0  # a comment", "greater than or equal to 1"),
+        ("nerfcli train x --steps 0  # a comment", "give at least 1"),
         ("ls -d */ | nerfcli train", None),
     ):
         with pytest.raises((KeyError, TyperException), match=message):
@@ -170,6 +170,16 @@ def test_all_threads_are_the_processors_of_this_process():
         ("view x y", "unexpected extra argument(s) (y)"),
         ("export x", "'--to'. What to export: page, mesh"),
         ("train x --steps 0", "--steps"),
+        ("train x --steps 1.5", "'1.5' is not a whole number. Total optimizer steps"),
+        ("train x --threads all", "'all' is not a whole number. Number of CPU threads; 0 uses all."),
+        ("train x --budget 2", "'2' has no unit; write 2s or 2m"),
+        ("view x --port 80000", "'80000' is too large; give at most 65535"),
+        ("ablate x --seeds 0", "'0' is too small; give at least 1"),
+        ("report x --depth expected", "'expected'; choose conditional, moment, max-weight, median or quantile:Q"),
+        ("export x --to page --faces 100", "--faces: it is for meshes"),
+        ("export x --to volume --water 0.2", "--water: it is for X-ray scans"),
+        ("export x --to points --format laz -o x.ply", "'laz' contradicts -o x.ply"),
+        ("train x y", "(y); give one, or several on standard input: ls -d *-scene/ | nerfcli train -"),
         ("train x --downscale 3", "'3'; choose auto, 1, 2, 4 or 8"),
         ("train x --field gaussians", "'gaussians'; choose hash, voxels or mlp"),
         ("train x --budget soon", "--budget: 'soon' is not a time"),
@@ -459,7 +469,9 @@ def test_many_inputs_share_one_output_folder(capture, tmp_path):
 def test_an_empty_batch_is_told(command, stdin, tmp_path):
     result = nerfcli(command, "-", *needed(command, tmp_path), stdin=stdin)
     assert result.exit_code == BAD_INPUT
-    assert "no paths on standard input" in error_of(result)[0]
+    error, hint = error_of(result)
+    assert "no paths on standard input" in error
+    assert hint.endswith(f" | nerfcli {command} -")
 
 
 def test_a_finished_training_is_kept_another_one_refused_and_overwritten_on_demand(capture):

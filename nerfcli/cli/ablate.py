@@ -89,6 +89,7 @@ def ablate(
       nerfcli ablate photos-scene --model default --seeds 5 --whole -o paper/ablation
     """
     from nerfcli.ablate.results import COLUMNS, ResultRow, table_of
+    from nerfcli.cli.scans import refuse_scan
     from nerfcli.runs.components import CHOICES, Components, choose
     from nerfcli.runs.settings import TrainSettings, sizes_for
     from nerfcli.workflows.ablate import ablate_scene
@@ -114,6 +115,7 @@ def ablate(
     rule, limit = holdout_rule(holdout), memory_limit(memory, torch_device)
 
     def work(path: Path, one_of_many: bool) -> None:
+        refuse_scan(path, "ablate")
         folder = result_path(path, suffix="-ablation", output=output, one_of_many=one_of_many)
         with console.progress(f"ablate {path.name}") as update:
             content = ablate_scene(
@@ -135,4 +137,4 @@ def ablate(
         console.note(f"protocol: {rows[-1].protocol}; 95 % intervals from Student's t over the seeds")
         console.result(folder / "ablation.csv", content)
 
-    for_each_input(scene, work)
+    for_each_input(scene, work, command="ablate")

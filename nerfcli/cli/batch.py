@@ -10,9 +10,11 @@ from nerfcli.cli.console import out_of_memory_explained, report_error
 from nerfcli.errors import UserError
 
 STDIN = "-"
+# Commands that read scenes, and those that read runs; the others read captures.
+_READ_SCENES, _READ_RUNS = ("train", "ablate"), ("evaluate", "render", "export", "report", "bench", "info")
 
 
-def for_each_input(source: str, work: Callable[[Path, bool], None]) -> None:
+def for_each_input(source: str, work: Callable[[Path, bool], None], *, command: str) -> None:
     """Call `work(path, one_of_many)` for the path, or for each line of standard input as it comes.
 
     A path that fails is reported and the others go on; the exit code is then that of the first failure.
@@ -20,6 +22,7 @@ def for_each_input(source: str, work: Callable[[Path, bool], None]) -> None:
     Args:
         source: a path, or "-".
         work: does the whole command for one input.
+        command: its name, for the hint.
 
     Raises:
         UserError: the only input failed, or standard input held no path.
@@ -38,11 +41,20 @@ def for_each_input(source: str, work: Callable[[Path, bool], None]) -> None:
             report_error(error, about=str(path))
             first_failure = first_failure or error
     if count == 0:
-        raise UserError(
-            "no paths on standard input", "give one path per line, for example: ls -d captures/*/ | nerfcli poses -"
-        )
+        raise no_paths(command)
     if first_failure is not None:
         raise typer.Exit(first_failure.exit_code)
+
+
+def no_paths(command: str) -> UserError:
+    """Return the error of a command that found no path on standard input."""
+    return UserError("no paths on standard input", f"give one path per line, for example: {example_of_many(command)}")
+
+
+def example_of_many(command: str) -> str:
+    """Return a command line that gives a command several inputs."""
+    inputs = "*-scene/" if command in _READ_SCENES else "*-run/" if command in _READ_RUNS else "captures/*/"
+    return f"ls -d {inputs} | nerfcli {command} -"
 
 
 def stdin_paths() -> Iterator[Path]:

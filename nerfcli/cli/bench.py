@@ -74,10 +74,12 @@ def bench(
         )
     console = Console(quiet=quiet, json_lines=json)
     from nerfcli.bench.measurement import BenchOptions
+    from nerfcli.cli.scans import refuse_scan
 
     wanted = BenchOptions(seconds, sweep, seed)
 
     def work(path: Path, one_of_many: bool) -> None:
+        refuse_scan(path, "bench")
         folder = result_path(path, suffix="-bench", output=output, one_of_many=one_of_many)
         page, content = bench_one(
             path,
@@ -90,7 +92,7 @@ def bench(
         )
         console.result(page, content)
 
-    for_each_input(source, work)
+    for_each_input(source, work, command="bench")
 
 
 def bench_one(

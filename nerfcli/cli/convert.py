@@ -236,7 +236,7 @@ def convert(
         if not convert_scan(path, one_of_many):
             work(path, one_of_many)
 
-    for_each_input(source, either)
+    for_each_input(source, either, command="convert")
 
 
 def _print_verification(done: "Conversion", console: Console) -> None:

@@ -96,7 +96,7 @@ def doctor(
         if require is not None:
             _hold_against(diagnosis, require)
 
-    for_each_input(capture, work)
+    for_each_input(capture, work, command="doctor")
 
 
 def _examine_run(path: Path, folder: Path, console: Console, *, count: int, threads: int, overwrite: bool) -> None:

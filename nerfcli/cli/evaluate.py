@@ -181,10 +181,10 @@ def evaluate(
 
     if dry_run:
         for run in runs:
-            for_each_input(run, plan)
+            for_each_input(run, plan, command="evaluate")
         return
     if seeds == 1 and len(runs) == 1:
-        for_each_input(runs[0], work)
+        for_each_input(runs[0], work, command="evaluate")
         return
     folders = [Path(run) for run in runs]
     if seeds > 1:

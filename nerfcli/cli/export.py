@@ -30,7 +30,10 @@ def export(
     voxel_size: Annotated[
         float | None, typer.Option(help="Voxel size in scene units.  [default: the resolution of the photos]")
     ] = None,
-    faces: Annotated[int, typer.Option(help="Maximum number of triangles of a mesh.", min=4)] = 300_000,
+    faces: Annotated[
+        int | None,
+        typer.Option(help="Maximum number of triangles of a mesh.  [default: 300000]", min=4, show_default=False),
+    ] = None,
     max_size: Annotated[
         int, typer.Option(help="Longer side of the depth maps that are fused, in pixels.", min=16, max=8192)
     ] = 480,
@@ -72,7 +75,7 @@ def export(
       nerfcli export photos-scene-run --to colmap-dense -o kitchen-dense
       nerfcli export tooth-scene-run --to volume -o tooth.nrrd
     """
-    from nerfcli.surface.settings import SurfaceSettings
+    from nerfcli.surface.settings import FACES, SurfaceSettings
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.export import TARGETS, default_target, export_run
 
@@ -97,8 +100,14 @@ def export(
     finite(voxel_size, "--voxel-size")
     if voxel_size is not None and voxel_size <= 0:
         raise typer.BadParameter(f"{voxel_size:g} is not a positive size", param_hint="--voxel-size")
+    unused = {"--faces": faces is not None and to != "mesh", "--water": water is not None}
+    if option := next((name for name, is_given in unused.items() if is_given), None):
+        suited = "meshes" if option == "--faces" else "X-ray scans"
+        raise typer.BadParameter(f"it is for {suited}; remove it", param_hint=option)
+    if suffix is not None and output is not None and run != STDIN and output.suffix.lower() not in ("", suffix):
+        raise typer.BadParameter(f"{form!r} contradicts -o {output}; remove one of them", param_hint="--format")
     settings = SurfaceSettings(
-        box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces, max_size=max_size
+        box=None if box is None else box_of(box), voxel_size=voxel_size, faces=faces or FACES, max_size=max_size
     )
 
     def work(folder: Path, one_of_many: bool) -> None:
@@ -123,7 +132,7 @@ def export(
             )
         console.result(written)
 
-    for_each_input(run, work)
+    for_each_input(run, work, command="export")
 
 
 def box_of(text: str) -> tuple[float, ...]:

@@ -67,4 +67,4 @@ def info(
                 lines += [f"  {line}" for line in cost_lines(costs)]
             typer.echo("\n".join([str(folder), *(f"  {line}" for line in lines)]))
 
-    for_each_input(path, work)
+    for_each_input(path, work, command="info")

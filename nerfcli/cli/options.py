@@ -85,6 +85,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print results as JSON Lines 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing result.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show only warnings and errors.")]
 
+# A shorter time has to come with its unit.
+FEWEST_PLAIN_SECONDS = 10.0
 _SECONDS_PER_UNIT = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -117,12 +119,14 @@ def seconds_from_text(text: str, option: str = "--budget") -> float:
     """Parse 90s, 5m, 1.5h or plain seconds, the value of an option.
 
     Raises:
-        typer.BadParameter: anything else, or zero.
+        typer.BadParameter: anything else, zero, or a few seconds without a unit: who writes 2 means minutes.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smh]?)", text.strip())
     seconds = float(match[1]) * _SECONDS_PER_UNIT[match[2] or "s"] if match else 0.0
     if not seconds > 0:
         raise typer.BadParameter(f"{text!r} is not a time; write 90s, 5m or 1h", param_hint=option)
+    if match and not match[2] and seconds < FEWEST_PLAIN_SECONDS:
+        raise typer.BadParameter(f"{text!r} has no unit; write {match[1]}s or {match[1]}m", param_hint=option)
     return seconds
 
 

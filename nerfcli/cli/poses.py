@@ -191,7 +191,7 @@ def poses(
         print_database(scene, drop=drop_database, console=console)
         console.result(scene)
 
-    for_each_input(photos, work)
+    for_each_input(photos, work, command="poses")
 
 
 def sizes_of(quality: str) -> tuple[int, int]:

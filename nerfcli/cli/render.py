@@ -249,7 +249,7 @@ def render(
                 console.result(path)
 
     if is_of_scan(run, outputs=outputs, slices=slices):
-        for_each_input(run, render_one_scan)
+        for_each_input(run, render_one_scan, command="render")
         return
     chosen = some_of(outputs or "rgb,depth,opacity", OUTPUTS, "--outputs")
     if not is_convention(depth):
@@ -353,4 +353,4 @@ def render(
         for path in written:
             console.result(path)
 
-    for_each_input(run, work)
+    for_each_input(run, work, command="render")

@@ -5,10 +5,9 @@ from typing import Annotated
 
 import typer
 
-from nerfcli.cli.batch import STDIN, stdin_paths
+from nerfcli.cli.batch import STDIN, no_paths, stdin_paths
 from nerfcli.cli.console import Console, command
 from nerfcli.cli.options import Device, Json, Output, Overwrite, Quiet, Threads, device_name, one_of, thread_count
-from nerfcli.errors import UserError
 
 
 @command
@@ -40,16 +39,17 @@ def report(
       nerfcli report small-run large-run -o comparison.html
       ls -d *-run/ | nerfcli report - --views 4 -o all.html
     """
-    from nerfcli.render.depth import DepthRequest, is_convention
+    from nerfcli.render.depth import CONVENTIONS, DepthRequest, is_convention
     from nerfcli.workflows.report import report_runs
 
     if not is_convention(depth) or depth == "background":
-        raise typer.BadParameter(f"{depth!r}; choose one listed in nerfcli render --help", param_hint="--depth")
+        choices = ", ".join(name for name in CONVENTIONS if name != "background")
+        raise typer.BadParameter(f"{depth!r}; choose {choices} or quantile:Q with 0 < Q < 1", param_hint="--depth")
     one_of(depth_axis, ("ray", "z"), "--depth-axis")
     console = Console(quiet=quiet, json_lines=json)
     paths = list(stdin_paths()) if runs == [STDIN] else [Path(run) for run in runs]
     if not paths:
-        raise UserError("no run was given", "give run folders written by nerfcli train")
+        raise no_paths("report")
     with console.progress("report") as update:
         page = report_runs(
             paths,

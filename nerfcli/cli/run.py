@@ -174,4 +174,4 @@ def run(
         console.result(page)
         check_requirements(trained, evaluation.metrics, requirements)
 
-    for_each_input(photos, work)
+    for_each_input(photos, work, command="run")

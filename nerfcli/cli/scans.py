@@ -81,6 +81,22 @@ def slices_of(texts: list[str]) -> tuple[tuple[str, float], ...]:
     return tuple(found)
 
 
+def refuse_scan(path: Path, command: str) -> None:
+    """Refuse X-ray data, and a reconstruction of it, in a command that is for photos.
+
+    Raises:
+        UserError: the path holds either.
+    """
+    from nerfcli.tomography.formats.read import recognise
+    from nerfcli.tomography.result import is_reconstruction
+
+    hint = f"{command} is for photos; commands for scans: convert, doctor, train, evaluate, render, export, info"
+    if is_reconstruction(path):
+        raise UserError(f"{path} is the reconstruction of an X-ray scan, not a run of photos", hint)
+    if recognise(path) is not None:
+        raise UserError(f"{path} is an X-ray scan, not a scene of photos", hint)
+
+
 def is_of_scan(run: str, *, outputs: str | None, slices: list[str] | None) -> bool:
     """Return whether the options of render, or the only run it gets, are those of a scan."""
     from nerfcli.tomography.result import OUTPUTS, is_reconstruction

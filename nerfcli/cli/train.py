@@ -49,7 +49,7 @@ def train(
     scene: Annotated[str, typer.Argument(help="Scene folder, or - to read paths from standard input.")],
     output: Output = None,
     budget: Annotated[
-        str | None, typer.Option(help="Training time: 90s, 5m, 1h.  [default: 2m, or none with --steps]")
+        str | None, typer.Option(help="Training time: 90s, 5m, 1h; 90 is 90 s.  [default: 2m, or none with --steps]")
     ] = None,
     steps: Annotated[
         int | None, typer.Option(help="Total optimizer steps; results repeat bit for bit on a CPU.", min=1)
@@ -348,6 +348,8 @@ def train(
             raise UserError(
                 f"{folder} is a scan in a scanner's format", f"convert it first: nerfcli convert {folder} SCAN"
             )
+        elif voxel_size is not None:
+            raise UserError(f"--voxel-size is for X-ray scans, and {folder} is none", "remove --voxel-size")
         elif dry_run:
             plan_one_scene(folder)
             return
@@ -362,4 +364,4 @@ def train(
         # A wrong option is refused before anything is read.
         member_settings(photo_settings(), member_count, vary=vary)
         block_settings(photo_settings(), 0, count)
-    for_each_input(scene, work)
+    for_each_input(scene, work, command="train")

@@ -5,12 +5,25 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
+from nerfcli.cli.batch import example_of_many
+
 # Of click, or of typer's own copy of it, by typer's version.
 _UsageError: Any = typer.BadParameter.__bases__[0]
 
 
+# What is wrong with a value, by the name of pydantic's error, which typer has from 0.29 on.
+_WRONG_VALUES = {
+    "int_parsing": "is not a whole number",
+    "int_parsing_size": "is too long for a whole number",
+    "float_parsing": "is not a number",
+    "greater_than_equal": "is too small; give at least {ge:g}",
+    "less_than_equal": "is too large; give at most {le:g}",
+}
+
+
 class Command(TyperCommand):
-    """A command that also says who has an unknown option, how to give several inputs, and what a missing one is."""
+    """A command whose usage errors also say which command has an unknown option, how to give several inputs, what a
+    missing one is, and what is wrong with a number."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; see `TyperCommand.parse_args`."""
@@ -24,13 +37,25 @@ class Command(TyperCommand):
                     error.message = f"No such option: {option}, which belongs to {', '.join(owners)}"
                     error.possibilities = None
             elif "unexpected extra argument" in error.message and self._reads_paths():
-                error.message += f"; give one, or several on standard input: ls -d captures/*/ | nerfcli {self.name} -"
+                error.message += f"; give one, or several on standard input: {example_of_many(str(self.name))}"
+            elif text := _wrong_value(error):
+                error.message = text
             elif not error.message and (help_text := getattr(error.param, "help", None)):  # a missing one
                 error.message = help_text
             raise
 
     def _reads_paths(self) -> bool:
         return any("standard input" in (getattr(parameter, "help", None) or "") for parameter in self.params)
+
+
+def _wrong_value(error: Any) -> str | None:
+    """Return what is wrong with a number; None for other errors."""
+    problems = getattr(error.__cause__, "errors", list)()
+    if not problems or problems[0]["type"] not in _WRONG_VALUES:
+        return None
+    text = _WRONG_VALUES[problems[0]["type"]].format(**problems[0].get("ctx", {}))
+    meaning = (getattr(error.param, "help", None) or "").partition("  [")[0]
+    return f"{str(problems[0]['input'])!r} {text}. {meaning}".rstrip()
 
 
 def _has(command: Any, option: str) -> bool:

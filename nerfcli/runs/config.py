@@ -159,7 +159,7 @@ def read_config(run: Path) -> RunConfig:
     """
     try:
         return RunConfig.from_json(read_sealed(run / CONFIG))
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         raise no_run(run) from error
     except UserError as error:
         raise UserError(f"{run / CONFIG} cannot be read: {error.message}", MEND) from error
@@ -172,6 +172,8 @@ def no_run(path: Path) -> UserError:
     hint = "give a run folder written by nerfcli train"
     if not path.exists():
         return UserError(f"{path} does not exist", hint)
+    if path.is_file():
+        return UserError(f"{path} is a file, not a run folder", hint)
     if is_scene(path):
         return UserError(f"{path} is a scene, not a run", f"train it first: nerfcli train {path}")
     if (path / RECONSTRUCTION).exists():

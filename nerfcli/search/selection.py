@@ -148,7 +148,7 @@ def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list
     """
     wanted: list[tuple[Change, str]] = []
     if facts.points and may_use_points(requested, facts):
-        wanted.append((("points", CHOICES["points"].on), f"{facts.points} pixels see a 3D point at a known distance"))
+        wanted.append((("points", CHOICES["points"].on), f"{facts.points:,} pixels see a 3D point at a known distance"))
         if facts.stereo:
             wanted.append((("stereo", True), f"several photos agree on the depth of {facts.stereo} pixels"))
         if facts.exposure_spread > LIKELY_EXPOSURE_SPREAD:

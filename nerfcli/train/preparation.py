@@ -183,7 +183,7 @@ def prepare(
     camera = album.photos[0].frame.camera
     notify(
         f"{len(album.photos)} training photos, {len(scene.test_frames)} held out, "
-        f"{camera.width}x{camera.height} (1/{factor}), {extent}, {settings.device}, {settings.threads} threads"
+        f"{camera.width}x{camera.height} (1/{factor}), {extent}, {settings.device}, {_threads(settings.threads)}"
     )
     if pool.without_ray:
         notify(f"{pool.without_ray} pixels are skipped: they lie outside the lens model's field of view")
@@ -209,7 +209,7 @@ def prepare(
         gains = selection.log_gains
     elif settings.components.exposure == "learned" and settings.components.stereo:
         gains = evidence.gains_or(gains)
-    points = _points(scene, settings.components, evidence, pool=pool) if settings.components.points else None
+    points = _points(scene, settings, evidence, pool=pool) if settings.components.points else None
     sky = evidence.sky if settings.components.background == "sphere" else None
     seconds = evidence.stereo_seconds if selection is None else selection.seconds
     return Prepared(
@@ -217,16 +217,21 @@ def prepare(
     )
 
 
-def _points(scene: Scene, components: Components, evidence: Evidence, *, pool: PixelPool) -> PointRays:
+def _points(scene: Scene, settings: TrainSettings, evidence: Evidence, *, pool: PixelPool) -> PointRays:
     """Return the pixels at known distances that are drawn in each step."""
-    points = PointRays(evidence.sets(components), pool)
+    points = PointRays(evidence.sets(settings.components), pool)
     if not points.sets:
         raise UserError(
             f"--with points: no 3D point could be triangulated from the photos of {scene.root}",
             "use a scene written by nerfcli poses or a COLMAP model, or remove --with points",
         )
-    evidence.notify(f"points: {len(evidence.of_tracks.numbers)} pixels see a 3D point at a known distance")
+    if settings.model != "auto" or "points" in settings.fixed:  # else the decision on points has said it
+        evidence.notify(f"points: {len(evidence.of_tracks.numbers):,} pixels see a 3D point at a known distance")
     return points
+
+
+def _threads(count: int) -> str:
+    return f"{count} {'thread' if count == 1 else 'threads'}"
 
 
 def _facts(

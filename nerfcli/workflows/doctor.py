@@ -1,11 +1,10 @@
 """Examine a capture: findings, and a page with thumbnails."""
 
-import os
 from pathlib import Path
 
 import cv2
 
-from nerfcli.atomic import cannot_write
+from nerfcli.atomic import refuse_read_only
 from nerfcli.convert.camera_files import read_calibration
 from nerfcli.doctor.examination import Diagnosis, estimated_seconds, examine
 from nerfcli.doctor.page import refuse_foreign, write_page
@@ -44,9 +43,7 @@ def examine_capture(
         raise UserError(f"{page} is a folder", "give a file name for the page with -o")
     if not overwrite:
         refuse_foreign(page, path)
-    home = next(folder for folder in page.absolute().parents if folder.exists())
-    if not os.access(home, os.W_OK):  # before the work rather than after it
-        raise cannot_write(page, PermissionError(13, "no write permission"))
+    refuse_read_only(page)
     count = len(subject.sources)
     notify(f"{path}: {count} photos, about {_time(estimated_seconds(count, threads))}")
     cv2.setNumThreads(1)  # photos and pairs are worked on in parallel; threads within them only wait for each other

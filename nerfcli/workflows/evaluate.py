@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from nerfcli.atomic import atomic_folder, clear_leftovers, read_json, write_json
+from nerfcli.atomic import atomic_folder, clear_leftovers, read_json, refuse_read_only, write_json
 from nerfcli.cameras.frame import Frame
 from nerfcli.errors import GATE_NOT_MET, UserError
 from nerfcli.evaluate.ledger import leak_ledger
@@ -96,6 +96,7 @@ def evaluate_run(
     summary = trained.summary
     if summary is None:
         raise UserError(f"{trained.path} has no {LOG}, which records the training time", "train again with --overwrite")
+    refuse_read_only(trained.metrics_path)
     test = trained.cameras.test
     held_out = held_out_photos_of(trained.config, test, model, threads=cores)
     perceptual = find_perceptual(notify)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from nerfcli.atomic import cannot_write
+from nerfcli.atomic import cannot_write, refuse_read_only
 from nerfcli.errors import UserError
 from nerfcli.pages.page import write_page
 from nerfcli.photos.undistorted import pinhole_frame
@@ -132,6 +132,7 @@ def refuse_existing(path: Path, *, overwrite: bool, folder: bool) -> None:
             path.resolve().parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise cannot_write(path, error) from error
+    refuse_read_only(path)
 
 
 def _export_page(

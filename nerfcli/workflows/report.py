@@ -5,6 +5,7 @@ from pathlib import Path
 
 import torch
 
+from nerfcli.atomic import refuse_read_only
 from nerfcli.errors import UserError
 from nerfcli.evaluate.run_photos import held_out_photos_of
 from nerfcli.export.settings import depth_meta
@@ -58,6 +59,7 @@ def report_runs(
         raise UserError(f"{target} is a folder", "give a file name for the page with -o")
     if not overwrite:
         refuse_foreign(target, mark_of(runs), about="report")
+    refuse_read_only(target)
     torch.set_num_threads(thread_count(threads))
     opened, facts, hashes = [], [], []
     for path, label in zip(runs, labels_of(runs), strict=True):

@@ -122,7 +122,9 @@ def _trained(
         if not _keeps(run, loaded, settings, resume=resume, overwrite=overwrite):
             return False
         ranks.from_first(None)  # nothing to do for the others, either
-        notify(f"{run} is kept: it is complete and has these settings; add --overwrite to train again")
+        complete = "it is complete and has these settings; add --overwrite to train again"
+        used = "its training has used this budget; give a larger --budget or --steps"
+        notify(f"{run} is kept: {used if resume else complete}")
         return True
 
     if is_kept():
@@ -289,6 +291,10 @@ def _keeps(path: Path, scene: Scene, settings: TrainSettings, *, resume: bool, o
         )
     if resume and run.config.scene_fingerprint != scenes.fingerprint(scene):
         raise UserError(f"{path} was trained on a different scene than {scene.root}", "choose another folder with -o")
+    if resume and run.is_complete(settings):  # before stereo matching is repeated for nothing
+        before = run.config.settings
+        same = replace(settings, budget_seconds=before.budget_seconds, steps=before.steps)
+        return run.is_trained_from(scene, same)
     if run.is_trained and not resume and not overwrite:
         if run.is_trained_from(scene, settings) and run.is_complete(settings):
             return True
