@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from fog import SIDE, STEP, fog, foggy_cells
+from frame_rays import frame_rays
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -14,7 +15,6 @@ from nerfcli.cameras.rigid import Similarity, from_parts, look_at, rotation_from
 from nerfcli.render.depth import CONVENTIONS
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import DepthRequest, RenderedPicture, default_rays_per_tile, render_picture
-from nerfcli.render.rays import frame_rays
 
 # From a scene that is turned, moved and four times as large as the training frame.
 SIMILARITY = Similarity(0.25, rotation_from_quaternion(np.array([0.8, 0.2, -0.4, 0.4])), np.array([0.3, -0.2, 0.1]))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from frame_rays import frame_rays
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
@@ -20,7 +21,6 @@ from nerfcli.memory import default_memory_limit, resident_bytes
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
 from nerfcli.photos.pool import Album, PixelPool, load_album
 from nerfcli.photos.storage import IN_MEMORY, InFiles, Needs, PhotoStorage, check_device_memory, storage_for
-from nerfcli.render.rays import frame_rays
 from nerfcli.runs.settings import TrainSettings
 from nerfcli.scene import Scene
 from nerfcli.train import preparation

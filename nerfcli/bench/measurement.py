@@ -35,7 +35,7 @@ THIS_RUN = "this run"
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """What to measure.
+    """Options of a bench.
 
     Args:
         budget_seconds: for everything.

@@ -12,6 +12,7 @@ from nerfcli.bench.tables import (
     RENDERING_COLUMNS,
     TRAINING_COLUMNS,
     command_of,
+    numbers_of,
     rendering_rows,
     sentences,
     training_rows,
@@ -67,11 +68,7 @@ def _advice(advice: Mapping[str, Any]) -> str:
     head = f"<p>{escape(advice['part'].capitalize())}, {escape(advice['question'])}</p>"
     if advice["point"] is None:
         return f"<div>{head}<b>none of the measured settings</b></div>"
-    unit = "s per picture" if advice["part"] == "rendering" else "s of training"
-    text = f"{advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
-    if advice["against"] != advice["point"]:
-        text += f" ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"
-    what = f"<b>{escape(advice['point'])}</b><p>{escape(text)}</p>"
+    what = f"<b>{escape(advice['point'])}</b><p>{escape(numbers_of(advice))}</p>"
     return f"<div>{head}{what}<code>{escape(command_of(advice))}</code></div>"
 
 

@@ -34,7 +34,7 @@ class TimeSpread:
 
 @dataclass(frozen=True)
 class SettingResult:
-    """What a setting costs and what it gives; the smaller the error, the better, in any unit."""
+    """Cost and error of a setting; the smaller the error, the better, in any unit."""
 
     name: str
     seconds: TimeSpread

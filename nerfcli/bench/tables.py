@@ -123,16 +123,21 @@ def command_of(advice: Mapping[str, Any]) -> str:
     return f"nerfcli train SCENE --budget {advice['seconds']:.0f}s {advice['options']}".strip()
 
 
+def numbers_of(advice: Mapping[str, Any]) -> str:
+    """Return time and PSNR of a recommendation, with those of the setting that it is compared with."""
+    unit = "s per picture" if advice["part"] == "rendering" else "s of training"
+    text = f"{advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
+    if advice["against"] == advice["point"]:
+        return text
+    return f"{text} ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"
+
+
 def _advice_in_words(advice: Mapping[str, Any]) -> str:
     """Return one sentence, with what to type."""
     head = f"{advice['part'].capitalize()}, {advice['question']}: "
     if advice["point"] is None:
         return f"{head}none of the measured settings is fast enough."
-    unit = "s per picture" if advice["part"] == "rendering" else "s of training"
-    text = f"{head}{advice['point']}, {advice['seconds']:.3g} {unit}, {advice['psnr']:.2f} dB"
-    if advice["against"] != advice["point"]:
-        text += f" ({advice['against']}: {advice['against_seconds']:.3g} s, {advice['against_psnr']:.2f} dB)"
-    return f"{text}: {command_of(advice)}"
+    return f"{head}{advice['point']}, {numbers_of(advice)}: {command_of(advice)}"
 
 
 def _megabytes(count: int | None) -> str:

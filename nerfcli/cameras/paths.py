@@ -63,7 +63,7 @@ def orbit(
         curve = _ring(offsets, distances, up)
     else:
         curve = _sway(offsets, distances, up)
-    centres = focus + _equal_steps(curve, count, closed=True)
+    centres = focus + _equal_steps(curve, count)
     return _looking_at(frames, centres, focus, up=up, name="orbit")
 
 
@@ -108,7 +108,7 @@ def ellipse(
         angle = 2 * np.pi * t
         return middle + np.stack([np.cos(angle), np.sin(angle)], axis=-1) * half @ axes.T
 
-    return _looking_at(frames, _equal_steps(curve, count, closed=True), focus, up=up, name="ellipse")
+    return _looking_at(frames, _equal_steps(curve, count), focus, up=up, name="ellipse")
 
 
 def spiral(
@@ -150,7 +150,7 @@ def spiral(
         angle = 2 * np.pi * turns * t
         return np.stack([np.cos(angle), np.sin(angle), np.sin(2 * np.pi * t)], axis=-1) * radii
 
-    path = middle + _equal_steps(curve, count, closed=True) @ axes.T
+    path = middle + _equal_steps(curve, count) @ axes.T
     depth = max(float((focus - middle) @ axes[:, 2]), 2.0 * float(np.linalg.norm(radii))) or 1.0
     return _looking_at(frames, path, middle + depth * axes[:, 2], up=up, name="spiral")
 
@@ -227,13 +227,13 @@ def _sway(offsets: np.ndarray, distances: np.ndarray, up: np.ndarray) -> Callabl
     return curve
 
 
-def _equal_steps(curve: Callable[[np.ndarray], np.ndarray], count: int, *, closed: bool) -> np.ndarray:
-    """`count` points (count, 3) at equal arc lengths along a curve over [0, 1]; a closed one leaves out its end."""
+def _equal_steps(curve: Callable[[np.ndarray], np.ndarray], count: int) -> np.ndarray:
+    """Return points (count, 3) at equal arc lengths along a closed curve over [0, 1], without its end."""
     t = np.linspace(0.0, 1.0, _CURVE_SAMPLES + 1)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve(t), axis=0), axis=1))])
     if length[-1] == 0:
         return curve(np.zeros(count))
-    at = np.linspace(0.0, length[-1], count, endpoint=not closed)
+    at = np.linspace(0.0, length[-1], count, endpoint=False)
     return curve(np.interp(at, length, t))
 
 

@@ -50,7 +50,7 @@ class PhotoFeatures:
 
 @dataclass(frozen=True)
 class PhotoFacts:
-    """All that is kept of a photo.
+    """Measurements of one photo.
 
     Args:
         name: as the capture lists it.
@@ -58,7 +58,6 @@ class PhotoFacts:
         digest: SHA-256 of the file.
         thumbnail: a small JPEG.
         tiny: (32, 32) float32, grey, of mean 0 and norm 1; all 0 for an even picture.
-        transparent: whether the file has transparent pixels.
     """
 
     name: str
@@ -66,7 +65,6 @@ class PhotoFacts:
     digest: str
     thumbnail: bytes
     tiny: np.ndarray
-    transparent: bool
     sharpness: sharpness.Sharpness
     exposure: brightness.Brightness
     features: PhotoFeatures
@@ -129,7 +127,6 @@ def read_photo(source: Source, most_features: int) -> PhotoFacts:
         digest=digest,
         thumbnail=_jpeg(_shrunk(small, _THUMBNAIL_PX)),
         tiny=_tiny(small_grey),
-        transparent=large.shape[2] == 4 and bool((large[..., 3] < 255).any()),
         sharpness=sharp,
         exposure=brightness.measure(rgb, used),
         features=_features(small, seen, local_detail=local_detail, most_features=most_features),

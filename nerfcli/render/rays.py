@@ -39,16 +39,13 @@ class PictureRays:
     cones: Tensor
 
 
-def frame_rays(frame: Frame, training_from_scene: Similarity, device: torch.device) -> PictureRays:
-    """Rays of every pixel centre of a frame; geometry in float64, the result in float32."""
-    pixels = np.arange(frame.camera.width * frame.camera.height)
-    return pixel_rays(frame, training_from_scene, pixels=pixels, places=CENTRES, device=device)
-
-
 def pixel_rays(
     frame: Frame, training_from_scene: Similarity, *, pixels: np.ndarray, places: np.ndarray, device: torch.device
 ) -> PictureRays:
-    """Rays of pixels (M,), counted row by row, at the same places (P, 2) inside [0, 1]^2 of each: N = M * P."""
+    """Rays of pixels (M,), counted row by row, at the same places (P, 2) inside [0, 1]^2 of each: N = M * P.
+
+    Geometry is in float64, the result in float32.
+    """
     return _turned(frame, training_from_scene, *_bearings(frame.camera, pixels, places, device), count=len(places))
 
 

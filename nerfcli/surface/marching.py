@@ -1,4 +1,4 @@
-"""From signed distances to triangles: marching cubes where all corners of a cube were seen, and pieces that matter."""
+"""Turn signed distances into triangles: marching cubes where all corners were seen, without small pieces."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from nerfcli.surface.fusion import SIDE, Fused
 
 # Voxels along a side of a brick, which is marched through at a time.
 _BRICK = 8 * SIDE
-# What views have to count together for a voxel to have been seen.
+# Weight at which views have seen a voxel; cubes with a corner below it hold no surface.
 SEEN = 0.5
 # Pieces of a surface that are smaller than this share of it are noise.
 _SMALLEST_PIECE = 0.002
@@ -35,20 +35,17 @@ class Mesh:
     colours: np.ndarray | None = None
 
 
-def surface_of(
-    fused: Fused, *, seen: float = SEEN, on_progress: Callable[[float], None] = lambda fraction: None
-) -> Mesh:
+def surface_of(fused: Fused, *, on_progress: Callable[[float], None] = lambda fraction: None) -> Mesh:
     """Return where the signed distance is 0, between voxels that were seen.
 
     Args:
         fused: the distances.
-        seen: weight of a voxel at least; cubes with a corner below it hold no surface.
         on_progress: called with how much is done.
     """
     keys, vertices, faces, count = [], [], [], 0
     bricks = np.argwhere(_any_block(fused.index)) * _BRICK
     for done, first in enumerate(bricks):
-        found = _march(fused, first, seen)
+        found = _march(fused, first)
         on_progress((done + 1) / len(bricks))
         if found is None:
             continue
@@ -84,7 +81,7 @@ def mesh_of(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None 
 
 
 def without_small_pieces(mesh: Mesh, share: float = _SMALLEST_PIECE) -> Mesh:
-    """Return the mesh without connected pieces of fewer than this share of all faces."""
+    """Return the mesh without connected pieces of fewer than this fraction of all faces."""
     if not len(mesh.faces):
         return mesh
     first, second = mesh.faces[:, 0], mesh.faces[:, 1:]
@@ -105,13 +102,13 @@ def _any_block(index: np.ndarray) -> np.ndarray:
     return np.asarray(padded.reshape(x, size, y, size, z, size).any(axis=(1, 3, 5)))
 
 
-def _march(fused: Fused, first: np.ndarray, seen: float) -> tuple[np.ndarray, np.ndarray] | None:
+def _march(fused: Fused, first: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Vertices in voxels from `first` on, and triangles of a brick; None where there is no surface."""
     shape = tuple(int(min(_BRICK + 1, total - at)) for at, total in zip(first, fused.grid.shape, strict=True))
     if min(shape) < 2:
         return None
     distance, weight = fused.dense((int(first[0]), int(first[1]), int(first[2])), (shape[0], shape[1], shape[2]))
-    known = weight >= seen
+    known = weight >= SEEN
     cubes = known[:-1, :-1, :-1].copy()
     negative = np.zeros(cubes.shape, np.int8)
     for corner in np.ndindex(2, 2, 2):

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+from frame_rays import frame_rays
 from torch import Tensor
 
 from nerfcli import kernels
@@ -14,7 +15,6 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, from_parts
 from nerfcli.field.contraction import uncontract
 from nerfcli.kernels import HashGrid, March, Rays, reference
-from nerfcli.render.rays import frame_rays
 from nerfcli.selftest import textbook
 from nerfcli.selftest.cases import CONTRACTED, DIRECTIONS
 from nerfcli.selftest.measure import Errors, Precision, Row, largest_error
