@@ -1,4 +1,4 @@
-"""What torchrun says of this process: whether it is one of several, and which."""
+"""Read torchrun's environment: whether this process is one of several, and which."""
 
 import os
 

@@ -26,7 +26,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class CaptureTraits:
-    """What a capture offers to components.
+    """Properties of a capture that components depend on.
 
     Args:
         has_alpha: whether its photos have alpha: then nothing is behind the object.

@@ -1,4 +1,4 @@
-"""What --dry-run of render and evaluate prints."""
+"""Print the plans of render --dry-run and evaluate --dry-run."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING

@@ -349,7 +349,7 @@ def train(
                 f"{folder} is a scan in a scanner's format", f"convert it first: nerfcli convert {folder} SCAN"
             )
         elif voxel_size is not None:
-            raise UserError(f"--voxel-size is for X-ray scans, and {folder} is none", "remove --voxel-size")
+            raise UserError(f"--voxel-size is for X-ray scans, and {folder} is not one", "remove --voxel-size")
         elif dry_run:
             plan_one_scene(folder)
             return

@@ -35,7 +35,7 @@ class Doubt:
 
 @dataclass(frozen=True)
 class TargetOptions:
-    """What the written file shall be.
+    """Format and conventions of the written file.
 
     Args:
         form: its format.

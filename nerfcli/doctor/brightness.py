@@ -1,4 +1,4 @@
-"""How light a photo is: clipped pixels, and the light around single pixels, which matches compare between photos."""
+"""Brightness of photos: clipped pixels, and local brightness, which matches compare between photos."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ _PALE = 0.3
 
 @dataclass(frozen=True)
 class Brightness:
-    """How light a photo is by itself.
+    """Brightness of one photo.
 
     Args:
         mean: of all channels, sRGB in [0, 1].

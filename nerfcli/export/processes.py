@@ -117,7 +117,7 @@ def render_in_processes(
 
 @dataclass(frozen=True)
 class _Failure:
-    """What a process reports instead of None; exceptions themselves do not survive the way."""
+    """Failure that a process reports instead of None; exceptions themselves cannot be sent."""
 
     text: str
     hint: str | None = None

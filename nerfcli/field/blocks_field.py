@@ -1,4 +1,4 @@
-"""A field of several blocks: cells of ground, in each of which another field is asked.
+"""A field of several blocks: cells of ground, each with a field of its own.
 
 Letters as in `kernels.interface`; blocks B; ground coordinates are distances along two horizontal directions.
 """
@@ -64,7 +64,7 @@ class BlocksFieldSettings(FieldSettings):
 
 
 class BlocksField(Field):
-    """The fields of blocks side by side; a point is asked of the one whose cell it is in.
+    """The fields of blocks side by side; each point is evaluated in the field of its cell.
 
     It is not trained: its blocks are, each by itself. Pictures of it are made by `render.spans`.
 

@@ -114,7 +114,7 @@ class HashField(Field):
 
 
 def _resolutions_at(detail: float, resolutions: tuple[int, ...]) -> tuple[int, ...]:
-    """Return those of the levels that learn at a share of the budget, 0 for the others."""
+    """Return the resolutions of the levels that learn at a fraction of the budget, 0 for the others."""
     first = min(FIRST_LEVELS, len(resolutions))
     learning = max(1, first + math.floor((len(resolutions) - first) * detail / ALL_LEVELS_SHARE))
     return tuple(side if level < learning else 0 for level, side in enumerate(resolutions))

@@ -109,7 +109,7 @@ def _of_gif(path: Path) -> str | None:
 
 
 def _of_video(path: Path) -> str | None:
-    """Return the comment of the container, as ffmpeg tells it."""
+    """Return the comment of the container, as ffmpeg prints it."""
     path.stat()
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", f"file:{path}", "-f", "ffmetadata", "-"]
     done = subprocess.run(command, capture_output=True, check=False)

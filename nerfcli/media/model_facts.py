@@ -1,4 +1,4 @@
-"""What a file of a mesh, of points or of a volume holds, as plain values."""
+"""Describe files of meshes, points and volumes as plain values."""
 
 import json
 from pathlib import Path

@@ -18,7 +18,7 @@ _HEAD_BYTES = 4096
 
 @dataclass(frozen=True)
 class Mark:
-    """Whose page it is, without telling where that is.
+    """Mark of a page's source, which does not reveal its path.
 
     Args:
         kind: the command that wrote it.

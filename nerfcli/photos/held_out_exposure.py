@@ -30,7 +30,7 @@ def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray)
 
 
 def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> float:
-    """Return the factor, from 0 to 1, by which gains of photos follow the exposures that EXIF tells.
+    """Return the factor, from 0 to 1, by which gains of photos follow the exposures in EXIF.
 
     Tone curves make it smaller than 1. It is 0 where the mean of other photos, or the photos before and after, tell the
     gains of a photo that is left out better, by squared differences.
@@ -65,7 +65,7 @@ def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray
 
 
 def log_gains_of(frames: Sequence[Frame], model: Model) -> np.ndarray:
-    """(N, 3) logarithms of the gains of photos relative to the pictures of a model, as EXIF tells them; where it does
+    """(N, 3) logarithms of the gains of photos relative to the pictures of a model, from EXIF; where it does
     not, as the training does; else 0."""
     if model.log_exposure is None or model.exif_slope == 0.0:
         by_exif = np.full(len(frames), np.nan)

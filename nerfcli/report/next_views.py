@@ -72,7 +72,7 @@ def next_views_html(
 
 
 def mark_of(run: Path) -> page.Mark:
-    """Whose page it is."""
+    """Return the mark of a run's page."""
     return page.Mark("next-views", run)
 
 

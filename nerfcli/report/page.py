@@ -45,7 +45,7 @@ _MEGA = 1e6
 
 
 def mark_of(runs: Sequence[Path]) -> page.Mark:
-    """Whose page a report on these runs is."""
+    """Return the mark of a report on these runs."""
     return page.Mark("report", Path("|".join(str(run.resolve()) for run in runs)))
 
 

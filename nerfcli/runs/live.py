@@ -23,7 +23,7 @@ VIEWER_SECONDS, TRAINING_SECONDS = 5.0, 20.0
 
 @dataclass(frozen=True)
 class Request:
-    """What the viewer wants: fields to look at, a pause, the end of the training."""
+    """Request of a viewer: fields to show, a pause, or the end of the training."""
 
     count: int
     paused: bool = False

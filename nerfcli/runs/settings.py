@@ -1,4 +1,4 @@
-"""Everything a training depends on, besides the scene."""
+"""Settings of a training."""
 
 import dataclasses
 import math

@@ -82,7 +82,7 @@ class Facts:
 
 
 def with_known_cameras(requested: Components, facts: Facts) -> tuple[Components, float, list[Decision]]:
-    """Return the model with what matched features surely tell of the cameras: another focal length than the given one,
+    """Return the model with what matched features show about the cameras: another focal length than the given one,
     or poses that do not fit; the logarithm of the length's factor, which is 0 elsewhere; and the decisions.
 
     Trials cannot decide about lengths: a model that has begun with a wrong one is bent to fit, and stays so for long.
@@ -140,7 +140,7 @@ def may_use_stereo(requested: Components, facts: Facts, *, has_time: bool) -> bo
 
 
 def with_evidence(requested: Components, facts: Facts) -> tuple[Components, list[Decision]]:
-    """Return the model with what photos tell before any training, where that is not decided;
+    """Return the model with the components that photos support before any training, unless they are set;
     and the decisions about it.
 
     Rays end at the points that photos share, and photos have the exposures that shared pixels tell. All of it is in

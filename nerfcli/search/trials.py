@@ -75,7 +75,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class TrialStart:
-    """Where the first training stood when it stopped.
+    """State of the first training when it stopped.
 
     Args:
         tensors, description: its state.

@@ -31,7 +31,7 @@ Inputs = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an operation gives.
+    """Result of an operation.
 
     Args:
         values, gradients: as many as the operation has; gradients are those of a weighted sum of the values.

@@ -1,4 +1,4 @@
-"""What part of space the photos are about, and how fine they show it."""
+"""Extent of the photos' subject, and the resolution at which they show it."""
 
 from collections.abc import Sequence
 

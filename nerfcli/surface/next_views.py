@@ -1,4 +1,4 @@
-"""Where to stand next: the surface that too few photos see, and the further views that would see most of it."""
+"""Suggest further views: those that would see most of the surface that too few photos see."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What is wanted of a geometry: where, how fine, how large."""
+"""Settings of an exported geometry: region, resolution, size."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ FACES = 300_000
 
 @dataclass(frozen=True)
 class SurfaceSettings:
-    """How a geometry is taken out of a field.
+    """Settings of extracting a geometry from a field.
 
     Args:
         box: low and high corner x0, y0, z0, x1, y1, z1 in the scene's frame and unit; None for what the photos see.

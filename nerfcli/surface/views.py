@@ -20,7 +20,7 @@ DEPTH = DepthRequest("median", "z")
 
 @dataclass(frozen=True)
 class DepthView:
-    """What a pinhole camera sees of a field: (H, W) float32, scene units along the optical axis, NaN where undefined.
+    """View of a field by a pinhole camera: (H, W) float32, scene units along the optical axis, NaN where undefined.
 
     Args:
         frame: the camera and its pose.

@@ -61,7 +61,7 @@ class HashVolume:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """What was learned, by the names of its files."""
+        """Learned arrays by the names of their files."""
         tensors = zip(ARRAYS, (self.table, *self.layers), strict=True)
         return {name: tensor.detach().numpy() for name, tensor in tensors}
 

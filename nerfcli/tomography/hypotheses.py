@@ -128,6 +128,6 @@ _CONE = (
     "projections: only a feature whose handedness is known can tell"
 )
 _PARALLEL = (
-    "parallel beams do not tell: a mirrored detector is the object turned by half a turn, a reversed direction is its "
-    "mirror image, with the same projections"
+    "parallel beams cannot distinguish them: a mirrored detector is the object turned by half a turn, a reversed "
+    "direction is its mirror image, with the same projections"
 )

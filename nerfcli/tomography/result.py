@@ -28,7 +28,7 @@ OUTPUTS = ("projection", "transmission", "residual")
 
 @dataclass(frozen=True)
 class ReconstructionSettings:
-    """How to fit a volume to a scan.
+    """Settings of fitting a volume to a scan.
 
     Args:
         budget_seconds: for everything, trials included; None for none.

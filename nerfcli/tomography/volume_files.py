@@ -26,7 +26,7 @@ _WORDS = {np.dtype(np.uint8): "MET_UCHAR", np.dtype(np.float32): "MET_FLOAT"}
 
 @dataclass(frozen=True)
 class VolumeFile:
-    """What a volume's file holds.
+    """Content of a volume's file.
 
     Args:
         values: (Z, Y, X).

@@ -1,4 +1,4 @@
-"""How many photos see the surface, and from how different directions, in the cells of a page."""
+"""Coverage and parallax of the surface on the grid of a page."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What a live page fetches from its server, as bytes: a description in JSON and arrays after it."""
+"""Encode the data that a live page fetches: a description in JSON, followed by arrays."""
 
 import json
 import struct

@@ -43,7 +43,7 @@ _HEAD = struct.Struct("<8I")
 
 @dataclass(frozen=True)
 class View:
-    """What a page wants to see.
+    """View that a page requests.
 
     Args:
         frame: pinhole camera and pose in the scene's frame.

@@ -28,7 +28,7 @@ _WHITE = 255.0
 
 @dataclass(frozen=True)
 class PagePhotos:
-    """What the page holds of photos.
+    """Photos of a page.
 
     Args:
         entries: of each frame, plain values for the page.
@@ -122,7 +122,7 @@ def _sorted(train: Sequence[Frame], test: Sequence[Frame]) -> list[tuple[Frame, 
 
 
 def _entries(model: Model, frames: Sequence[tuple[Frame, str]]) -> list[dict[str, Any]]:
-    """Return what the page holds of each frame besides its picture."""
+    """Return the entry of each frame in a page, without its picture."""
     gains = log_gains_of([frame for frame, _ in frames], model)
     return [
         {

@@ -25,7 +25,7 @@ MAPS = (
 
 @dataclass(frozen=True)
 class Proof:
-    """What the page compares with.
+    """Pictures that the page is compared with.
 
     Args:
         description: cameras and maps, plain values.

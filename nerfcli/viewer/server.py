@@ -25,7 +25,7 @@ _HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Co
 
 
 class Show(Protocol):
-    """What the page shows; called from several threads. A UserError becomes a message in the page."""
+    """Data source of the page; called from several threads. A UserError becomes a message in the page."""
 
     def page(self) -> str:
         """HTML of the page; it is loaded again where there is no field yet."""
@@ -164,7 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(HTTPStatus.OK, "image/jpeg", content, {"Cache-Control": "private, max-age=3600"})
 
     def _events(self) -> None:
-        """Send the status whenever it changes, and now and then; the client counts as open as long as this goes on."""
+        """Send the status whenever it changes, and now and then; the client counts as open until this ends."""
         server = self._of
         with server.changed:
             server.clients += 1

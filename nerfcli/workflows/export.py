@@ -1,4 +1,4 @@
-"""From a run to files that other programs open: a page, a mesh, points, a volume, COLMAP's dense folder."""
+"""Export a run to files that other programs open: a page, a mesh, points, a volume, COLMAP's dense folder."""
 
 from pathlib import Path
 

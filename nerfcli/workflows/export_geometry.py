@@ -1,4 +1,4 @@
-"""From a run to geometry: surfaces, points, volumes, and COLMAP's dense folder, in the scene's frame and unit."""
+"""Export the geometry of a run: surfaces, points, volumes, and COLMAP's dense folder, in the scene's frame and unit."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

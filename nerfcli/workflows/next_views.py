@@ -35,7 +35,7 @@ STRATA = {"none": 0, "one": 1, "two or three": 2, "four or more": 4}
 
 @dataclass(frozen=True)
 class RunCoverage:
-    """How much of the surface the photos of a run have seen.
+    """Coverage of the surface by the photos of a run.
 
     Args:
         photos: training photos.

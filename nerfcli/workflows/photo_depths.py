@@ -1,4 +1,4 @@
-"""What each training photo sees of the surface, and how wrong depth is: made once per field, kept in the run."""
+"""Depth maps of training photos and errors of depth: computed once per field and kept in the run."""
 
 from collections.abc import Callable, Sequence
 

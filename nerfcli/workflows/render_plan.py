@@ -35,7 +35,7 @@ _PREDICTION_BYTES = {None: 0, "png": 6, "float": 30}
 
 @dataclass(frozen=True)
 class RenderingPlan:
-    """What rendering or evaluating a run takes, once the program has started and the model is read.
+    """Cost of rendering or evaluating a run, after the program has started and the model is read.
 
     Args:
         pictures: how many.

@@ -21,6 +21,21 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent
 
 OWN, ASTRA = "nerfcli", "astra"
 WRITTEN = (OWN, ASTRA)
+# Suffixes of files of scans, none of which a folder should have.
+_FILE_SUFFIXES = (
+    ".h5",
+    ".hdf5",
+    ".nxs",
+    ".mat",
+    ".npy",
+    ".txt",
+    ".json",
+    ".tif",
+    ".tiff",
+    ".pickle",
+    ".xtekct",
+    ".log",
+)
 # What a statement and what is recovered from stored vectors may differ by: rounding of float64.
 TOLERANCES = {"angle_deg": 1e-9, "length": 1e-9, "shift_px": 1e-6, "tilt_deg": 1e-9}
 
@@ -68,11 +83,14 @@ def convert_scan(
     """
     if to not in WRITTEN:
         raise UserError(f"a scan cannot be written as {to}", f"scans are written as {' or '.join(WRITTEN)}")
+    if to == OWN and target.suffix.lower() in _FILE_SUFFIXES:
+        astra = "add --to astra for a file of vectors, or " if target.suffix.lower() in (".npy", ".txt") else ""
+        raise UserError(f"{target}: a scan is written as a folder", f"{astra}give a folder, such as {target.stem}")
     if target.exists() and not (overwrite and (target.is_file() or is_scan(target))):
-        what = "use --overwrite to replace it" if target.is_file() or is_scan(target) else "choose another place"
-        raise UserError(f"{target} already exists", what)
+        what = "add --overwrite to replace it" if target.is_file() or is_scan(target) else "choose another output path"
+        raise UserError(f"{target} exists", what)
     if target.exists() and target.resolve() == source.resolve():
-        raise UserError(f"{target} is the input itself", "choose another place")
+        raise UserError(f"{target} is the input itself", "choose another output path")
     if to == ASTRA:
         scan = read_scan(source, given)
         facts = write_astra(scan, target)
@@ -212,10 +230,10 @@ def _read_back(scan: Scan, stored: Scan) -> dict[str, float]:
 
 def _proof(checks: dict[str, float]) -> str:
     if "angle_deg" not in checks:
-        return "read back: the same vectors and values"
+        return "verified by reading it back: the same vectors and values"
     return (
-        f"read back: angles within {checks['angle_deg']:.1g} degrees, distances and pixel sizes within "
-        f"{checks['length']:.1g} of themselves, the axis within {checks['shift_px']:.1g} px"
+        f"verified by reading it back: angles agree to {checks['angle_deg']:.1g} degrees, lengths to a fraction of "
+        f"{checks['length']:.1g}, the axis of rotation to {checks['shift_px']:.1g} px"
     )
 
 

@@ -149,7 +149,7 @@ def _fit(
         strength, model_error = trial.strength, trial.model_error
         if settings.strength is None:
             tried = ", ".join(f"{value:g}: {deviance:.3f}" for value, deviance in sorted(trial.tried))
-            decisions.append(f"total variation {strength:g}: chi-square of left-out views at {tried}")
+            decisions.append(f"total variation: weight {strength:g}; chi-square of left-out views by weight: {tried}")
         else:
             strength = settings.strength
         if model_error > 0:
@@ -207,7 +207,7 @@ def _fit(
 
 @dataclass(frozen=True)
 class Limit:
-    """When a fit ends.
+    """Stopping criterion of a fit.
 
     Args:
         total_passes, total_seconds: of everything; None for no limit.

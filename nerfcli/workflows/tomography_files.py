@@ -182,4 +182,4 @@ def _write_picture(path: Path, values: np.ndarray, low: float, high: float, *, o
 
 def _refuse_existing(path: Path, *, overwrite: bool) -> None:
     if path.exists() and not overwrite:
-        raise UserError(f"{path} exists already", "choose another place with --output, or add --overwrite")
+        raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another path with -o")

@@ -16,7 +16,7 @@ _FIELDS_ON_DISK = 7
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """What a training takes.
+    """Cost of a training.
 
     Args:
         train_photos, held_out_photos: how many.

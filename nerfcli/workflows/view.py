@@ -86,7 +86,7 @@ def _from_elsewhere(port: int) -> str:
 
 
 class RunShow:
-    """What the server shows of a run, see `viewer.server.Show`.
+    """Data of a run for the server, see `viewer.server.Show`.
 
     Args:
         path: of the run.
@@ -120,7 +120,7 @@ class RunShow:
             raise no_run(self._path)
 
     def tick(self, server: PageServer) -> None:
-        """Look at the run, and tell its training whether somebody looks at it; in the thread that serves."""
+        """Check the run, and report to its training whether a page is open; in the thread that serves."""
         with self._lock:
             loading = time.monotonic() < self._loaded_until
             if server.clients > 0 or loading or self._request.paused or self._request.stop:

@@ -26,7 +26,7 @@ CHECKS: dict[str, Check] = {
 
 @dataclass(frozen=True)
 class ScanDiagnosis:
-    """What was found.
+    """Findings of the checks of a scan.
 
     Args:
         sample: what was looked at.

@@ -101,7 +101,7 @@ def counts(sample: Sample) -> Finding | str:
     """Estimate the photons behind the thickest part."""
     scan = sample.scan
     if scan.kind == "line_integral":
-        return "line integrals do not tell how many photons were counted"
+        return "line integrals do not contain the number of photons"
     if scan.photons_per_value is None:
         return "how many photons a value stands for is not known: give --photons when converting"
     open_beam = 1.0 if scan.open_beam is None else float(np.median(scan.open_beam))
