@@ -72,6 +72,7 @@ def test_an_ablation_goes_on_where_it_stopped(tmp_path, monkeypatch):
     """Killed before its third training, the same command trains what is left, and no model twice."""
     from nerfcli.train import loop
 
+    monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 10)  # 34 MB for each run otherwise
     # How a field compares with billboards has its own tests; here it would be computed four times.
     monkeypatch.setattr(evaluate_workflow, "training_billboards", lambda run, *, notify: None)
     trained, real = [], loop.train

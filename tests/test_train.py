@@ -44,7 +44,12 @@ from nerfcli.train import loop, sentinel
 from nerfcli.train.loop import Progress, train
 
 # A step of a few rays is enough where bits are compared, not pictures.
-FEW = TrainSettings(budget_seconds=None, steps=24, first_samples_per_step=2**9, samples_per_step=2**9, threads=2)
+# Tables of 2^12 rows: a run folder takes 3 MB, with the default of 2^16 it takes 34.
+FEW = TrainSettings(
+    budget_seconds=None, steps=24, first_samples_per_step=2**9, samples_per_step=2**9, log2_rows=12, threads=2
+)
+# The number of rows is chosen, as it is by default.
+CHOSEN_ROWS = replace(FEW, log2_rows=None)
 # Enough samples that the number of rays follows what the rays before had.
 ADAPTIVE = replace(FEW, first_samples_per_step=2**15, samples_per_step=2**15)
 
@@ -251,23 +256,26 @@ def test_expected_samples_are_the_sum_over_the_steps(first, steps):
 
 def test_longer_trainings_have_more_rows_and_given_ones_stay():
     budgets = [1e-6, 15, 60, 120, 300, 600, 1800, 1e9]
-    rows = [replace(FEW, steps=None, budget_seconds=seconds).chosen_log2_rows for seconds in budgets]
+    rows = [replace(CHOSEN_ROWS, steps=None, budget_seconds=seconds).chosen_log2_rows for seconds in budgets]
     assert rows == sorted(rows)
     assert (rows[0], rows[1], rows[-1]) == (16, 16, 18)
     assert replace(FEW, log2_rows=12).chosen_log2_rows == 12
-    assert replace(FEW, steps=4000).chosen_log2_rows == replace(FEW, steps=4000, threads=1).chosen_log2_rows
+    assert (
+        replace(CHOSEN_ROWS, steps=4000).chosen_log2_rows
+        == replace(CHOSEN_ROWS, steps=4000, threads=1).chosen_log2_rows
+    )
 
 
 def test_a_training_that_goes_on_to_a_larger_total_keeps_its_rows(views, tmp_path, monkeypatch):
     """The larger total alone would have chosen more; rows that are asked for by number are refused."""
-    fit(views, tmp_path / "run", replace(FEW, steps=2))
+    fit(views, tmp_path / "run", replace(CHOSEN_ROWS, steps=2))
     monkeypatch.setattr("nerfcli.runs.settings.FEWEST_LOG2_ROWS", 17)
-    assert replace(FEW, steps=3).chosen_log2_rows == 17
-    fit(views, tmp_path / "run", replace(FEW, steps=3), resume=True)
+    assert replace(CHOSEN_ROWS, steps=3).chosen_log2_rows == 17
+    fit(views, tmp_path / "run", replace(CHOSEN_ROWS, steps=3), resume=True)
     assert load_model(tmp_path / "run" / "field.safetensors", "cpu").field.settings.to_json()["log2_rows"] == 16
     assert read_config(tmp_path / "run").settings.log2_rows == 16
     with pytest.raises(UserError, match="was trained with another field"):
-        fit(views, tmp_path / "run", replace(FEW, steps=4, log2_rows=17), resume=True)
+        fit(views, tmp_path / "run", replace(CHOSEN_ROWS, steps=4, log2_rows=17), resume=True)
 
 
 def test_detailed_fields_train_and_resume_bit_for_bit_with_their_fine_cells(views, tmp_path, monkeypatch):
@@ -569,7 +577,7 @@ def test_what_counts_as_the_same_run(views, tmp_path):
 
 
 def test_settings_that_an_earlier_version_did_not_write_down_were_the_defaults(views, tmp_path):
-    settings = replace(FEW, steps=1, downscale=4)
+    settings = replace(CHOSEN_ROWS, steps=1, downscale=4)
     fit(views, tmp_path / "run", settings)
     config = read_config(tmp_path / "run").to_json()
     del config["settings"]["log2_rows"]

@@ -156,4 +156,4 @@ def differences(components: Components) -> dict[str, Value]:
 
 
 def _wrong(name: str, text: str, expected: str) -> UserError:
-    return UserError(f"--with {name}={text}: expected {expected}", f"for example --with {name}", 2)
+    return UserError(f"--with {name}={text}: expected {expected}", f"for example --with {name}={CHOICES[name].on}", 2)

@@ -83,7 +83,7 @@ def scale_from_gps(frames: Sequence[Frame], positions: Mapping[str, Position]) -
     used = sorted((frame for frame in frames if frame.name in positions), key=lambda frame: frame.name)
     if len(used) < 2:
         raise UserError(
-            f"only {len(used)} of {len(frames)} photos with a pose have a GPS position in their EXIF",
+            f"{'only 1' if used else 'none'} of {len(frames)} photos with a pose has a GPS position in its EXIF",
             "at least 2 are needed for the scale and 3 for directions; give a known distance instead",
         )
     x = centres_of(used)
