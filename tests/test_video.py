@@ -10,9 +10,10 @@ from typing import Any
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from commands import error_of, nerfcli
 from PIL import Image
 
-from nerfcli.errors import UserError
+from nerfcli.errors import BAD_INPUT, UserError
 from nerfcli.media.video import FORMATS, check_encoders, write_video
 
 
@@ -248,3 +249,16 @@ def test_a_missing_ffmpeg_is_told(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="cannot write videos: ffmpeg not found"):
         write(tmp_path / "a.mp4", [np.zeros((4, 4, 3), np.uint8)])
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", [("info",), ("poses", "--frames", "4")])
+def test_a_video_is_not_called_damaged_where_ffmpeg_is_missing(command, tmp_path, monkeypatch):
+    """IMAGEIO_FFMPEG_EXE named a file that is not there: poses ended with a traceback, info missed the video."""
+    video = tmp_path / "a.mp4"
+    write(video, [np.zeros((16, 16, 3), np.uint8)] * 4)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    result = nerfcli(command[0], video, *command[1:])
+    assert result.exit_code == BAD_INPUT
+    error, hint = error_of(result)
+    assert error == f"Error: cannot read {video}: {tmp_path / 'none'} is not a program"
+    assert hint.startswith("Hint:  install ffmpeg, and set the environment variable IMAGEIO_FFMPEG_EXE")

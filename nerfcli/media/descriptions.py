@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
 import numpy as np
 import OpenEXR
 import tifffile
@@ -17,6 +16,7 @@ from PIL import Image
 
 from nerfcli.errors import UserError
 from nerfcli.media.depth_pictures import KEY, DepthMeta, entries_of_text
+from nerfcli.media.ffmpeg import ffmpeg_program
 
 VIDEO_SUFFIXES = (".mp4", ".webm", ".mkv", ".mov", ".gif")
 
@@ -111,7 +111,7 @@ def _of_gif(path: Path) -> str | None:
 def _of_video(path: Path) -> str | None:
     """Return the comment of the container, as ffmpeg prints it."""
     path.stat()
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", f"file:{path}", "-f", "ffmetadata", "-"]
+    command = [ffmpeg_program(f"cannot read {path}"), "-v", "error", "-i", f"file:{path}", "-f", "ffmetadata", "-"]
     done = subprocess.run(command, capture_output=True, check=False)
     if done.returncode != 0:
         reason = done.stderr.decode("utf-8", errors="replace").strip().splitlines()

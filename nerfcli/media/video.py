@@ -12,11 +12,11 @@ from itertools import chain
 from pathlib import Path
 from typing import IO
 
-import imageio_ffmpeg
 import numpy as np
 
 from nerfcli.atomic import atomic_path
 from nerfcli.errors import UserError
+from nerfcli.media.ffmpeg import ANOTHER_FFMPEG, ffmpeg_program
 
 # Left alone, ffmpeg converts by the matrix of standard television and tags nothing; players guess another. A picture
 # holds sRGB, so that is the transfer curve; "setparams" tags the frames, which is where encoders read it.
@@ -28,7 +28,6 @@ _COLOURS = (
 GIF_FASTEST_FPS = 50.0
 # Ordered dither does not crawl over areas that stand still, as error diffusion does.
 _DITHER = "[0:v][1:v]paletteuse=dither=bayer:bayer_scale=4"
-_ANOTHER_FFMPEG = "install ffmpeg, and set the environment variable IMAGEIO_FFMPEG_EXE to its path"
 
 
 @dataclass(frozen=True)
@@ -78,14 +77,14 @@ def check_encoders(formats: Iterable[str]) -> None:
     try:
         listed = subprocess.run([ffmpeg, "-hide_banner", "-encoders"], capture_output=True, check=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        raise UserError(f"{ffmpeg} does not run: {error}", _ANOTHER_FFMPEG) from error
+        raise UserError(f"{ffmpeg} does not run: {error}", ANOTHER_FFMPEG) from error
     there = set(re.findall(r"^ V\S+ +(\S+)", listed.stdout, flags=re.MULTILINE))
     for name in formats:
         if FORMATS[name].encoder not in there:
             able = ", ".join(other for other, form in FORMATS.items() if form.encoder in there) or "no videos"
             raise UserError(
                 f"cannot write {name} videos: {ffmpeg} has no encoder {FORMATS[name].encoder}",
-                f"it supports {able}; use one of these, or {_ANOTHER_FFMPEG}",
+                f"it supports {able}; use one of these, or {ANOTHER_FFMPEG}",
             )
 
 
@@ -217,12 +216,7 @@ def _even(frame: np.ndarray) -> np.ndarray:
 
 
 def _ffmpeg() -> str:
-    try:
-        return imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise UserError(
-            "cannot write videos: ffmpeg not found", f"{_ANOTHER_FFMPEG}, or remove the video options"
-        ) from error
+    return ffmpeg_program("cannot write videos", instead=", or remove the video options")
 
 
 def _failure(target: Path, log: IO[bytes]) -> UserError:

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Generic, TypeVar
 
-import imageio_ffmpeg
 import numpy as np
 
 from nerfcli.errors import UserError
+from nerfcli.media.ffmpeg import ffmpeg_program
 from nerfcli.media.images import IMAGE_SUFFIXES
 
 T = TypeVar("T")
@@ -205,13 +205,8 @@ class _Decoder:
 @contextmanager
 def _decoding(path: Path, filters: str, codec: str, *, more: Sequence[str] = ()) -> Iterator[_Decoder]:
     """ffmpeg at work on the first video stream (covers and thumbnails are none); it is gone when the block ends."""
-    try:
-        ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        hint = "install ffmpeg, or name its program in the variable IMAGEIO_FFMPEG_EXE"
-        raise UserError(f"cannot read {path}: ffmpeg not found", hint) from error
     command = [
-        *(ffmpeg, "-hide_banner", "-nostats", "-nostdin", "-loglevel", "level+info"),
+        *(ffmpeg_program(f"cannot read {path}"), "-hide_banner", "-nostats", "-nostdin", "-loglevel", "level+info"),
         # "file:", because a colon in a name would read as a protocol; and no list of files may lead elsewhere.
         *("-protocol_whitelist", "file,pipe", "-i", f"file:{path}", "-map", "0:V:0"),
         # Each frame once, whatever its time: else ffmpeg repeats and drops frames to make the rate constant.
