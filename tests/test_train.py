@@ -542,6 +542,13 @@ def as_convert_reads(run: Path) -> Capture:
     return form.parse(found, Given())
 
 
+def says_the_same(text: str, other: str) -> bool:
+    try:
+        return json.loads(text) == json.loads(other)
+    except json.JSONDecodeError:
+        return False
+
+
 @pytest.mark.parametrize(
     ("file", "read"),
     [("config.json", read_config), ("cameras.json", read_cameras), ("cameras.json", as_convert_reads)],
@@ -553,7 +560,10 @@ def test_a_digit_that_changes_in_the_description_of_a_run_is_noticed(file, read,
     name = whole.index('"blake2b"')  # without it, it is a file of an earlier version
     digits = [index for index, letter in enumerate(whole) if letter.isdigit() and not 0 <= index - name < 9]
     for index in digits[:: max(1, len(digits) // 40)]:
-        path.write_text(whole[:index] + str((int(whole[index]) + 1) % 10) + whole[index + 1 :])
+        changed = whole[:index] + str((int(whole[index]) + 1) % 10) + whole[index + 1 :]
+        if says_the_same(changed, whole):
+            continue  # the 17th digit of a float64
+        path.write_text(changed)
         with pytest.raises(UserError, match=rf"{file} cannot be read"):
             read(tmp_path / "run")
     path.write_text(whole)
