@@ -14,7 +14,7 @@ from nerfcli import scene as scenes
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import from_parts, rotation_from_vector
-from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, ShapeEvidence, random_pixels
+from nerfcli.evaluate.billboards import COMPARED_PIXELS, Billboards, Shape, ShapeEvidence, random_pixels
 from nerfcli.evaluate.metrics import to_8_bit
 from nerfcli.evaluate.protocol import Extras, HeldOutPhoto, evaluate_model, over_white
 from nerfcli.photos.loading import load_photos
@@ -79,6 +79,17 @@ def test_a_field_of_a_camera_that_only_turned_shows_no_shape():
     assert shape is not None
     assert not shape.shown
     assert "do not trust its depth" in shape.in_words()
+
+
+@pytest.mark.parametrize(
+    ("gain", "error", "needed"),
+    [(0.77, 0.2, "1.0 dB"), (0.77, 0.58, "1.2 dB"), (0.77, None, "1.0 dB"), (-1.0, 0.2, "")],
+)
+def test_a_gain_that_is_too_small_is_named_with_what_it_takes(gain: float, error: float | None, needed: str):
+    words = Shape(14.83, 14.83 + gain, gain, error, shown=False, seconds=0.0).in_words()
+    assert words.startswith("no evidence of geometry")
+    assert ("to be sure" in words) == bool(needed)
+    assert needed in words
 
 
 def test_the_distance_of_a_round_wall_is_found():

@@ -70,6 +70,9 @@ class Shape:
         )
         if self.shown:
             return f"geometry: {compared}"
+        if self.gain_db > 0:
+            needed = max(LEAST_GAIN_DB, STANDARD_ERRORS * (self.error_db or 0.0))
+            compared = f"{compared}; it takes a gain of {needed:.1f} dB to be sure"
         return (
             f"no evidence of geometry: {compared}. The training was too short, or these photos do not determine "
             "depth (the camera only turned, too few photos, a flat scene): do not trust its depth"
