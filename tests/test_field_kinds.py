@@ -56,6 +56,18 @@ def test_every_kind_is_made_here():
     assert set(SMALL) == set(KINDS)
 
 
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("hash", "hash grid, 8 levels of 4 to 32 cells per axis, 2^8 rows each; networks of width 32"),
+        ("voxels", "7x7x7 voxels"),  # between 8^3 = 2^9 vertices
+        ("mlp", "network of 2 layers of width 16 on 4 octaves of Fourier features"),
+    ],
+)
+def test_every_kind_states_its_size(kind: str, text: str):
+    assert SMALL[kind].size_text == text
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_dense_grid_interpolates_as_scipy_does(dtype):
     """Log density and harmonics, by scipy.ndimage.map_coordinates of order 1, borders included."""

@@ -59,6 +59,10 @@ class BlocksFieldSettings(FieldSettings):
     occupancy_side: int = 1
     blocks: tuple[Block, ...] = ()
 
+    @property
+    def size_text(self) -> str:
+        return f"{len(self.blocks)} blocks"
+
     def to_json(self) -> dict[str, Any]:
         return {**super().to_json(), "blocks": [block.to_json() for block in self.blocks]}
 

@@ -35,6 +35,10 @@ class FourierFieldSettings(FieldSettings):
     width: int = 128
     layers: int = 4
 
+    @property
+    def size_text(self) -> str:
+        return f"network of {self.layers} layers of width {self.width} on {self.octaves} octaves of Fourier features"
+
 
 class FourierField(Field):
     """Fourier features, rectified layers, a density; then the direction, one more layer, a colour.

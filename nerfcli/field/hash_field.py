@@ -48,6 +48,11 @@ class HashFieldSettings(FieldSettings):
         return self.log2_rows >= DETAILED_LOG2_ROWS
 
     @property
+    def size_text(self) -> str:
+        cells = f"{self.levels} levels of {self.coarsest} to {self.finest} cells per axis"
+        return f"hash grid, {cells}, 2^{self.log2_rows} rows each; networks of width {self.width}"
+
+    @property
     def resolutions(self) -> tuple[int, ...]:
         """Cells per axis of each level."""
         growth = math.log(self.finest / self.coarsest) / max(1, self.levels - 1)

@@ -29,6 +29,11 @@ class FieldSettings(abc.ABC):
         """Whether the field shows more in rendering steps shorter than those of its training."""
         return False
 
+    @property
+    @abc.abstractmethod
+    def size_text(self) -> str:
+        """Type and size for people, such as "129x129x129 voxels"."""
+
     def to_json(self) -> dict[str, Any]:
         """Plain values, the kind among them; see `kinds.settings_from_json`."""
         return {"kind": self.kind, **asdict(self)}

@@ -27,6 +27,11 @@ class VoxelFieldSettings(FieldSettings):
     log2_vertices: int = 17
 
     @property
+    def size_text(self) -> str:
+        side = self.resolution
+        return f"{side}x{side}x{side} voxels"
+
+    @property
     def resolution(self) -> int:
         """Cells per axis."""
         side = round(2 ** (self.log2_vertices / 3))

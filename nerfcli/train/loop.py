@@ -88,8 +88,7 @@ def train(
     settings = replace(settings, log2_rows=rows or of_all_ranks.chosen_log2_rows)
     prepared = prepare(scene, settings, run=run, memory_bytes=memory_bytes, begun=begun, notify=notify)
     fitting = prepared.fitting(ranks)
-    size = ", ".join(f"{name} {value}" for name, value in fitting.field.settings.to_json().items())
-    notify(f"field: {size}; {field_bytes(fitting.field) / 1e6:.2f} MB")
+    notify(f"field: {fitting.field.settings.size_text}; {field_bytes(fitting.field) / 1e6:.2f} MB")
     if saved is not None:
         totals = restore(fitting, run, *saved)
         cut_log(run, fitting.step)
