@@ -570,6 +570,20 @@ def test_predictions_are_what_was_measured(finished):
     assert nerfcli("evaluate", finished, "--save-predictions", "png").exit_code == 0
 
 
+def test_poses_and_colours_can_be_aligned_in_one_call(finished):
+    assert nerfcli("evaluate", finished).exit_code == 0
+    result = nerfcli("evaluate", finished, "--align", "colour", "--align", "pose")
+    assert result.exit_code == BAD_INPUT
+    assert "written without refined poses and fitted gains" in error_of(result)[0]
+    result = nerfcli("evaluate", finished, "--align", "colour", "--align", "pose", "--overwrite", "--json")
+    metrics = json.loads(result.stdout)
+    assert set(metrics["mean"]) >= {"psnr_right_half", "psnr_pose_aligned", "psnr_gains_aligned"}
+    assert "pose_aligned: " in metrics["protocol"]
+    assert "gains_aligned: " in metrics["protocol"]
+    assert nerfcli("evaluate", finished, "--align", "colour").exit_code == 0
+    assert nerfcli("evaluate", finished, "--align", "light").exit_code == 2
+
+
 def test_other_seeds_are_trained_and_their_spread_is_told(finished):
     result = nerfcli("evaluate", finished, "--seeds", "2", "--json")
     assert result.exit_code == 0, result.stderr

@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from examples import examples
 from fog import fog, foggy_cells
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from nerfcli.cameras.camera import Camera
@@ -17,11 +20,13 @@ from nerfcli.cameras.rigid import Similarity, apply, inverse, look_at, transform
 from nerfcli.errors import UserError
 from nerfcli.evaluate import perceptual
 from nerfcli.evaluate.colour import colour_aligned
+from nerfcli.evaluate.colour_alignment import align_gains
 from nerfcli.evaluate.ledger import leak_ledger, summary_line
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.pose_refinement import align_pose, halves
 from nerfcli.evaluate.requirements import known_numbers, parse_requirements, unmet
 from nerfcli.evaluate.spread import spread
+from nerfcli.field.exposure import exposed
 from nerfcli.kernels import RaysSeen
 from nerfcli.render.model import Model
 from nerfcli.render.rays import CENTRES, pixel_rays
@@ -63,6 +68,33 @@ def test_saturated_pixels_have_no_say_and_too_few_change_nothing():
     few = np.zeros_like(used)
     few[0, :9] = True
     np.testing.assert_array_equal(colour_aligned(picture, photo, used=few), picture)
+
+
+GAIN = st.floats(-1.5, 1.5)
+
+
+@examples(20)
+@given(st.tuples(GAIN, GAIN, GAIN))
+def test_gains_are_found_again_from_half_of_a_photo_though_parts_of_it_are_wrong(wanted):
+    # Closed form: the photo is the picture with these gains, cut at white.
+    picture = np.random.default_rng(0).uniform(0.0, 1.0, (40, 60, 3))
+    photo = exposed(torch.from_numpy(picture), torch.tensor(wanted, dtype=torch.float64)).clamp(0, 1).numpy()
+    left, right = halves(np.ones((40, 60), dtype=bool))
+    exact = np.where(right[..., None], 0.5, photo)  # what is on the right has no say
+    assert align_gains(picture, exact, used=left, log_gains=(0.4,) * 3) == pytest.approx(wanted, abs=1e-9)
+    photo[::5], picture[1::5] = 1.0, 0.0  # neither white nor black says anything
+    photo[2, 1:5] = 0.5
+    assert align_gains(picture, photo, used=left, log_gains=(0.4,) * 3) == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize(("shown", "level"), [(0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5)])
+def test_black_and_white_leave_the_given_gains(shown, level):
+    given = (0.2, 0.0, -0.2)
+    picture, photo, used = np.full((9, 9, 3), shown), np.full((9, 9, 3), level), np.ones((9, 9), dtype=bool)
+    assert align_gains(picture, photo, used=used, log_gains=given) == given
+    grey, nothing = np.full((9, 9, 3), 0.5), np.zeros((9, 9), dtype=bool)
+    assert align_gains(grey, grey, used=nothing, log_gains=given) == given
+    assert align_gains(grey, grey, used=used, log_gains=given) == (0.0, 0.0, 0.0)
 
 
 # Novelty

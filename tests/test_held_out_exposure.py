@@ -9,7 +9,7 @@ from PIL import Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.photos.held_out_exposure import exif_slope, gains_between, log_gains_of
+from nerfcli.photos.held_out_exposure import exif_slope, gain_sources, gains_between, log_gains_of
 from nerfcli.render.model import load_model
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
@@ -100,12 +100,16 @@ def test_what_exif_tells_of_a_held_out_photo_goes_before_its_neighbours(monkeypa
     told = {"a": (9.0, 9.0, 9.0), "b": (0.1, 0.2, 0.3)}
     model = SimpleNamespace(log_exposure=1.0, exif_slope=1.0, exposures=told)
     assert log_gains_of(frames, model).tolist() == [[0.5] * 3, [0.1, 0.2, 0.3], [0.0] * 3]  # type: ignore[arg-type]
+    assert gain_sources(frames, model) == ["EXIF", "training photos around", "their mean"]  # type: ignore[arg-type]
     model.exif_slope = 0.6
     assert log_gains_of(frames, model).tolist()[:2] == [[pytest.approx(0.3)] * 3, [0.1, 0.2, 0.3]]  # type: ignore[arg-type]
     model.exif_slope = 0.0
     assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
     model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures=told)
     assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
+    assert gain_sources(frames, model)[0] == "training photos around"  # type: ignore[arg-type]
+    model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures={})
+    assert gain_sources(frames, model) == ["none"] * 3  # type: ignore[arg-type]
 
 
 def log_ratio(one: int, other: int) -> float:

@@ -56,7 +56,7 @@ def smaller(photo: HeldOutPhoto, factor: float) -> HeldOutPhoto:
         return photo
     used = None if photo.used is None else downscale(photo.used.astype(np.uint8) * 255, factor) == 255
     frame = replace(photo.frame, camera=downscaled_camera(photo.frame.camera, factor))
-    return HeldOutPhoto(frame, downscale(photo.pixels, factor), used, photo.log_gains)
+    return replace(photo, frame=frame, pixels=downscale(photo.pixels, factor), used=used)
 
 
 def _in_float64(model: Model) -> Model:

@@ -22,6 +22,7 @@ _COLUMNS = {
     "colours aligned": "_colour_aligned",
     "right half": "_right_half",
     "right half, pose aligned": "_pose_aligned",
+    "right half, gains aligned": "_gains_aligned",
 }
 _MEASURES = (("psnr", 2), ("ssim", 4), ("lpips", 4))
 
@@ -32,8 +33,11 @@ def evaluate(
         list[str], typer.Argument(help="Run folders written by train, or - to read paths from standard input.")
     ],
     align: Annotated[
-        str | None,
-        typer.Option(help="pose: also refine each pose on the left half of the photo and measure on the right half."),
+        list[str] | None,
+        typer.Option(
+            help="pose: also refine each pose on the left half of the photo and measure on the right half; colour: the "
+            "same with a gain per channel. Can be given twice."
+        ),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Train with this many seeds in total and report the spread.", min=1)] = 1,
     members: Annotated[
@@ -74,6 +78,7 @@ def evaluate(
       nerfcli evaluate photos-scene-run --json | jq .mean.psnr
       nerfcli evaluate photos-scene-run --require "psnr>=25,registered>=0.9"
       nerfcli evaluate photos-scene-run --align pose --save-predictions png --overwrite
+      nerfcli evaluate photos-scene-run --align colour --overwrite
       nerfcli evaluate photos-scene-run --seeds 3
       nerfcli evaluate photos-scene-run --members
       nerfcli evaluate photos-scene-run --dry-run --json
@@ -85,7 +90,7 @@ def evaluate(
     from nerfcli.tomography.result import is_reconstruction
     from nerfcli.workflows.evaluate import check_requirements, evaluate_run
 
-    one_of(align, ("pose",), "--align")
+    aligned = {one_of(kind, ("pose", "colour"), "--align") for kind in align or ()}
     one_of(save_predictions, KINDS, "--save-predictions")
     if STDIN in runs and (len(runs) > 1 or seeds > 1):
         raise typer.BadParameter(
@@ -126,7 +131,8 @@ def evaluate(
                 device=torch_device,
                 threads=cores,
                 overwrite=overwrite,
-                align_poses=align == "pose",
+                align_poses="pose" in aligned,
+                align_colours="colour" in aligned,
                 predictions=save_predictions,
                 notify=console.note,
                 progress=update,
@@ -164,7 +170,12 @@ def evaluate(
         if is_reconstruction(folder):
             raise UserError(f"{folder} is a reconstruction of a scan; --dry-run is for photos", "remove --dry-run")
         found = plan_evaluation(
-            folder, device=torch_device, threads=cores, align_poses=align == "pose", predictions=save_predictions
+            folder,
+            device=torch_device,
+            threads=cores,
+            align_poses="pose" in aligned,
+            align_colours="colour" in aligned,
+            predictions=save_predictions,
         )
         print_plan(folder, found, console)
 

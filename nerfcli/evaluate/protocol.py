@@ -14,6 +14,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.billboards import Billboards, Shape, ShapeEvidence
 from nerfcli.evaluate.colour import colour_aligned
+from nerfcli.evaluate.colour_alignment import align_gains
 from nerfcli.evaluate.metrics import as_float, psnr, ssim, to_8_bit, whole_windows
 from nerfcli.evaluate.novelty import novelty
 from nerfcli.evaluate.perceptual import NAME as LPIPS_NAME
@@ -39,12 +40,14 @@ class HeldOutPhoto:
         used: (H, W) bool; None for all pixels.
         log_gains: logarithms of its gains relative to the model's pictures, as EXIF or the training photos around it
             tell them, never the photo itself; see `field.exposure`.
+        gains_from: what tells them, one of `held_out_exposure.SOURCES`.
     """
 
     frame: Frame
     pixels: np.ndarray
     used: np.ndarray | None
     log_gains: tuple[float, ...] = NO_GAINS
+    gains_from: str = "none"
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,7 @@ class Extras:
         perceptual: LPIPS, where it can be had.
         billboards: a model without shape that the field is compared with.
         align_poses: whether each held-out pose is refined, too; it costs a render and about 60 times 2048 pixels.
+        align_colours: whether gains are fitted to the left half of each held-out photo, too.
         keep: takes what was compared, photo by photo.
     """
 
@@ -78,6 +82,7 @@ class Extras:
     perceptual: Perceptual | None = None
     billboards: Billboards | None = None
     align_poses: bool = False
+    align_colours: bool = False
     keep: Callable[[Compared], None] = lambda compared: None
 
 
@@ -92,7 +97,8 @@ def evaluate_model(
 
     Per photo: psnr, ssim and lpips of the 8-bit picture; psnr_float and ssim_float of the picture before rounding;
     *_colour_aligned after `colour.colour_aligned`; with `align_poses`, *_pose_aligned and *_right_half: the right half
-    of the photo, from the pose that the left half asks for and from its own. None is what is not known.
+    of the photo, from the pose that the left half asks for and from its own; with `align_colours`, *_gains_aligned:
+    the right half with the gains that the left half asks for. None is what is not known.
 
     Args:
         model: the trained model.
@@ -136,7 +142,12 @@ def evaluate_model(
             "name": photo.frame.name,
             **measured(compared, extras.perceptual),
             **_counted(photo, picture, compared),
+            "exposure": {"from": photo.gains_from, "log_gains": list(photo.log_gains)},
         }
+        if extras.align_poses or extras.align_colours:
+            entry |= _right_half(compared, compared.rendered, suffix="_right_half")
+        if extras.align_colours:
+            entry |= _gains_aligned(picture.rgb, compared, photo.log_gains)
         if extras.align_poses:
             entry |= _pose_aligned(model, compared, photo.log_gains, background=background, on_tile=on_tile)
         if views is not None:
@@ -259,18 +270,36 @@ def _pose_aligned(
     background: Background,
     on_tile: Callable[[int], None],
 ) -> dict[str, Any]:
-    left, right = halves(compared.used)
-    truth = compared.photo
-    found = align_pose(model, compared.frame, as_float(truth), used=left, background=background, log_gains=log_gains)
-    if found is None or not right.any():
-        nothing = ("psnr_right_half", "ssim_right_half", "psnr_pose_aligned", "ssim_pose_aligned", "pose_alignment")
-        return dict.fromkeys(nothing)
+    left, _ = halves(compared.used)
+    truth = as_float(compared.photo)
+    found = align_pose(model, compared.frame, truth, used=left, background=background, log_gains=log_gains)
+    if found is None:
+        return dict.fromkeys(("psnr_pose_aligned", "ssim_pose_aligned", "pose_alignment"))
     again = render_picture(model, found.frame, background=background, on_tile=on_tile)
     return {
-        **_close(to_8_bit(compared.rendered), truth, used=right, suffix="_right_half"),
-        **_close(to_8_bit(as_exposed(again.rgb, log_gains)), truth, used=right, suffix="_pose_aligned"),
+        **_right_half(compared, as_exposed(again.rgb, log_gains), suffix="_pose_aligned"),
         "pose_alignment": found.to_json(),
     }
+
+
+def _gains_aligned(rgb: np.ndarray, compared: Compared, log_gains: tuple[float, ...]) -> dict[str, Any]:
+    """Measure the model's own colours (H, W, 3) with other gains than the photo's given ones."""
+    if compared.on_white:
+        return dict.fromkeys(("psnr_gains_aligned", "ssim_gains_aligned", "gain_alignment"))
+    left, _ = halves(compared.used)
+    found = align_gains(rgb, as_float(compared.photo), used=left, log_gains=log_gains)
+    return {
+        **_right_half(compared, as_exposed(rgb, found), suffix="_gains_aligned"),
+        "gain_alignment": {"log_gains": list(found)},
+    }
+
+
+def _right_half(compared: Compared, rendered: np.ndarray, *, suffix: str) -> dict[str, float | None]:
+    """Measure a picture on the right half of the photo; None where no pixel of it counts."""
+    _, right = halves(compared.used)
+    if not right.any():
+        return {f"psnr{suffix}": None, f"ssim{suffix}": None}
+    return _close(to_8_bit(rendered), compared.photo, used=right, suffix=suffix)
 
 
 def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -285,14 +314,19 @@ def _kinds(images: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
 def _protocol_name(held_out: Sequence[HeldOutPhoto], extras: Extras) -> str:
     sizes = sorted({f"{photo.pixels.shape[1]}x{photo.pixels.shape[0]}" for photo in held_out})
     names = hashlib.sha256("\n".join(photo.frame.name for photo in held_out).encode()).hexdigest()[:12]
-    matched = any(any(photo.log_gains) for photo in held_out)
-    exposures = ", exposures by EXIF or training photos around" if matched else ""
+    sources = {photo.gains_from for photo in held_out} - {"none"}
+    exposures = f", exposures by {' or '.join(sorted(sources))}" if sources else ""
     alpha = ", RGBA on white" if any(photo.pixels.shape[-1] == 4 for photo in held_out) else ""
     lpips = f"{LPIPS_NAME} (torchmetrics)" if extras.perceptual is not None else "no LPIPS"
     pose = ", pose_aligned: refined on the left half, measured on the right" if extras.align_poses else ""
+    gains = (
+        ", gains_aligned: median gain per channel in linear light of the left half, measured on the right"
+        if extras.align_colours
+        else ""
+    )
     return (
         f"{PROTOCOL}: {len(held_out)} held-out photos (names sha256 {names}) at {' '.join(sizes)}, area-averaged, "
         f"sRGB 8 bit{alpha}{exposures}, mean of per-image values; PSNR; SSIM with Gaussian window 1.5, 11 x 11, of "
         f"windows inside the picture that hold no masked pixel (scikit-image); {lpips}; float: before rounding; "
-        f"colour_aligned: quadratic colour correction fitted to the held-out photo (multinerf){pose}"
+        f"colour_aligned: quadratic colour correction fitted to the held-out photo (multinerf){pose}{gains}"
     )

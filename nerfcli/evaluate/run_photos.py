@@ -7,7 +7,7 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.errors import UserError
 from nerfcli.evaluate.billboards import Billboards, reduction
 from nerfcli.evaluate.protocol import HeldOutPhoto, over_white
-from nerfcli.photos.held_out_exposure import log_gains_of
+from nerfcli.photos.held_out_exposure import gain_sources, log_gains_of
 from nerfcli.photos.loading import downscaled_camera, load_photos
 from nerfcli.render.model import Model
 from nerfcli.runs.config import RunConfig
@@ -30,9 +30,10 @@ def held_out_photos(
         UserError: a photo cannot be read.
     """
     photos = load_photos(frames, factor=downscale, threads=threads, masks=masks)
+    told = zip(photos, log_gains_of(frames, model).tolist(), gain_sources(frames, model), strict=True)
     return [
-        HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains))
-        for photo, gains in zip(photos, log_gains_of(frames, model).tolist(), strict=True)
+        HeldOutPhoto(photo.frame, photo.pixels, photo.used, log_gains=tuple(gains), gains_from=source)
+        for photo, gains, source in told
     ]
 
 

@@ -8,6 +8,10 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.photos.exif_exposure import log_exposures
 from nerfcli.render.model import Model
 
+# What tells the gains of a held-out photo: nothing, as the model has no exposures; EXIF; the training photos taken
+# before and after; or nothing but that they are the mean of all.
+SOURCES = ("none", "EXIF", "training photos around", "their mean")
+
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Interpolate (T, 3) gains along the capture for photos between others; 0, the mean, where that is a better guess.
@@ -67,12 +71,28 @@ def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray
 def log_gains_of(frames: Sequence[Frame], model: Model) -> np.ndarray:
     """(N, 3) logarithms of the gains of photos relative to the pictures of a model, from EXIF; where it does
     not, as the training does; else 0."""
-    if model.log_exposure is None or model.exif_slope == 0.0:
-        by_exif = np.full(len(frames), np.nan)
-    else:
-        by_exif = model.exif_slope * (log_exposures(frames) - model.log_exposure)
+    by_exif = _by_exif(frames, model)
     by_training = np.array([model.exposures.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
     return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None], by_training)
+
+
+def gain_sources(frames: Sequence[Frame], model: Model) -> list[str]:
+    """Return what tells the gains of each photo in `log_gains_of`, one of `SOURCES`."""
+    none, exif, around, mean = SOURCES
+    if model.log_exposure is None and not model.exposures:
+        return [none] * len(frames)
+    known = np.isfinite(_by_exif(frames, model))
+    told = [any(model.exposures.get(frame.name, ())) for frame in frames]
+    return [
+        exif if by_exif else around if by_training else mean for by_exif, by_training in zip(known, told, strict=True)
+    ]
+
+
+def _by_exif(frames: Sequence[Frame], model: Model) -> np.ndarray:
+    """Return the logarithms of gains that EXIF tells, (N,), NaN where it does not."""
+    if model.log_exposure is None or model.exif_slope == 0.0:
+        return np.full(len(frames), np.nan)
+    return model.exif_slope * (log_exposures(frames) - model.log_exposure)
 
 
 def _interpolated(places: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:

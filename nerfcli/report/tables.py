@@ -213,6 +213,7 @@ _NUMBERS: tuple[tuple[str, Callable[[RunFacts], str]], ...] = (
     ("PSNR after colour alignment", metric("psnr_colour_aligned", "{:.2f} dB")),
     ("PSNR on the right halves", metric("psnr_right_half", "{:.2f} dB")),
     ("PSNR on the right halves, poses aligned on the left halves", metric("psnr_pose_aligned", "{:.2f} dB")),
+    ("PSNR on the right halves, gains fitted on the left halves", metric("psnr_gains_aligned", "{:.2f} dB")),
     ("PSNR on views between training views (interpolation)", _of_kind("interpolation")),
     ("PSNR on views beyond training views (extrapolation)", _of_kind("extrapolation")),
     ("gain over billboards (a model without geometry)", _shape),

@@ -53,6 +53,7 @@ def evaluate_run(
     threads: int = 0,
     overwrite: bool = False,
     align_poses: bool = False,
+    align_colours: bool = False,
     predictions: str | None = None,
     notify: Notify = silent,
     progress: Progress = no_progress,
@@ -70,6 +71,7 @@ def evaluate_run(
         threads: of the CPU; 0 for all.
         overwrite: measure again.
         align_poses: also from a pose refined on the left half of each photo, measured on the right.
+        align_colours: also with gains fitted on the left half of each photo, measured on the right.
         predictions: "png" saves what was compared in RUN/predictions, "float" unrounded, too; None saves nothing.
         notify: takes lines for the user.
         progress: takes the share of the photos that is done, and a few words.
@@ -87,7 +89,13 @@ def evaluate_run(
     checkpoint = model.sha256
     assert checkpoint is not None
     if trained.metrics_path.exists() and not overwrite:
-        metrics = _kept(trained.metrics_path, checkpoint, align_poses=align_poses, predictions=predictions)
+        metrics = _kept(
+            trained.metrics_path,
+            checkpoint,
+            align_poses=align_poses,
+            align_colours=align_colours,
+            predictions=predictions,
+        )
         made_by = metrics["protocol"].split(":")[0]
         older = "" if made_by == PROTOCOL else f" (by {made_by})"
         notify(f"{trained.metrics_path} is kept{older}: it is up to date; add --overwrite to evaluate again")
@@ -107,7 +115,7 @@ def evaluate_run(
             model,
             held_out,
             on_image=lambda done, total: progress(done / total, f"of {total} rays"),
-            extras=Extras(trained.cameras.train, perceptual, billboards, align_poses, keep),
+            extras=Extras(trained.cameras.train, perceptual, billboards, align_poses, align_colours, keep),
         )
     metrics["training"] = summary.to_json()
     metrics["ledger"] = [entry.to_json() for entry in leak_ledger(trained.config)]
@@ -161,7 +169,9 @@ def saved_predictions(
         write_json(folder / INFO, {"checkpoint_sha256": checkpoint, "kind": kind, "files": stems})
 
 
-def _kept(path: Path, checkpoint: str, *, align_poses: bool, predictions: str | None) -> dict[str, Any]:
+def _kept(
+    path: Path, checkpoint: str, *, align_poses: bool, align_colours: bool, predictions: str | None
+) -> dict[str, Any]:
     """Return the metrics that are there, if they are of this checkpoint and have all that is wanted."""
     metrics = read_json(path, needed=("protocol", "mean", "images"), hint="add --overwrite to evaluate again")
     if metrics.get("checkpoint_sha256") != checkpoint:
@@ -169,6 +179,8 @@ def _kept(path: Path, checkpoint: str, *, align_poses: bool, predictions: str | 
     lacks = []
     if align_poses and "psnr_pose_aligned" not in metrics["mean"]:
         lacks.append("refined poses")
+    if align_colours and "psnr_gains_aligned" not in metrics["mean"]:
+        lacks.append("fitted gains")
     if predictions is not None and not predictions_are_there(
         path.with_name(PREDICTIONS), predictions, checkpoint=checkpoint
     ):

@@ -116,12 +116,13 @@ def plan_evaluation(
     device: str = "auto",
     threads: int = 0,
     align_poses: bool = False,
+    align_colours: bool = False,
     predictions: str | None = None,
 ) -> RenderingPlan:
     """Return what `evaluate_run` would take, from three held-out photos that are compared at a smaller size.
 
     Args:
-        run, device, threads, align_poses, predictions: as for `evaluate_run`.
+        run, device, threads, align_poses, align_colours, predictions: as for `evaluate_run`.
 
     Raises:
         UserError: see `evaluate_run`.
@@ -135,7 +136,7 @@ def plan_evaluation(
     load_photos(_spread(train), factor=factor, threads=1, masks=trained.components.masks)
     reading = (time.perf_counter() - begin) * (len(test) + len(train)) / (len(photos) + len(_spread(train)))
     small = [_fewer_pixels(photo) for photo in photos]
-    extras = Extras(train, align_poses=align_poses)
+    extras = Extras(train, align_poses=align_poses, align_colours=align_colours)
     seconds = _second_run(lambda: evaluate_model(model, small, on_image=lambda done, total: None, extras=extras))
     frames = [photo.frame for photo in photos]
     share = _pixels(frames) / _pixels([photo.frame for photo in small]) * len(test) / len(photos)
