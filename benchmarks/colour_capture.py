@@ -1,0 +1,120 @@
+"""Photos as three cameras would have taken them: exposure, colour matrix, contrast and vignetting are known.
+
+    python benchmarks/colour_capture.py sample_scenes/desk captures/desk-three-cameras
+    python benchmarks/colour_capture.py sample_scenes/desk captures/desk-exposures --only gains
+    nerfcli train captures/desk-three-cameras --with exposure=learned
+
+The photos are those of three cameras in turn. Each camera has a 3x3 colour matrix whose rows sum to 1, a contrast and
+vignetting; each photo has its own gains. In linear light, with r^2 = 1 in the corners of the picture:
+
+    light' = gains * 0.18 * (matrix @ light * (1 + v1 r^2 + v2 r^4) / 0.18)^contrast
+
+Writes images/, transforms.json and colours.json, which holds the truth.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from nerfcli.media.srgb import linear_light
+
+Array = NDArray[np.float64]
+
+EFFECTS = ("gains", "matrix", "contrast", "vignetting")
+MATRICES = np.array(
+    [
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        [[1.25, -0.2, -0.05], [-0.1, 1.2, -0.1], [0.0, -0.2, 1.2]],
+        [[0.85, 0.1, 0.05], [0.05, 0.9, 0.05], [0.0, 0.1, 0.9]],
+    ]
+)
+CONTRASTS = (1.0, 1.2, 0.85)
+VIGNETTING = ((0.0, 0.0), (-0.3, -0.1), (-0.1, -0.2))
+MIDDLE = 0.18
+# Standard deviation of the logarithms of gains: of all channels of a photo, and of each.
+GAIN, WHITE_BALANCE = 0.25, 0.08
+
+
+def developed(light: Array, truth: dict[str, Any]) -> Array:
+    """Return linear light (H, W, 3) as a photo of this truth has it, not clipped."""
+    height, width = light.shape[:2]
+    y, x = np.mgrid[:height, :width] + 0.5
+    squared = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width / 2) ** 2 + (height / 2) ** 2)
+    first, second = truth["vignetting"]
+    seen = light @ np.array(truth["matrix"]).T * (1.0 + first * squared + second * squared**2)[..., None]
+    return np.exp(truth["log_gains"]) * MIDDLE * (np.maximum(seen, 0.0) / MIDDLE) ** truth["contrast"]
+
+
+def truths(count: int, *, effects: tuple[str, ...], seed: int = 0) -> list[dict[str, Any]]:
+    """Return what each of the photos is developed with; effects that are left out are none."""
+    rng = np.random.default_rng(seed)
+    gains = rng.normal(0.0, GAIN, (count, 1)) + rng.normal(0.0, WHITE_BALANCE, (count, 3))
+    return [
+        {
+            "camera": (camera := photo % len(MATRICES)),
+            "log_gains": gains[photo].tolist() if "gains" in effects else [0.0] * 3,
+            "matrix": (MATRICES[camera] if "matrix" in effects else np.eye(3)).tolist(),
+            "contrast": CONTRASTS[camera] if "contrast" in effects else 1.0,
+            "vignetting": VIGNETTING[camera] if "vignetting" in effects else (0.0, 0.0),
+        }
+        for photo in range(count)
+    ]
+
+
+def write(source: Path, out: Path, *, effects: tuple[str, ...], reduction: int) -> None:
+    """Write images/, transforms.json and colours.json from photos with known cameras.
+
+    Args:
+        source: a folder like sample_scenes/desk.
+        out: where to.
+        effects: some of `EFFECTS`.
+        reduction: of the photos' sides.
+    """
+    known = json.loads((source / "truth" / "cameras.json").read_text())
+    (focal, x, y, k1, k2), names = known["camera"]["params"], sorted(image["name"] for image in known["images"])
+    poses = {image["name"]: np.array(image["world_from_cam"]) for image in known["images"]}
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    told = dict(zip(names, truths(len(names), effects=effects), strict=True))
+    width, height = known["camera"]["width"] // reduction, known["camera"]["height"] // reduction
+    for name in names:
+        photo = Image.open(source / "images" / name).resize((width, height), Image.Resampling.BOX)
+        light = developed(linear_light(np.asarray(photo) / 255.0), told[name])
+        curved = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055)
+        levels = np.round(255 * curved.clip(0, 1)).astype(np.uint8)
+        Image.fromarray(levels).save(out / "images" / f"{Path(name).stem}.png")
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])  # to the axes of OpenGL, as the format has them
+    frames = [
+        {"file_path": f"images/{Path(name).stem}.png", "transform_matrix": (poses[name] @ flip).tolist()}
+        for name in names
+    ]
+    described = {
+        "camera_model": "OPENCV",
+        "w": width,
+        "h": height,
+        "fl_x": focal / reduction,
+        "fl_y": focal / reduction,
+        "cx": x / reduction,
+        "cy": y / reduction,
+        "k1": k1,
+        "k2": k2,
+        "p1": 0.0,
+        "p2": 0.0,
+        "frames": frames,
+    }
+    (out / "transforms.json").write_text(json.dumps(described, indent=1))
+    (out / "colours.json").write_text(json.dumps(told, indent=1))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--only", nargs="*", choices=EFFECTS, default=EFFECTS)
+    parser.add_argument("--reduction", type=int, default=2)
+    chosen = parser.parse_args()
+    write(chosen.source, chosen.out, effects=tuple(chosen.only), reduction=chosen.reduction)
