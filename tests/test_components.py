@@ -106,3 +106,17 @@ def test_gradients_near_a_camera_shrink_with_the_square_of_the_distance():
     assert rgb.grad is not None
     assert density.grad.tolist() == [0.0, 0.25, 1.0, 1.0]
     assert rgb.grad[:, 1].tolist() == [0.0, 0.25, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("option", ["--with", "--without"])
+@pytest.mark.parametrize("command", ["train", "run", "ablate"])
+def test_components_may_be_separated_by_commas(command, option, tmp_path):
+    result = CliRunner().invoke(app, [command, str(tmp_path), option, "points, stereo,sharpness", option, "near"])
+    assert result.exit_code == 2
+    assert f"{option} sharpness: unknown component" in result.stderr
+
+
+def test_components_to_vary_may_be_separated_by_commas(tmp_path):
+    result = CliRunner().invoke(app, ["ablate", str(tmp_path), "--only", "view,sharpness"])
+    assert result.exit_code == 2
+    assert "'sharpness'; choose from background" in result.stderr

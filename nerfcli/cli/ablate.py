@@ -27,6 +27,7 @@ from nerfcli.cli.options import (
     model_name,
     named_components,
     seconds_from_text,
+    split_at_commas,
     thread_count,
 )
 
@@ -47,7 +48,12 @@ def ablate(
     seeds: Annotated[int, typer.Option(help="Number of seeds per variant, starting at --seed.", min=1)] = 3,
     only: Annotated[
         list[str] | None,
-        typer.Option("--only", metavar="NAME", help="Vary only this component. Repeatable.  [default: all]"),
+        typer.Option(
+            "--only",
+            metavar="NAME,...",
+            help="Vary only these components. Repeatable.  [default: all]",
+            callback=split_at_commas,
+        ),
     ] = None,
     include: Include = None,
     exclude: Exclude = None,

@@ -9,6 +9,12 @@ import typer
 
 Word = TypeVar("Word", str, str | None)
 
+
+def split_at_commas(texts: list[str] | None) -> list[str]:
+    """Return the items of all comma-separated texts that a repeatable option was given."""
+    return [item.strip() for text in texts or () for item in text.split(",")]
+
+
 Output = Annotated[
     Path | None,
     typer.Option(
@@ -22,12 +28,20 @@ Downscale = Annotated[str, typer.Option(help="Reduce photos by this factor: auto
 Include = Annotated[
     list[str] | None,
     typer.Option(
-        "--with", metavar="NAME[=VALUE]", help="Enable a component; nerfcli train --help lists them. Repeatable."
+        "--with",
+        metavar="NAME[=VALUE],...",
+        help="Components to enable; nerfcli train --help lists them. Repeatable.",
+        callback=split_at_commas,
     ),
 ]
 Exclude = Annotated[
     list[str] | None,
-    typer.Option("--without", metavar="NAME", help="Disable a component; nerfcli train --help lists them. Repeatable."),
+    typer.Option(
+        "--without",
+        metavar="NAME,...",
+        help="Components to disable; nerfcli train --help lists them. Repeatable.",
+        callback=split_at_commas,
+    ),
 ]
 ModelChoice = Annotated[
     str,
