@@ -422,6 +422,14 @@ def test_poses_count_even_where_no_point_is_seen(moved, tmp_path):
     assert not replace(checked, **{moved: 1e-6}).holds
 
 
+def test_without_points_cameras_are_compared_by_synthetic_ones(tmp_path):
+    capture = capture_of([SQUARE])
+    bare = replace(capture, points=np.zeros((0, 3)), colours=None, observations=None)
+    result = nerfcli("convert", npz_of(tmp_path, bare), tmp_path / "out.json", "--to", "transforms")
+    assert result.exit_code == 0
+    assert "projections of synthetic points in " in " ".join(result.stderr.split())
+
+
 def test_a_view_under_another_name_is_found(tmp_path, monkeypatch):
     source = npz_of(tmp_path, capture_of([SQUARE]))
     monkeypatch.setattr(transforms, "relative_path", lambda frame, folder: "photo 01.png")

@@ -245,11 +245,12 @@ def _print_verification(done: "Conversion", console: Console) -> None:
         console.warn(f"{done.path}: not verified")
         return
     against = "the remaining capture" if done.losses else "the capture"
+    points = f"{checked.num_points} points" if checked.num_points else "synthetic points"
     if not checked.num_projections:
         console.note(f"{done.path}: verified, its {checked.num_points} points equal those of {against}")
         return
     console.note(
-        f"{done.path}: verified, {checked.num_projections} projections of {checked.num_points} points in "
+        f"{done.path}: verified, {checked.num_projections} projections of {points} in "
         f"{checked.num_views} images compared with {against}; largest residual {checked.max_px:.2g} px "
         f"(tolerance {checked.tolerance_px:.2g} px), rotation {checked.max_deg:.2g} degrees, "
         f"centre {checked.max_centre_shift:.2g} of the scene's size"
