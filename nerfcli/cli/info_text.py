@@ -13,7 +13,28 @@ _UNITS_OF_MAPS = {"coverage": " photos", "parallax": " degrees", "confidence": "
 _LENGTHS = ("depth", "spread", "disagreement", "lower", "upper", "depth_deviation")
 # Of facts whose name in JSON is not what people say.
 _LABELS = {
-    "held_out": "held-out photos",
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "psnr_float": "PSNR before rounding to 8 bits",
+    "ssim_float": "SSIM before rounding to 8 bits",
+    "psnr_colour_aligned": "PSNR after colour correction",
+    "ssim_colour_aligned": "SSIM after colour correction",
+    "lpips_colour_aligned": "LPIPS after colour correction",
+    "budget_seconds": "budget",
+    "fixed": "set by hand",
+    "log2_rows": "rows per level",
+    "features": "numbers per row",
+    "coarsest": "cells per axis of the coarsest level",
+    "finest": "of the finest",
+    "first_samples_per_step": "samples of the first steps",
+    "photo_fraction": "share of the photos",
+    "angles_deg": "angles in degrees",
+    "pixel_at_object": "pixel at the object",
+    "source_origin": "source to axis",
+    "source_detector": "source to detector",
+    "axis_column": "column of the axis",
+    "held_out": "held out",
     "missing": "missing photos",
     "camera_count": "number of cameras",
     "step": "steps",
@@ -23,6 +44,8 @@ _LABELS = {
     "field_bytes": "size of the field",
     "occupied_share": "occupied cells",
 }
+# Settings of the training of members and blocks, as they are in any other.
+_USUAL = {"photo_fraction": 1.0, "random_start": 0.0, "blocks": 0, "block": 0}
 # Letters in a line; what is longer goes on in the next one, further in.
 WIDTH = 110
 
@@ -33,15 +56,27 @@ def lines_of(facts: dict[str, Any]) -> list[str]:
     for key, value in facts.items():
         if value is None or value in ([], {}):
             continue
-        name = _LABELS.get(key, key.replace("_", " "))
+        name = _name(key)
         if isinstance(value, list):
-            lines += [f"{name}:", *(f"  {_plain(entry)}" for entry in value)]
-        elif isinstance(value, dict):
-            listed = ", ".join(f"{part} {_plain(entry)}" for part, entry in value.items() if entry is not None)
-            lines += _folded(f"{name}: {listed}")
+            lines += [
+                f"{name}:",
+                *(f"  {_listed(entry) if isinstance(entry, dict) else _plain(entry)}" for entry in value),
+            ]
+        elif key == "components":
+            lines += _folded(f"{name}: {', '.join(f'{part}={_plain(choice)}' for part, choice in value.items())}")
         else:
-            lines.append(f"{name}: {_with_unit(key, value)}")
+            text = f"{name}: {_with_unit(key, value)}"
+            lines += _folded(text) if isinstance(value, dict) else [text]
     return lines
+
+
+def _name(key: str) -> str:
+    return _LABELS.get(key, key.replace("_", " "))
+
+
+def _listed(facts: dict[str, Any]) -> str:
+    told = {key: value for key, value in facts.items() if value not in (None, []) and _USUAL.get(key) != value}
+    return ", ".join(f"{_name(key)} {_with_unit(key, value)}" for key, value in told.items())
 
 
 def words_of(facts: dict[str, Any]) -> list[str]:
@@ -140,8 +175,20 @@ def _folded(text: str) -> list[str]:
 
 
 def _with_unit(key: str, value: Any) -> str:
-    if key == "seconds":
+    if key.endswith("seconds"):
         return f"{value:.4g} s"
+    if key == "angles_deg":
+        return f"{value['from']:g} to {value['to']:g}"
+    if key == "log2_rows":
+        return f"2^{value}"
+    if key.startswith("psnr"):
+        return f"{value:.2f} dB"
+    if key.startswith(("ssim", "lpips")):
+        return f"{value:.3f}"
+    if isinstance(value, list):
+        return " and ".join(map(str, value))
+    if isinstance(value, dict):
+        return _listed(value)
     if key == "samples_per_second":
         return f"{value:,}"
     if key.endswith("_share"):
