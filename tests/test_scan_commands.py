@@ -1,6 +1,7 @@
 """Scans through the commands: train, evaluate, render on a small phantom, and what they refuse."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -214,6 +215,26 @@ def test_hash_grids_are_trained_resumed_evaluated_rendered_and_exported(bean_run
     assert "another reconstruction" in err
 
 
+@pytest.mark.parametrize(
+    ("first", "more"),
+    [
+        (("--outputs", "projection"), ("--outputs", "residual,projection")),
+        (("--slices", "z=0"), ("--slices", "x=0", "--slices", "z=0")),
+    ],
+)
+def test_pictures_that_are_there_are_kept_and_nothing_is_added(
+    bean_run: Path, tmp_path: Path, first: tuple[str, ...], more: tuple[str, ...]
+) -> None:
+    code, _, err = call("render", bean_run, "-o", tmp_path, *first)
+    assert code == 0, err
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    code, _, err = call("render", bean_run, "-o", tmp_path, *more)
+    assert code == 3
+    assert re.search(r"Error: \S+ exists\nHint:  add --overwrite to replace it", err)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    assert call("render", bean_run, "-o", tmp_path, *more, "--overwrite")[0] == 0
+
+
 @pytest.mark.parametrize("suffix", [".nrrd", ".mha", ".nii", ".tif"])
 def test_volume_files_read_back(bean_run: Path, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"bean{suffix}"
@@ -267,8 +288,6 @@ def test_other_suffixes_and_types_are_refused(tmp_path: Path) -> None:
     ],
 )
 def test_train_refuses_in_two_lines(bean_run: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
-    import re
-
     code, _, err = call("train", bean_run.with_name("bean"), "--steps", "1", "-o", tmp_path / "run", *arguments)
     assert code == 3
     assert re.search(said, err)

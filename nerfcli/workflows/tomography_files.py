@@ -57,7 +57,12 @@ def render_scan(
     torch.set_num_threads(thread_count(threads))
     result = load_reconstruction(run)
     if slices:
-        return [path for axis, at in slices for path in _write_slice(result, target, axis, at, overwrite=overwrite)]
+        cuts = {target / f"{name}.tif": cut for axis, at in slices for name, cut in _slice(result, axis, at).items()}
+        _refuse_existing(*cuts, overwrite=overwrite)
+        for path, (values, high) in cuts.items():
+            # Rows go down on screens, and up along the second axis.
+            _write_picture(path, values[::-1].copy(), 0.0, high)
+        return list(cuts)
     scan = scan_of(result, run)
     chosen = np.array(scan.held_out, dtype=int) if views == "test" else scan.training_views
     if len(chosen) == 0:
@@ -66,7 +71,8 @@ def render_scan(
     projector, likelihood = Projector(geometry, result.grid), likelihood_of(scan, chosen)
     volume = torch.from_numpy(np.array(result.volume))
     top = float(np.nanmax(scan.line_integrals(chosen)))
-    written = []
+    paths = {(view, name): target / name / f"{view:04d}.tif" for view in chosen for name in outputs}
+    _refuse_existing(*paths.values(), overwrite=overwrite)
     for number, view in enumerate(chosen):
         index = np.array([number])
         integrals = projector.forward(volume, index)
@@ -77,12 +83,10 @@ def render_scan(
         }
         for name in outputs:
             values, low, high = pictures[name]
-            path = target / name / f"{view:04d}.tif"
-            _write_picture(path, values.view(geometry.rows, geometry.columns).numpy(), low, high, overwrite=overwrite)
-            written.append(path)
+            _write_picture(paths[view, name], values.view(geometry.rows, geometry.columns).numpy(), low, high)
         progress((number + 1) / len(chosen), f"view {view}")
-    notify(f"{len(written)} pictures of {len(chosen)} views; line integrals up to {top:.3g}")
-    return written
+    notify(f"{len(paths)} pictures of {len(chosen)} views; line integrals up to {top:.3g}")
+    return list(paths.values())
 
 
 def export_scan(
@@ -110,8 +114,7 @@ def export_scan(
     if water is not None:
         values, quantity = (1000 * (values / np.float32(water) - 1)).astype(np.float32), "HU"
     beside = target.with_name(f"{target.stem}-marks{target.suffix}")
-    for path in (target, beside):
-        _refuse_existing(path, overwrite=overwrite)
+    _refuse_existing(target, beside, overwrite=overwrite)
     write_volume(target, VolumeFile(values, result.grid, result.unit, quantity))
     written = [target]
     if marks.any():
@@ -155,31 +158,28 @@ def residual_of(likelihood: Likelihood, integrals: torch.Tensor, views: torch.Te
     return -torch.sign(likelihood.slope(integrals, views)) * likelihood.deviance(integrals, views).sqrt()
 
 
-def _write_slice(result: Reconstruction, target: Path, axis: str, at: float, *, overwrite: bool) -> list[Path]:
-    """Write a slice, and the marks of its nearest layer if there are any."""
+def _slice(result: Reconstruction, axis: str, at: float) -> dict[str, tuple[np.ndarray, float]]:
+    """Return a slice and the marks of its nearest layer, if there are any: values and the largest one, by name."""
     top = float(np.nanquantile(np.asarray(result.volume), 0.999))
     layer = int(np.argmin(np.abs(result.grid.axis(axis) - at)))
     found = np.take(result.marks, layer, "zyx".index(axis)).astype(np.float32)
     pictures = {f"{axis}={at:g}": (slice_of(result, axis, at), top)}
     if found.any():
         pictures[f"{axis}={at:g}-marks"] = (found, float(sum(MEANINGS)))
-    for name, (values, high) in pictures.items():
-        # Rows go down on screens, and up along the second axis.
-        _write_picture(target / f"{name}.tif", values[::-1].copy(), 0.0, high, overwrite=overwrite)
-    return [target / f"{name}.tif" for name in pictures]
+    return pictures
 
 
-def _write_picture(path: Path, values: np.ndarray, low: float, high: float, *, overwrite: bool) -> None:
+def _write_picture(path: Path, values: np.ndarray, low: float, high: float) -> None:
     import tifffile
 
     from nerfcli.atomic import atomic_path
 
-    _refuse_existing(path, overwrite=overwrite)
     with atomic_path(path) as partial:
         tifffile.imwrite(partial, values.astype(np.float32), photometric="minisblack", compression="zlib")
     write_png(path.with_suffix(".png"), coloured(values, lo=low, hi=high, colour_map="grey"))
 
 
-def _refuse_existing(path: Path, *, overwrite: bool) -> None:
-    if path.exists() and not overwrite:
-        raise UserError(f"{path} exists", "add --overwrite to replace it, or choose another path with -o")
+def _refuse_existing(*paths: Path, overwrite: bool) -> None:
+    there = [path for path in paths if path.exists()]
+    if there and not overwrite:
+        raise UserError(f"{there[0]} exists", "add --overwrite to replace it, or choose another path with -o")
