@@ -38,7 +38,7 @@ def test_a_page_allows_no_loading_and_no_script_that_it_has_not():
 def test_titles_and_cells_are_text():
     assert "<b>" not in simple()
     assert html.escape(EVIL) in simple()
-    made = tables.table(("a", EVIL), ((EVIL, "1"),), numbers={1}, name="points")
+    made = tables.table(("a", EVIL), ((EVIL, "1"),), numbers={1})
     assert "<b>" not in made
     assert made.count(html.escape(EVIL)) == 2
     assert "<td class=number>1</td>" in made

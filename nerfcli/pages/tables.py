@@ -4,16 +4,13 @@ from collections.abc import Collection, Sequence
 from html import escape
 
 
-def table(
-    columns: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Collection[int] = (), name: str = ""
-) -> str:
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Collection[int] = ()) -> str:
     """Return a table that scrolls sideways where the window is too narrow; all cells are plain text.
 
     Args:
         columns: the headings.
         rows: as many cells each.
         numbers: columns that are aligned to the right.
-        name: the table's id.
     """
 
     def line(tag: str, cells: Sequence[str]) -> str:
@@ -24,5 +21,4 @@ def table(
 
     head = f"<thead><tr>{line('th', columns)}</tr></thead>"
     body = "\n".join(f"<tr>{line('td', row)}</tr>" for row in rows)
-    identity = f' id="{escape(name)}"' if name else ""
-    return f'<div class="wide"><table{identity}>{head}<tbody>{body}</tbody></table></div>'
+    return f'<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
