@@ -207,6 +207,7 @@ GROUPS: tuple[Group, ...] = (
             Mutant("/ (spread + eps)", "/ spread"),
             Mutant("gradient.zero_()", "gradient.abs()"),
             Mutant(".any(-1)", ".all(-1)"),
+            Mutant("+ decay * table[touched]", "- decay * table[touched]"),
         ),
     ),
     Group(
@@ -441,6 +442,7 @@ GROUPS: tuple[Group, ...] = (
             Mutant("(a != zero) | (b != zero) | (c != zero) | (d != zero)", "(a != zero) | (b != zero) | (c != zero)"),
             Mutant("gradient[at] = zero", "gradient[at] = g"),
             Mutant("rate * m /", "-rate * m /"),
+            Mutant("gradient[at] + decay * table[at]", "gradient[at]"),
         ),
     ),
     Group(

@@ -98,6 +98,7 @@ TRITON: tuple[Group, ...] = (
             Mutant("    tl.store(half + at, value.to(tl.float16), mask=touched)\n", ""),
             Mutant("tl.zeros([BLOCK, 4], tl.float32), mask=touched", "g, mask=touched"),
             Mutant("tl.max(tl.where(g == 0.0, 0, 1), 1) > 0", "tl.min(tl.where(g == 0.0, 0, 1), 1) > 0"),
+            Mutant("g += decay * value", "g += value"),
         ),
     ),
 )

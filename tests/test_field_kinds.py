@@ -251,6 +251,26 @@ def test_the_sink_gets_the_gradient_of_the_rows(field):
             assert changed.float().mean() > 0.5
 
 
+def test_rows_of_the_hash_grid_decay_where_photos_say_little():
+    """The gradient of a row of value 0.1 is -1e-15 plus the decay of 0.1: Adam's first step goes a whole rate towards
+    zero. Without that gradient nothing touches the row; a voxel's row does not decay."""
+    fields = (fresh_field(SMALL["hash"]), fresh_field(SMALL["voxels"]))
+    for made, towards_zero in zip(fields, (1, -1), strict=True):
+        optimiser, rows = FieldOptimiser(made), made.rows()
+        assert rows is not None
+        assert optimiser.sink is not None
+        rows.data.fill_(0.1)
+        rows_in_a_line, sink = rows.data.view(-1, 4), optimiser.sink.view(-1, 4)
+        sink[3] = -1e-15
+        optimiser.step(1, 1e-3)
+        moved = rows_in_a_line - 0.1
+        assert (moved[:3] == 0).all()
+        assert (moved[4:] == 0).all()
+        assert (moved[3] * towards_zero < 0).all()
+        if towards_zero > 0:
+            torch.testing.assert_close(moved[3], torch.full((4,), -1e-3), rtol=1e-4, atol=0)
+
+
 def test_marching_and_learning_see_pixels_of_the_same_width():
     """Density and colour with gradients are those that the march saw, and levels count min(1, cell / width) in both;
     without antialias, nothing has a width."""

@@ -346,7 +346,8 @@ def test_visible_samples_holds_many_rays_of_many_samples(generator):
 
 @pytest.mark.parametrize("rows", [0, 1, 5, 123])
 @pytest.mark.parametrize("magnitude", [1e-12, 1.0, 1e6])
-def test_adam_rows(rows, magnitude, generator):
+@pytest.mark.parametrize("decay", [0.0, 0.1])
+def test_adam_rows(rows, magnitude, decay, generator):
     values = [torch.randn(2, rows, 4, generator=generator) for _ in range(4)]
     values[1] *= magnitude
     values[1][:, ::2] = 0.0
@@ -357,7 +358,7 @@ def test_adam_rows(rows, magnitude, generator):
     fast, exact = [v.clone() for v in values], [v.double() for v in values]
     for arrays, function in ((fast, numba_cpu.adam_rows), (exact, reference.adam_rows)):
         for step in (1, 2):
-            function(*arrays, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15)
+            function(*arrays, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15, decay=decay * magnitude)
             if step == 1:
                 arrays[1] += values[1].to(arrays[1].dtype)
     for name, actual, expected in zip(("table", "gradient", "first", "second"), fast, exact, strict=True):
@@ -365,17 +366,18 @@ def test_adam_rows(rows, magnitude, generator):
     assert torch.equal(fast[0][:, ::2], values[0][:, ::2])  # untouched rows stay
 
 
-def test_adam_rows_is_adam_where_every_row_is_touched(generator):
+@pytest.mark.parametrize("decay", [0.0, 0.3])
+def test_adam_rows_is_adam_where_every_row_is_touched(decay, generator):
     # Against torch's own Adam over five steps.
     parameter = torch.nn.Parameter(torch.randn(1, 20, 4, generator=generator))
     ours = [parameter.detach().clone(), torch.zeros(1, 20, 4), torch.zeros(1, 20, 4), torch.zeros(1, 20, 4)]
-    optimiser = torch.optim.Adam([parameter], lr=0.01, betas=(0.9, 0.99), eps=1e-15)
+    optimiser = torch.optim.Adam([parameter], lr=0.01, betas=(0.9, 0.99), eps=1e-15, weight_decay=decay)
     for step in range(1, 6):
         gradient = torch.randn(1, 20, 4, generator=generator)
         parameter.grad = gradient.clone()
         optimiser.step()
         ours[1].copy_(gradient)
-        numba_cpu.adam_rows(*ours, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15)
+        numba_cpu.adam_rows(*ours, step=step, rate=0.01, betas=(0.9, 0.99), eps=1e-15, decay=decay)
     assert_close(ours[0], parameter.detach(), "table")
 
 

@@ -347,13 +347,14 @@ def test_a_far_thin_surface_has_its_spread():
 
 
 @pytest.mark.parametrize("rows", SIZES)
-def test_adam_rows(rows, generator):
+@pytest.mark.parametrize("decay", [0.0, 0.3])
+def test_adam_rows(rows, decay, generator):
     """Also of rows of which one feature alone has a gradient, or none."""
     start = [torch.randn(1, rows, 4, generator=generator) for _ in range(4)]
     start[3].square_()
     start[1][:, 1::3] = 0.0
     start[1][:, 2::5, 1:] = 0.0
-    named = {"step": 3, "rate": 1e-2, "betas": (0.9, 0.99), "eps": 1e-15}
+    named = {"step": 3, "rate": 1e-2, "betas": (0.9, 0.99), "eps": 1e-15, "decay": decay}
     exact, fast = [x.double() for x in start], [x.clone().to(DEVICE) for x in start]
     half = fast[0].half()
     reference.adam_rows(*exact, **named)

@@ -43,10 +43,12 @@ class Field(nn.Module, abc.ABC):
     """Density by position, colour by position and direction, on the unit cube of `kernels.grid_coordinates`.
 
     `medium` says what that is; `backend` computes with it. How this kind is trained best: `rate_factor` times the
-    learning rate, and `closing_steps` until rays pass over cells that hold little.
+    learning rate, `row_decay` of rows, see `reference.adam_rows`, and `closing_steps` until rays pass over cells that
+    hold little.
     """
 
     rate_factor: float = 1.0
+    row_decay: float = 0.0
     closing_steps: ClassVar[int] = 150
 
     def __init__(self) -> None:

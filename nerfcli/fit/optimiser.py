@@ -47,7 +47,15 @@ class FieldOptimiser:
         rows = self._field.rows()
         if rows is not None and self.sink is not None and self._first is not None and self._second is not None:
             self._field.backend.adam_rows(
-                rows, self.sink, self._first, self._second, step=number, rate=rate, betas=BETAS, eps=EPS
+                rows,
+                self.sink,
+                self._first,
+                self._second,
+                step=number,
+                rate=rate,
+                betas=BETAS,
+                eps=EPS,
+                decay=self._field.row_decay,
             )
 
     def state(self) -> dict[str, Tensor]:

@@ -299,8 +299,9 @@ class Backend(Protocol):
         rate: float,
         betas: tuple[float, float],
         eps: float,
+        decay: float = 0.0,
     ) -> None:
-        """Take one step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero."""
+        """Take one step of Adam with weight decay, in place, on the rows whose gradient is not zero, and zero it."""
         ...
 
     def project(

@@ -69,9 +69,10 @@ class NumbaBackend(ComposedBackend):
         rate: float,
         betas: tuple[float, float],
         eps: float,
+        decay: float = 0.0,
     ) -> None:
         module = numba_cpu if table.shape[-1] == FEATURES else reference
-        module.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
+        module.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
 
     def project(
         self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float

@@ -24,7 +24,7 @@ AHEAD = 16
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _update(
     table: Any, gradient: Any, first: Any, second: Any, rate: Any, beta1: Any, beta2: Any, correction: Any, eps: Any,
-    threads: Any,
+    decay: Any, threads: Any,
 ) -> None:  # fmt: skip
     one, zero, rows = np.float32(1), np.float32(0), table.shape[0] // FEATURES
     for thread in numba.prange(threads):
@@ -43,7 +43,7 @@ def _update(
                 prefetch(second, coming)
                 prefetch(table, coming)
                 for at in range(places[i], places[i] + FEATURES):
-                    g = gradient[at]
+                    g = gradient[at] + decay * table[at]
                     m = beta1 * first[at] + (one - beta1) * g
                     v = beta2 * second[at] + (one - beta2) * g * g
                     first[at], second[at] = m, v
@@ -61,10 +61,11 @@ def adam_rows(
     rate: float,
     betas: tuple[float, float],
     eps: float,
+    decay: float = 0.0,
 ) -> None:
     """See `reference.adam_rows`; float32 on the CPU, rows of 4 features."""
     scale = rate / (1 - betas[0] ** step)
     correction = (1 - betas[1] ** step) ** -0.5
     flat = [x.detach().view(-1).numpy() for x in (table, gradient, first, second)]
-    numbers = [np.float32(x) for x in (scale, *betas, correction, eps)]
+    numbers = [np.float32(x) for x in (scale, *betas, correction, eps, decay)]
     _update(*(*flat, *numbers, use_threads()))

@@ -43,8 +43,9 @@ class ReferenceBackend(ComposedBackend):
         rate: float,
         betas: tuple[float, float],
         eps: float,
+        decay: float = 0.0,
     ) -> None:
-        reference.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
+        reference.adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
 
     def project(
         self, volume: Tensor, origins: Tensor, directions: Tensor, *, first: tuple[float, float, float], size: float

@@ -15,23 +15,27 @@ def adam_rows(
     rate: float,
     betas: tuple[float, float],
     eps: float,
+    decay: float = 0.0,
 ) -> None:
-    """Take one step of Adam, in place, on the rows whose gradient is not zero; the gradient is set to zero.
+    """Take one step of Adam with weight decay, in place, on the rows whose gradient is not zero, and zero it.
 
+    g := g + decay table
     m = b1 m + (1 - b1) g,  v = b2 v + (1 - b2) g^2
     table -= rate (m / (1 - b1^step)) / (sqrt(v / (1 - b2^step)) + eps)
 
-    A row that no sample touched keeps its moments and its value: it does not drift on old momentum, and costs nothing.
+    A row that no sample touched keeps its moments and its value: it neither drifts on old momentum nor decays, and
+    costs nothing.
 
     Args:
         table, gradient, first, second: (..., F), all of one shape.
         step: number of this step, from 1.
         rate, betas, eps: of Adam.
+        decay: >= 0, the weight of the sum of table^2 / 2 over the touched rows in the loss.
 
     Source: Kingma and Ba 2015, Adam, arXiv:1412.6980, algorithm 1; skipping untouched rows as in Müller et al. 2022.
     """
     touched = (gradient != 0).any(-1)
-    g = gradient[touched]
+    g = gradient[touched] + decay * table[touched]
     first[touched] = betas[0] * first[touched] + (1 - betas[0]) * g
     second[touched] = betas[1] * second[touched] + (1 - betas[1]) * g * g
     mean = first[touched] / (1 - betas[0] ** step)

@@ -70,12 +70,13 @@ class TritonBackend(ReferenceBackend):
         rate: float,
         betas: tuple[float, float],
         eps: float,
+        decay: float = 0.0,
     ) -> None:
         if table.shape[-1] != hash_grid.FEATURES:
-            super().adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps)
+            super().adam_rows(table, gradient, first, second, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
             return
         half = self._half.of(table)
-        adam_rows(table, gradient, first, second, half=half, step=step, rate=rate, betas=betas, eps=eps)
+        adam_rows(table, gradient, first, second, half=half, step=step, rate=rate, betas=betas, eps=eps, decay=decay)
 
     @torch.no_grad()
     def density(self, coordinates: Tensor, medium: Any) -> Tensor:

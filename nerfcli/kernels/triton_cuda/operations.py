@@ -44,7 +44,10 @@ def adam_rows(
     rate: float,
     betas: tuple[float, float],
     eps: float,
+    decay: float = 0.0,
 ) -> None:
     """See `reference.adam_rows`."""
     half = table.half()
-    row_adam.adam_rows(table, gradient, first, second, half=half, step=step, rate=rate, betas=betas, eps=eps)
+    row_adam.adam_rows(
+        table, gradient, first, second, half=half, step=step, rate=rate, betas=betas, eps=eps, decay=decay
+    )

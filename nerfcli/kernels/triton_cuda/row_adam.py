@@ -16,16 +16,18 @@ BLOCK = Size.of(256, interpreted=1024)
 @jit
 def _update(
     table, half, gradient, first, second, rows, rate, beta1, beta2,
-    correction, eps, BLOCK: tl.constexpr,
+    correction, eps, decay, BLOCK: tl.constexpr,
 ):  # fmt: skip
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     at = row[:, None] * 4 + tl.arange(0, 4)[None, :]
     valid = (row < rows)[:, None]
     g = tl.load(gradient + at, mask=valid, other=0.0)
     touched = valid & (tl.max(tl.where(g == 0.0, 0, 1), 1) > 0)[:, None]
+    value = tl.load(table + at, mask=touched, other=0.0)
+    g += decay * value
     m = beta1 * tl.load(first + at, mask=touched, other=0.0) + (1.0 - beta1) * g
     v = beta2 * tl.load(second + at, mask=touched, other=0.0) + (1.0 - beta2) * g * g
-    value = tl.load(table + at, mask=touched, other=0.0) - rate * m / (tl.sqrt_rn(v) * correction + eps)
+    value -= rate * m / (tl.sqrt_rn(v) * correction + eps)
     tl.store(first + at, m, mask=touched)
     tl.store(second + at, v, mask=touched)
     tl.store(table + at, value, mask=touched)
@@ -44,6 +46,7 @@ def adam_rows(
     rate: float,
     betas: tuple[float, float],
     eps: float,
+    decay: float = 0.0,
 ) -> None:
     """See `reference.adam_rows`; float32, rows of 4 features.
 
@@ -54,5 +57,5 @@ def adam_rows(
     scale, correction = rate / (1 - betas[0] ** step), (1 - betas[1] ** step) ** -0.5
     launch(
         _update, (blocks(rows, BLOCK),), table.detach(), half, gradient, first, second, rows, scale, *betas,
-        correction, float(eps), BLOCK=BLOCK,
+        correction, float(eps), float(decay), BLOCK=BLOCK,
     )  # fmt: skip
