@@ -548,6 +548,9 @@ def test_requirements_decide_on_the_exit_code(finished):
     assert "registered>=0.5 (registered is not known)" in error
     assert "ssim" not in error
     assert "--budget" in hint
+    error, hint = error_of(nerfcli("evaluate", finished, "--require", "psnr>=1,registered>=0.5"))
+    assert "registered is not known" in error
+    assert hint.endswith("leave this requirement out")
     for wrong in ("psnr", "beauty>=1"):
         assert nerfcli("evaluate", finished, "--require", wrong).exit_code == 2
         assert nerfcli("run", finished, "--require", wrong).exit_code == 2

@@ -1,5 +1,6 @@
 """Volumes fitted to scans of a phantom with closed-form line integrals: no projector is shared with the fit."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from nerfcli.tomography.reconstruct import Problem, Projector, mean_attenuation,
 from nerfcli.tomography.scan import Scan, held_out_views, load_scan, save_scan
 from nerfcli.tomography.scores import resampled, score_volume
 from nerfcli.tomography.strength import STRENGTHS, choose_strength
+from nerfcli.workflows.tomography import Limit
 
 PHOTONS = 2e4
 
@@ -141,6 +143,21 @@ def test_line_integrals_of_a_constant_hash_grid_are_chords_of_the_box(generator:
     assert total_variation(volume, torch.rand(5, 3, generator=generator), 0.5).item() < 1e-6
     assert volume.on_grid(grid).shape == grid.shape
     torch.testing.assert_close(volume.on_grid(grid), torch.full(grid.shape, 0.3))
+
+
+def test_hash_grid_takes_no_step_without_time(scan: Scan, grid: VoxelGrid) -> None:
+    """The pass limit is there for a fit that ignores the time."""
+    problem = problem_of(scan, grid)
+    volume = hash_volume(grid, mean_attenuation(problem), new_arrays(0))
+    before = volume.on_grid(grid)
+    fit_hash(problem, volume, strength=1.0, passes=1, seconds=0.0)
+    assert volume.passes == 0
+    assert torch.equal(volume.on_grid(grid), before)
+
+
+def test_fit_keeps_a_quarter_of_the_budget_when_trials_took_it_all() -> None:
+    assert Limit(None, 8.0, time.perf_counter() - 100.0, 0).seconds == 2.0
+    assert Limit(4, None, time.perf_counter() - 100.0, 0).seconds is None
 
 
 def test_hash_grid_beats_filtered_back_projection_and_repeats(scan: Scan, grid: VoxelGrid) -> None:

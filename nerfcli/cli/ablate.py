@@ -91,7 +91,7 @@ def ablate(
     \b
     Examples:
       nerfcli ablate photos-scene
-      nerfcli ablate photos-scene --only view --only exposure --budget 30s
+      nerfcli ablate photos-scene --only view,exposure --budget 30s
       nerfcli ablate photos-scene --model default --seeds 5 --whole -o paper/ablation
     """
     from nerfcli.ablate.results import COLUMNS, ResultRow, table_of

@@ -12,16 +12,27 @@ from nerfcli.errors import GATE_NOT_MET, UserError
 if TYPE_CHECKING:
     from nerfcli.selftest.measure import Errors, Row
 
-_COLUMNS = ("case", "operation", "in", "error", "gradient", "bound", "verdict", "textbook", "gradient", "ms")
+_COLUMNS = (
+    "case",
+    "operation",
+    "precision",
+    "error",
+    "of gradient",
+    "bound",
+    "verdict",
+    "textbook error",
+    "of its gradient",
+    "ms",
+)
 _FORMULAS = (
     "textbook formula",
     "worst where",
     "operation",
-    "in",
+    "precision",
     "error",
-    "gradient",
-    "here",
-    "gradient",
+    "of gradient",
+    "nerfcli",
+    "of its gradient",
     "bound",
 )
 _VALUE_ONLY = "value only"

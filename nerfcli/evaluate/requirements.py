@@ -15,6 +15,13 @@ NAMES = (
     *(f"{measure}{aligned}" for measure in ("psnr", "ssim") for aligned in (*_ALIGNED, "_float", "_right_half")),
     *("lpips", "lpips_colour_aligned", "registered", "training_seconds", "seconds_per_image"),
 )
+# Why a number may be absent, and what to do.
+WHY_ABSENT = {
+    "registered": "only scenes of nerfcli poses say how many photos were registered; leave this requirement out",
+    "lpips": "LPIPS needs pip install 'nerfcli[lpips]'; then evaluate again with --overwrite",
+    "psnr_pose_aligned": "evaluate with --align pose",
+    "ssim_pose_aligned": "evaluate with --align pose",
+}
 
 
 @dataclass(frozen=True)

@@ -163,7 +163,7 @@ def fit_hash(
         strength: of total variation, as in `reconstruct`.
         seed: of pixels and samples.
         passes: how many times to look at all pixels.
-        seconds: how long to work.
+        seconds: how long to work; None for no limit, 0 for no step.
         progress: takes the share done and a few words.
     """
     begun = time.perf_counter()
@@ -184,7 +184,8 @@ def fit_hash(
     while True:
         order = torch.randperm(count, generator=generator)
         for chosen in order.split(rays_of_step):
-            share = max(done / passes if passes else 0.0, (time.perf_counter() - begun) / seconds if seconds else 0.0)
+            spent = time.perf_counter() - begun
+            share = max(done / passes if passes else 0.0, 0.0 if seconds is None else spent / max(seconds, 1e-9))
             if share >= 1:
                 return
             origins, directions = geometry.rays_of_pixels(chosen.numpy())

@@ -22,7 +22,7 @@ from nerfcli.evaluate.predictions import (
     save_unrounded,
 )
 from nerfcli.evaluate.protocol import PROTOCOL, Compared, Extras, evaluate_model
-from nerfcli.evaluate.requirements import Requirement, known_numbers, unmet
+from nerfcli.evaluate.requirements import WHY_ABSENT, Requirement, known_numbers, unmet
 from nerfcli.evaluate.run_photos import held_out_photos_of, training_billboards
 from nerfcli.export.file_names import file_names
 from nerfcli.runs.files import LOG
@@ -133,11 +133,18 @@ def check_requirements(run: Run, metrics: dict[str, Any], requirements: Sequence
     Raises:
         UserError: with the exit code of gates.
     """
-    failures = unmet(requirements, known_numbers(metrics, run.config)) if requirements else []
+    if not requirements:
+        return
+    numbers = known_numbers(metrics, run.config)
+    failures = unmet(requirements, numbers)
     if failures:
+        absent = [requirement.name for requirement in requirements if numbers.get(requirement.name) is None]
+        only_absent = len(absent) == len(failures) and absent[0] in WHY_ABSENT
         raise UserError(
             f"{run.path} does not meet --require {', '.join(failures)}",
-            "train longer (--budget, --resume), or check the photos with nerfcli doctor",
+            WHY_ABSENT[absent[0]]
+            if only_absent
+            else "train longer (--budget, --resume), or check the photos with nerfcli doctor",
             GATE_NOT_MET,
         )
 

@@ -43,6 +43,8 @@ from nerfcli.workflows.notices import Notify, Progress, no_progress, silent, war
 # Shares of a time budget for the choice of total variation, and for the coarse start.
 STRENGTH_SHARE = 0.15
 COARSE_SHARE = 0.1
+# The share of the budget that the fit gets even if the trials before it took longer than planned.
+LEAST_SHARE = 0.25
 COARSE_PASSES = 6
 # Passes where only a number of seconds ends the fit, and the other way round.
 MOST_PASSES = 200
@@ -227,10 +229,10 @@ class Limit:
 
     @property
     def seconds(self) -> float | None:
-        """Seconds that are left."""
+        """Seconds that are left, at least a quarter of all."""
         if self.total_seconds is None:
             return None
-        return max(self.total_seconds - (time.perf_counter() - self.begun), 0.0)
+        return max(self.total_seconds - (time.perf_counter() - self.begun), LEAST_SHARE * self.total_seconds)
 
 
 def _fit_voxels(problem: Problem, fit: Fit, strength: float, limit: Limit, *, progress: Progress) -> tuple[Fit, bool]:
