@@ -551,6 +551,8 @@ def test_requirements_decide_on_the_exit_code(finished):
     error, hint = error_of(nerfcli("evaluate", finished, "--require", "psnr>=1,registered>=0.5"))
     assert "registered is not known" in error
     assert hint.endswith("leave this requirement out")
+    _, hint = error_of(nerfcli("evaluate", finished, "--require", "ssim_gains_aligned>=0.5"))
+    assert hint.endswith("evaluate with --align colour")
     for wrong in ("psnr", "beauty>=1"):
         assert nerfcli("evaluate", finished, "--require", wrong).exit_code == 2
         assert nerfcli("run", finished, "--require", wrong).exit_code == 2

@@ -9,7 +9,7 @@ from typing import Any
 from nerfcli.runs.config import RunConfig
 
 _COMPARISONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
-_ALIGNED = ("", "_colour_aligned", "_pose_aligned")
+_ALIGNED = ("", "_colour_aligned", "_pose_aligned", "_gains_aligned")
 # What may be required: the means of metrics.json, the share of photos with a pose, and what the run cost.
 NAMES = (
     *(f"{measure}{aligned}" for measure in ("psnr", "ssim") for aligned in (*_ALIGNED, "_float", "_right_half")),
@@ -21,6 +21,8 @@ WHY_ABSENT = {
     "lpips": "LPIPS needs pip install 'nerfcli[lpips]'; then evaluate again with --overwrite",
     "psnr_pose_aligned": "evaluate with --align pose",
     "ssim_pose_aligned": "evaluate with --align pose",
+    "psnr_gains_aligned": "evaluate with --align colour",
+    "ssim_gains_aligned": "evaluate with --align colour",
 }
 
 
