@@ -202,6 +202,26 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
+        "fit/fitting.py",
+        ("tests/test_exposure_and_background.py",),
+        "directions_without_pixels or light_of_the_sky",
+        (),
+        (
+            Mutant("ROUGHNESS_WEIGHT * self.parts", "0 * self.parts"),
+            Mutant("loss + SKY_WEIGHT * opacity", "loss + 0 * opacity"),
+        ),
+    ),
+    Group(
+        "field/background.py",
+        ("tests/test_sky.py",),
+        "roughness or behind_surfaces",
+        (),
+        (
+            Mutant("for axis in (1, 2, 3)", "for axis in (2, 3)"),
+            Mutant(".square().sum() for", ".abs().sum() for"),
+        ),
+    ),
+    Group(
         "search/selection.py",
         ("tests/test_selection.py",),
         "",

@@ -207,6 +207,19 @@ def test_light_of_the_sky_does_not_end_before_it(capture, tmp_path):
     assert 1.0 - passed[1] < 0.7 * (1.0 - passed[0])
 
 
+def test_directions_without_pixels_take_the_colours_of_their_neighbours(capture, tmp_path):
+    """No direction reads the grid's middle, so only its roughness lowers a vertex there that stands out."""
+    prepared = prepare(capture, SHORT, run=tmp_path, memory_bytes=None, begun=None, notify=lambda text: None)
+    fitting = prepared.fitting()
+    assert fitting.parts.background is not None
+    logits = fitting.parts.background.logits
+    logits.data[:, 16, 16, 16] = 1.0
+    for step in range(10):
+        fitting.advance(step / 10)
+    assert (logits[:, 16, 16, 16] < 0.9).all()
+    assert (logits[:, 16, 16, 17] > 0.0).all()
+
+
 def test_a_sky_that_no_pixel_shows_changes_nothing():
     parts, drawn = parts_of(replace(LEARNED, exposure="none"), torch.full((2, 3), 0.5), [0.0, 0.0])
     parts.show_sky(torch.tensor([False, False]))

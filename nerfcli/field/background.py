@@ -29,6 +29,13 @@ class SphereBackground(nn.Module):
         )  # (1, 3, 1, 1, R)
         return torch.sigmoid(values[0, :, 0, 0].t())
 
+    def roughness(self) -> Tensor:
+        """Return the sum of squared differences between neighbouring vertices of the grid, in logits; a scalar.
+
+        Differentiable. Its gradient moves each vertex towards its neighbours; a grid of a single vertex has none.
+        """
+        return torch.stack([self.logits.diff(dim=axis).square().sum() for axis in (1, 2, 3)]).sum()
+
 
 Background = Colour | SphereBackground
 

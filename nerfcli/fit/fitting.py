@@ -32,6 +32,9 @@ MOST_RAYS = 2**14
 DEEPEST = 7.0
 # Weight of the light that ends before the sky where this is seen.
 SKY_WEIGHT = 0.1
+# Weight of the roughness of a learned background. Directions that no photo shows take the colours of their neighbours;
+# without it, Adam makes large steps of the little light that leaks through surfaces, and they end in any colour.
+ROUGHNESS_WEIGHT = 1e-6
 # The warm-up is over at this share of the budget at the latest, however few the steps.
 WARMUP_SHARE = 0.1
 # Large tables, those of long trainings, have after so many steps all the detail that others have at the end.
@@ -236,6 +239,8 @@ class Fitting:
         if self.parts.sky is not None:
             opacity = (1.0 - seen.transmittance) * self.parts.sky[drawn.numbers]
             loss = loss + SKY_WEIGHT * opacity.sum() / count
+        if self.parts.background is not None:
+            loss = loss + ROUGHNESS_WEIGHT * self.parts.background.roughness() / self.ranks.count
         watch.rows("rendered colour", seen.rgb, torch.arange(len(drawn.origins), device=device))
         watch.values("loss", loss)
         return loss, losses.detach(), int(seen.samples)
