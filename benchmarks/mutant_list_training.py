@@ -212,6 +212,18 @@ TRAINING: tuple[Group, ...] = (
         ),
     ),
     Group(
+        "photos/held_out_exposure.py",
+        ("tests/test_held_out_exposure.py",),
+        "",
+        (),
+        (
+            Mutant("min(proportional, both) < min(between, mean)", "proportional < min(between, mean)"),
+            Mutant("by_exif[:, None] + beyond", "by_exif[:, None]"),
+            Mutant("log_gains[known] - followed[:, None]", "log_gains[known]"),
+            Mutant("if by_place >= _left_out", "if by_place < _left_out"),
+        ),
+    ),
+    Group(
         "field/background.py",
         ("tests/test_sky.py",),
         "roughness or behind_surfaces",

@@ -9,7 +9,13 @@ from PIL import Image
 
 from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
-from nerfcli.photos.held_out_exposure import exif_slope, gain_sources, gains_between, log_gains_of
+from nerfcli.photos.held_out_exposure import (
+    exif_slope,
+    gain_sources,
+    gains_between,
+    gains_beyond_exif,
+    log_gains_of,
+)
 from nerfcli.render.model import load_model
 from nerfcli.runs.components import Components
 from nerfcli.runs.settings import TrainSettings
@@ -56,6 +62,53 @@ def test_exif_that_tells_less_than_neighbours_or_the_mean_is_not_followed():
     assert exif_slope(places[:2], np.ones((2, 3)), exif[:2]) == 1.0  # nothing to judge by
 
 
+def test_gains_follow_exif_and_drift_beyond_it_as_those_of_the_photos_around():
+    """Exposures that jump, on gains that drift along the capture, channel by channel: both are found exactly."""
+    places, wanted = np.arange(0, 60, 2), np.array([1, 21, 47])
+    rng = np.random.default_rng(2)
+    exif, held_out = rng.choice([-0.4, 0.0, 0.4], 30), np.array([0.4, -0.4, 0.0])
+    drift = np.sin(places / 10.0)[:, None] * np.array([0.3, 0.2, 0.1])
+    gains = 0.8 * (exif - exif.mean())[:, None] + drift
+    slope = exif_slope(places, gains, exif)
+    assert slope == pytest.approx(0.8, abs=0.15)  # drift and jumps are correlated by chance
+    told = slope * (held_out - exif.mean())[:, None] + gains_beyond_exif(places, gains, exif, wanted, slope=slope)
+    truth = 0.8 * (held_out - exif.mean())[:, None] + np.sin(wanted / 10.0)[:, None] * np.array([0.3, 0.2, 0.1])
+    assert np.abs(told - truth).max() < 0.1
+    by_exif = 0.8 * (held_out - exif.mean())[:, None]
+    around = gains_between(places, gains, wanted)
+    assert np.abs(by_exif - truth).max() > 0.2
+    assert np.abs(around - truth).max() > 0.2
+
+
+def test_exif_is_followed_where_it_tells_nothing_without_the_photos_around():
+    """A drift three times as large as the jumps: EXIF alone is worse than the photos around, both are better."""
+    places, rng = np.arange(60), np.random.default_rng(4)
+    exif = rng.permutation(np.repeat([-0.2, 0.2], 30))
+    drift = np.sin(places / 10.0)[:, None] * np.full(3, 0.6)
+    assert exif_slope(places, exif[:, None] + drift, exif) == pytest.approx(1.0, abs=0.5)
+    assert exif_slope(places, drift, rng.permutation(exif)) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_chance_beyond_exif_is_not_told_by_the_photos_around(seed):
+    rng = np.random.default_rng(seed)
+    exif = rng.normal(size=40)
+    gains = exif[:, None] + rng.normal(0, 0.05, (40, 3))
+    beyond = gains_beyond_exif(np.arange(40), gains, exif, np.array([7, 12]), slope=1.0)
+    assert np.array_equal(beyond, np.zeros((2, 3)))
+
+
+def test_photos_without_exif_take_no_part_in_what_is_beyond_it():
+    places = np.arange(9)
+    exif = np.where(places == 4, np.nan, 0.0)
+    gains = drifting(places.astype(float))
+    gains[4] = 100.0
+    told = gains_beyond_exif(places, gains, exif, np.array([4]), slope=0.7)
+    assert told == pytest.approx(drifting(np.array([4.0])), abs=1e-12)
+    nothing = gains_beyond_exif(places, gains, np.full(9, np.nan), np.array([4]), slope=0.0)
+    assert np.array_equal(nothing, np.zeros((1, 3)))
+
+
 def test_two_photos_tell_nothing_and_nobody_may_ask():
     assert np.array_equal(gains_between(np.array([0, 2]), np.ones((2, 3)), np.array([1])), np.zeros((1, 3)))
     assert gains_between(np.arange(4), drifting(np.arange(4.0)), np.zeros(0)).shape == (0, 3)
@@ -98,17 +151,22 @@ def test_what_exif_tells_of_a_held_out_photo_goes_before_its_neighbours(monkeypa
         "nerfcli.photos.held_out_exposure.log_exposures", lambda frames: np.array([1.5, np.nan, np.nan])[: len(frames)]
     )
     told = {"a": (9.0, 9.0, 9.0), "b": (0.1, 0.2, 0.3)}
-    model = SimpleNamespace(log_exposure=1.0, exif_slope=1.0, exposures=told)
+    model = SimpleNamespace(log_exposure=1.0, exif_slope=1.0, exposures=told, beyond_exif={})
     assert log_gains_of(frames, model).tolist() == [[0.5] * 3, [0.1, 0.2, 0.3], [0.0] * 3]  # type: ignore[arg-type]
     assert gain_sources(frames, model) == ["EXIF", "training photos around", "their mean"]  # type: ignore[arg-type]
     model.exif_slope = 0.6
     assert log_gains_of(frames, model).tolist()[:2] == [[pytest.approx(0.3)] * 3, [0.1, 0.2, 0.3]]  # type: ignore[arg-type]
+    model.beyond_exif = {"a": (0.1, 0.0, -0.1), "b": (5.0, 5.0, 5.0)}
+    assert log_gains_of(frames, model)[0].tolist() == pytest.approx([0.4, 0.3, 0.2])  # type: ignore[arg-type]
+    assert log_gains_of(frames, model)[1].tolist() == [0.1, 0.2, 0.3]  # type: ignore[arg-type]
+    sources = ["EXIF and training photos around", "training photos around", "their mean"]
+    assert gain_sources(frames, model) == sources  # type: ignore[arg-type]
     model.exif_slope = 0.0
     assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
-    model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures=told)
+    model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures=told, beyond_exif={})
     assert log_gains_of(frames, model).tolist()[0] == [9.0] * 3  # type: ignore[arg-type]
     assert gain_sources(frames, model)[0] == "training photos around"  # type: ignore[arg-type]
-    model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures={})
+    model = SimpleNamespace(log_exposure=None, exif_slope=1.0, exposures={}, beyond_exif={})
     assert gain_sources(frames, model) == ["none"] * 3  # type: ignore[arg-type]
 
 

@@ -1,6 +1,6 @@
-"""Exposures of held-out photos, without using their pixels: from EXIF, or from photos taken before and after."""
+"""Exposures of held-out photos, without using their pixels: from EXIF, from photos taken before and after, or both."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -9,8 +9,9 @@ from nerfcli.photos.exif_exposure import log_exposures
 from nerfcli.render.model import Model
 
 # What tells the gains of a held-out photo: nothing, as the model has no exposures; EXIF; the training photos taken
-# before and after; or nothing but that they are the mean of all.
-SOURCES = ("none", "EXIF", "training photos around", "their mean")
+# before and after, and by how much EXIF differs from theirs; these photos alone; or nothing but that they are the mean
+# of all.
+SOURCES = ("none", "EXIF", "EXIF and training photos around", "training photos around", "their mean")
 
 
 def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -37,7 +38,8 @@ def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> f
     """Return the factor, from 0 to 1, by which gains of photos follow the exposures in EXIF.
 
     Tone curves make it smaller than 1. It is 0 where the mean of other photos, or the photos before and after, tell the
-    gains of a photo that is left out better, by squared differences.
+    gains of a photo that is left out better than EXIF does, alone or with the photos before and after, by squared
+    differences.
 
     Args:
         places, log_gains: see `gains_between`.
@@ -47,12 +49,36 @@ def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> f
     places, log_gains, exif = places[known], log_gains[known], exif[known]
     if len(places) < 3:
         return 1.0
-    proportional = _left_out(
-        lambda o: log_gains[o].mean(0) + _slope(exif[o], log_gains[o]) * (exif[~o] - exif[o].mean()), log_gains
-    )
+
+    def beyond(others: np.ndarray, rest: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        slope = _slope(exif[others], log_gains[others])
+        return slope * exif[~others] + rest(log_gains[others] - slope * exif[others, None])
+
+    proportional = _left_out(lambda o: beyond(o, lambda rest: rest.mean(0)), log_gains)
+    both = _left_out(lambda o: beyond(o, lambda rest: _interpolated(places[o], rest, places[~o])[0]), log_gains)
     between = _left_out(lambda o: _interpolated(places[o], log_gains[o], places[~o])[0], log_gains)
     mean = _left_out(lambda o: log_gains[o].mean(0), log_gains)
-    return _slope(exif, log_gains) if proportional < min(between, mean) else 0.0
+    return _slope(exif, log_gains) if min(proportional, both) < min(between, mean) else 0.0
+
+
+def gains_beyond_exif(
+    places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray, wanted: np.ndarray, *, slope: float
+) -> np.ndarray:
+    """Return what to add to `slope` times the exposures in EXIF, relative to their mean: (T, 3) gains.
+
+    It is what the photos before and after have beyond that, where this tells more than the mean: matched pixels add up
+    errors along a capture, and cameras change their white balance.
+
+    Args:
+        places, log_gains, wanted: see `gains_between`.
+        exif: (P,) logarithms of exposures; where these are not known, the photo takes no part.
+        slope: see `exif_slope`.
+    """
+    known = np.isfinite(exif)
+    if not known.any():
+        return np.zeros((len(wanted), 3))
+    followed = slope * (exif[known] - exif[known].mean())
+    return gains_between(places[known], log_gains[known] - followed[:, None], wanted)
 
 
 def _slope(exif: np.ndarray, log_gains: np.ndarray) -> float:
@@ -69,23 +95,26 @@ def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray
 
 
 def log_gains_of(frames: Sequence[Frame], model: Model) -> np.ndarray:
-    """(N, 3) logarithms of the gains of photos relative to the pictures of a model, from EXIF; where it does
-    not, as the training does; else 0."""
+    """(N, 3) logarithms of the gains of photos relative to the pictures of a model, from EXIF and what the training
+    adds to it; without EXIF, as the training tells them; else 0."""
     by_exif = _by_exif(frames, model)
-    by_training = np.array([model.exposures.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
-    return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None], by_training)
+    beyond, by_training = (_by_name(frames, told) for told in (model.beyond_exif, model.exposures))
+    return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None] + beyond, by_training)
 
 
 def gain_sources(frames: Sequence[Frame], model: Model) -> list[str]:
     """Return what tells the gains of each photo in `log_gains_of`, one of `SOURCES`."""
-    none, exif, around, mean = SOURCES
+    none, exif, both, around, mean = SOURCES
     if model.log_exposure is None and not model.exposures:
         return [none] * len(frames)
     known = np.isfinite(_by_exif(frames, model))
-    told = [any(model.exposures.get(frame.name, ())) for frame in frames]
-    return [
-        exif if by_exif else around if by_training else mean for by_exif, by_training in zip(known, told, strict=True)
-    ]
+    beyond, by_training = (_by_name(frames, told).any(1) for told in (model.beyond_exif, model.exposures))
+    return np.where(known, np.where(beyond, both, exif), np.where(by_training, around, mean)).tolist()
+
+
+def _by_name(frames: Sequence[Frame], told: Mapping[str, tuple[float, ...]]) -> np.ndarray:
+    """Return (N, 3) what is told of photos, 0 where nothing is."""
+    return np.array([told.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
 
 
 def _by_exif(frames: Sequence[Frame], model: Model) -> np.ndarray:

@@ -60,6 +60,7 @@ class Model:
         exif_slope: by how much gains follow the exposures that EXIF tells, see `held_out_exposure.exif_slope`.
         exposures: of held-out photos by name, logarithms of their gains (3,) as training tells them where EXIF
             does not; see `photos.held_out_exposure`.
+        beyond_exif: the same, to be added to what EXIF tells.
         sha256: of the file that it was read from.
     """
 
@@ -73,6 +74,7 @@ class Model:
     log_exposure: float | None = None
     exif_slope: float = 1.0
     exposures: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
+    beyond_exif: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     sha256: str | None = None
 
     @property
@@ -110,6 +112,7 @@ def save_model(path: Path, model: Model) -> None:
         "log_exposure": model.log_exposure,
         "exif_slope": model.exif_slope,
         "exposures": {name: list(gains) for name, gains in model.exposures.items()},
+        "beyond_exif": {name: list(gains) for name, gains in model.beyond_exif.items()},
     }
     save_tensors(path, tensors, description)
 
@@ -146,6 +149,7 @@ def load_model(path: Path, device: str) -> Model:
         log_exposure=description.get("log_exposure"),
         exif_slope=description.get("exif_slope", 1.0),
         exposures={name: tuple(gains) for name, gains in description.get("exposures", {}).items()},
+        beyond_exif={name: tuple(gains) for name, gains in description.get("beyond_exif", {}).items()},
         sha256=hashlib.sha256(content).hexdigest(),
     )
 

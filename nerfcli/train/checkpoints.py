@@ -18,7 +18,7 @@ from nerfcli.fit.extent import Extent
 from nerfcli.fit.fitting import Fitting
 from nerfcli.fit.watch import that_must_be_finite
 from nerfcli.photos.exif_exposure import log_exposures
-from nerfcli.photos.held_out_exposure import exif_slope, gains_between
+from nerfcli.photos.held_out_exposure import exif_slope, gains_between, gains_beyond_exif
 from nerfcli.render.model import Model, save_model
 from nerfcli.runs.config import read_config
 from nerfcli.runs.files import FIELD, STATE
@@ -77,6 +77,7 @@ class Checkpoints:
             log_exposure=prepared.log_exposure,
             exif_slope=self._exif_slope(),
             exposures=self._held_out_exposures(),
+            beyond_exif=self._beyond_exif(),
         )
 
     def _learned_gains(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -105,7 +106,17 @@ class Checkpoints:
         learned = self._learned_gains()
         if learned is None:
             return {}
-        gains = gains_between(*learned, self._places(self._scene.test_frames))
+        return self._by_name(gains_between(*learned, self._places(self._scene.test_frames)))
+
+    def _beyond_exif(self) -> dict[str, tuple[float, ...]]:
+        """Return what the exposures that were learned add to those of held-out photos by EXIF, by name."""
+        learned = self._learned_gains()
+        if learned is None or self._prepared.log_exposure is None:
+            return {}
+        wanted = self._places(self._scene.test_frames)
+        return self._by_name(gains_beyond_exif(*learned, self._exif, wanted, slope=self._exif_slope()))
+
+    def _by_name(self, gains: np.ndarray) -> dict[str, tuple[float, ...]]:
         return {frame.name: tuple(row) for frame, row in zip(self._scene.test_frames, gains.tolist(), strict=True)}
 
     def frames(self) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
