@@ -166,7 +166,7 @@ class TestTogether:
 
 @pytest.fixture(scope="module")
 def capture() -> Turntable:
-    return turntable(16, size=(480, 360), turn_deg=160, supersampled=1, seed=1)
+    return turntable(12, size=(480, 360), turn_deg=120, supersampled=1, seed=1)
 
 
 class TestMasks:

@@ -6,10 +6,12 @@
 # pyright: reportCallIssue=false
 # It does not know how many tensors `on_device` gives.
 
+import inspect
 import json
 import math
 import os
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from triton.runtime import interpreter
 
 from nerfcli import kernels
 from nerfcli.kernels import Backend, HashGrid, March, PixelTable, Rays, Targets, reference, spherical_harmonics
@@ -32,6 +35,27 @@ DEVICE = torch.device("cpu" if INTERPRETED else "cuda")
 SIZES = [0, 1, 5, 123]
 # Of float32, and of what passes through float16: 11 bits, and sums of such.
 SINGLE, HALF = 1e-5, 6e-3
+
+
+@cache
+def first_builtin(language: Any) -> str | None:
+    """Name of the first operation of Triton's language that its interpreter replaces."""
+    return next((name for name, member in inspect.getmembers(language) if interpreter.tl.core.is_builtin(member)), None)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _patched_once() -> Iterator[None]:
+    """The interpreter goes through the whole language at each call of a function, though all is replaced already."""
+    with pytest.MonkeyPatch.context() as patch:
+        replace_all = interpreter._patch_builtin
+
+        def replace(language: Any, *others: Any) -> None:
+            name = first_builtin(language)
+            if name is not None and interpreter.tl.core.is_builtin(getattr(language, name)):
+                replace_all(language, *others)
+
+        patch.setattr(interpreter, "_patch_builtin", replace)
+        yield
 
 
 @pytest.fixture
