@@ -4,6 +4,7 @@ It carries what real folders hold: photos stored lying on their side, photos of 
 file, names with spaces.
 """
 
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -28,6 +29,7 @@ LYING = {1, 4}
 SMALLER = {5, 6}
 
 
+@cache
 def wall(seed: int) -> np.ndarray:
     """A 400 x 400 texture with detail at all scales, so that it looks like something from any distance."""
     rng = np.random.default_rng(seed)

@@ -731,6 +731,7 @@ def test_run_does_all_stages_keeps_them_and_goes_on_where_it_stopped(monkeypatch
 
     monkeypatch.setattr(poses_workflow, "estimate_poses", known_poses)
     arguments = ["run", capture, "-o", tmp_path / "all", "--budget", "0.2s", "--count", "2", "--max-size", "16"]
+    arguments += ["--downscale", "4"]
 
     def interrupted(*args: Any, on_progress: Callable[[Progress], None], **settings: Any) -> None:
         def stop_at_the_first_step(progress: Progress) -> None:

@@ -338,7 +338,7 @@ def test_centre_of_a_parallel_half_turn_is_found() -> None:
 
 
 def test_tilt_of_the_detector_is_found() -> None:
-    geometry = cone(40, rows=32)
+    geometry = cone(30, rows=24)
     scan = scan_of(geometry, photons=2e5)
     told = Scan(geometry.tilted(np.deg2rad(-1.0)), "counts", scan.values, scan.open_beam, photons_per_value=200.0)
     found = detector_tilt(told)
