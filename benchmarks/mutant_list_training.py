@@ -218,8 +218,8 @@ TRAINING: tuple[Group, ...] = (
         (),
         (
             Mutant("min(proportional, both) < min(between, mean)", "proportional < min(between, mean)"),
-            Mutant("by_exif[:, None] + beyond", "by_exif[:, None]"),
-            Mutant("log_gains[known] - followed[:, None]", "log_gains[known]"),
+            Mutant("by_exif[:, None] + offsets", "by_exif[:, None]"),
+            Mutant("log_gains[known] - predicted[:, None]", "log_gains[known]"),
             Mutant("if by_place >= _left_out", "if by_place < _left_out"),
         ),
     ),

@@ -8,9 +8,8 @@ from nerfcli.cameras.frame import Frame
 from nerfcli.photos.exif_exposure import log_exposures
 from nerfcli.render.model import Model
 
-# What tells the gains of a held-out photo: nothing, as the model has no exposures; EXIF; the training photos taken
-# before and after, and by how much EXIF differs from theirs; these photos alone; or nothing but that they are the mean
-# of all.
+# Where the gains of a held-out photo come from: the model has no exposures; EXIF; EXIF and an offset interpolated from
+# the training photos taken before and after; these photos alone; the mean of all training photos.
 SOURCES = ("none", "EXIF", "EXIF and training photos around", "training photos around", "their mean")
 
 
@@ -37,9 +36,9 @@ def gains_between(places: np.ndarray, log_gains: np.ndarray, wanted: np.ndarray)
 def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> float:
     """Return the factor, from 0 to 1, by which gains of photos follow the exposures in EXIF.
 
-    Tone curves make it smaller than 1. It is 0 where the mean of other photos, or the photos before and after, tell the
-    gains of a photo that is left out better than EXIF does, alone or with the photos before and after, by squared
-    differences.
+    Tone curves make it smaller than 1. Each photo is left out in turn and predicted from the others, with and without
+    EXIF. The factor is 0 if the mean of the others or the photos before and after predict it better, by squared
+    differences, than EXIF does alone or with an offset from the photos before and after.
 
     Args:
         places, log_gains: see `gains_between`.
@@ -50,12 +49,12 @@ def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> f
     if len(places) < 3:
         return 1.0
 
-    def beyond(others: np.ndarray, rest: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    def by_exif(others: np.ndarray, offset: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         slope = _slope(exif[others], log_gains[others])
-        return slope * exif[~others] + rest(log_gains[others] - slope * exif[others, None])
+        return slope * exif[~others] + offset(log_gains[others] - slope * exif[others, None])
 
-    proportional = _left_out(lambda o: beyond(o, lambda rest: rest.mean(0)), log_gains)
-    both = _left_out(lambda o: beyond(o, lambda rest: _interpolated(places[o], rest, places[~o])[0]), log_gains)
+    proportional = _left_out(lambda o: by_exif(o, lambda rest: rest.mean(0)), log_gains)
+    both = _left_out(lambda o: by_exif(o, lambda rest: _interpolated(places[o], rest, places[~o])[0]), log_gains)
     between = _left_out(lambda o: _interpolated(places[o], log_gains[o], places[~o])[0], log_gains)
     mean = _left_out(lambda o: log_gains[o].mean(0), log_gains)
     return _slope(exif, log_gains) if min(proportional, both) < min(between, mean) else 0.0
@@ -64,10 +63,10 @@ def exif_slope(places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray) -> f
 def gains_beyond_exif(
     places: np.ndarray, log_gains: np.ndarray, exif: np.ndarray, wanted: np.ndarray, *, slope: float
 ) -> np.ndarray:
-    """Return what to add to `slope` times the exposures in EXIF, relative to their mean: (T, 3) gains.
+    """Return the offsets (T, 3) to add to the gains that EXIF predicts, slope * (exif - mean exif).
 
-    It is what the photos before and after have beyond that, where this tells more than the mean: matched pixels add up
-    errors along a capture, and cameras change their white balance.
+    Errors of learned gains add up along a capture, and cameras change their white balance, so the offsets are
+    interpolated from the photos before and after; they are 0 where `gains_between` prefers the mean.
 
     Args:
         places, log_gains, wanted: see `gains_between`.
@@ -77,8 +76,8 @@ def gains_beyond_exif(
     known = np.isfinite(exif)
     if not known.any():
         return np.zeros((len(wanted), 3))
-    followed = slope * (exif[known] - exif[known].mean())
-    return gains_between(places[known], log_gains[known] - followed[:, None], wanted)
+    predicted = slope * (exif[known] - exif[known].mean())
+    return gains_between(places[known], log_gains[known] - predicted[:, None], wanted)
 
 
 def _slope(exif: np.ndarray, log_gains: np.ndarray) -> float:
@@ -95,26 +94,27 @@ def _left_out(predict: Callable[[np.ndarray], np.ndarray], log_gains: np.ndarray
 
 
 def log_gains_of(frames: Sequence[Frame], model: Model) -> np.ndarray:
-    """(N, 3) logarithms of the gains of photos relative to the pictures of a model, from EXIF and what the training
-    adds to it; without EXIF, as the training tells them; else 0."""
+    """Return the logarithms (N, 3) of the gains of photos relative to the pictures of a model: from EXIF plus the
+    model's offset; without EXIF, from the training photos around; else 0."""
     by_exif = _by_exif(frames, model)
-    beyond, by_training = (_by_name(frames, told) for told in (model.beyond_exif, model.exposures))
-    return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None] + beyond, by_training)
+    offsets, around = _by_name(frames, model.beyond_exif), _by_name(frames, model.exposures)
+    return np.where(np.isfinite(by_exif)[:, None], by_exif[:, None] + offsets, around)
 
 
 def gain_sources(frames: Sequence[Frame], model: Model) -> list[str]:
-    """Return what tells the gains of each photo in `log_gains_of`, one of `SOURCES`."""
+    """Return where `log_gains_of` has the gains of each photo from, one of `SOURCES`."""
     none, exif, both, around, mean = SOURCES
     if model.log_exposure is None and not model.exposures:
         return [none] * len(frames)
     known = np.isfinite(_by_exif(frames, model))
-    beyond, by_training = (_by_name(frames, told).any(1) for told in (model.beyond_exif, model.exposures))
-    return np.where(known, np.where(beyond, both, exif), np.where(by_training, around, mean)).tolist()
+    has_offset = _by_name(frames, model.beyond_exif).any(1)
+    has_neighbours = _by_name(frames, model.exposures).any(1)
+    return np.where(known, np.where(has_offset, both, exif), np.where(has_neighbours, around, mean)).tolist()
 
 
-def _by_name(frames: Sequence[Frame], told: Mapping[str, tuple[float, ...]]) -> np.ndarray:
-    """Return (N, 3) what is told of photos, 0 where nothing is."""
-    return np.array([told.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
+def _by_name(frames: Sequence[Frame], log_gains: Mapping[str, tuple[float, ...]]) -> np.ndarray:
+    """Return the gains (N, 3) of photos, 0 for those without an entry."""
+    return np.array([log_gains.get(frame.name, (0.0,) * 3) for frame in frames]).reshape(-1, 3)
 
 
 def _by_exif(frames: Sequence[Frame], model: Model) -> np.ndarray:

@@ -60,7 +60,7 @@ class Model:
         exif_slope: by how much gains follow the exposures that EXIF tells, see `held_out_exposure.exif_slope`.
         exposures: of held-out photos by name, logarithms of their gains (3,) as training tells them where EXIF
             does not; see `photos.held_out_exposure`.
-        beyond_exif: the same, to be added to what EXIF tells.
+        beyond_exif: of held-out photos by name, offsets (3,) to the gains that EXIF predicts.
         sha256: of the file that it was read from.
     """
 

@@ -109,7 +109,7 @@ class Checkpoints:
         return self._by_name(gains_between(*learned, self._places(self._scene.test_frames)))
 
     def _beyond_exif(self) -> dict[str, tuple[float, ...]]:
-        """Return what the exposures that were learned add to those of held-out photos by EXIF, by name."""
+        """Return the offsets to the gains that EXIF predicts for held-out photos, by name."""
         learned = self._learned_gains()
         if learned is None or self._prepared.log_exposure is None:
             return {}
