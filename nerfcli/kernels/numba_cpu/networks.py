@@ -17,7 +17,8 @@ from nerfcli.kernels.activations import LOG_DENSITY_LIMIT
 from nerfcli.kernels.numba_cpu.exponential import exponential, sigmoid, sigmoid_slope
 from nerfcli.kernels.numba_cpu.threads import use_threads
 from nerfcli.kernels.numba_cpu.vector import (
-    ROWS,
+    ROWS_16,
+    ROWS_32,
     add_product_16,
     add_product_32,
     product_16,
@@ -40,42 +41,42 @@ WEIGHTS = 4096
 @numba.njit(nogil=True, error_model="numpy")
 def _layer_32(x: Any, weights: Any, at: Any, out: Any) -> None:
     """out (TILE, 32) = x (TILE, 32) @ weights[at:] (32, 32)."""
-    for row in range(0, TILE, ROWS):
+    for row in range(0, TILE, ROWS_32):
         product_32(x, row * WIDTH, WIDTH, 1, weights, at, WIDTH, WIDTH, out, row * WIDTH, WIDTH)
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _rectified_32(x: Any, weights: Any, at: Any, out: Any, first: Any = 0) -> None:
     """out (TILE, 32) = max(0, x[first:] (TILE, 32) @ weights[at:] (32, 32))."""
-    for row in range(0, TILE, ROWS):
+    for row in range(0, TILE, ROWS_32):
         rectified_product_32(x, (first + row) * WIDTH, WIDTH, 1, weights, at, WIDTH, WIDTH, out, row * WIDTH, WIDTH)
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _layer_16(x: Any, weights: Any, at: Any, out: Any) -> None:
     """out (TILE, 16) = x (TILE, 32) @ weights[at:] (32, 16)."""
-    for row in range(0, TILE, ROWS):
+    for row in range(0, TILE, ROWS_16):
         product_16(x, row * WIDTH, WIDTH, 1, weights, at, OUT, WIDTH, out, row * OUT, OUT)
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _back_from_16(g: Any, weights: Any, at: Any, depth: Any, out: Any) -> None:
     """out (TILE, 32) = g (TILE, 16)[:, :depth] @ weights[at:] (depth, 32)."""
-    for row in range(0, TILE, ROWS):
+    for row in range(0, TILE, ROWS_32):
         product_32(g, row * OUT, OUT, 1, weights, at, WIDTH, depth, out, row * WIDTH, WIDTH)
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _weights_32(x: Any, g: Any, sums: Any, at: Any) -> None:
     """sums[at:] (32, 32) += x (TILE, 32)^T @ g (TILE, 32)."""
-    for row in range(0, WIDTH, ROWS):
+    for row in range(0, WIDTH, ROWS_32):
         add_product_32(x, row, 1, WIDTH, g, 0, WIDTH, TILE, sums, at + row * WIDTH, WIDTH)
 
 
 @numba.njit(nogil=True, error_model="numpy")
 def _weights_16(x: Any, g: Any, sums: Any, at: Any) -> None:
     """sums[at:] (32, 16) += x (TILE, 32)^T @ g (TILE, 16)."""
-    for row in range(0, WIDTH, ROWS):
+    for row in range(0, WIDTH, ROWS_16):
         add_product_16(x, row, 1, WIDTH, g, 0, OUT, TILE, sums, at + row * OUT, OUT)
 
 
@@ -83,8 +84,7 @@ def _weights_16(x: Any, g: Any, sums: Any, at: Any) -> None:
 def _mask(g: Any, h: Any) -> None:
     """Gradients pass where the rectified value is above 0."""
     for i in range(TILE * WIDTH):
-        if h[i] <= np.float32(0):
-            g[i] = np.float32(0)
+        g[i] = np.float32(0) if h[i] <= np.float32(0) else g[i]  # a store under a branch would not become vectors
 
 
 @numba.njit(inline="always")

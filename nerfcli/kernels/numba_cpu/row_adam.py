@@ -1,24 +1,77 @@
 """Adam on the rows of a table that have a gradient, on CPU threads; the gradient is set to zero on the way.
 
-Same operation as `reference.adam_rows`.
+Same operation as `reference.adam_rows`. Four rows make a vector, which is stepped if any of them has a gradient; the
+others among them keep what they have. LLVM leaves the same loop of Numba scalar, which takes two to four times as long.
 """
 
 from typing import Any
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 from torch import Tensor
 
 from nerfcli.kernels.numba_cpu.threads import use_threads
-from nerfcli.kernels.numba_cpu.vector import prefetch
+from nerfcli.kernels.numba_cpu.vector import FLOATS, INTS, LANES, floats, in_all_lanes, ints
 
 FEATURES = 4
 
 
-# Rows that a thread looks through before it updates those of them that have a gradient, and how many of these it asks
-# for ahead: with one loop for both, every row waits for memory.
-LOOK = 4096
-AHEAD = 16
+def _touched(builder: Any, gradient: Any) -> Any:
+    """Return -1 in all lanes of a row if any of its numbers is not zero (or NaN), else 0."""
+    touched = builder.sext(builder.fcmp_unordered("!=", gradient, floats(0.0)), INTS)
+    for distance in (1, 2):
+        swapped = ir.Constant(INTS, [lane ^ distance for lane in range(LANES)])
+        touched = builder.or_(touched, builder.shuffle_vector(touched, touched, swapped))
+    return touched
+
+
+def _square_root(builder: Any, vector: Any) -> Any:
+    kind = ir.FunctionType(FLOATS, [FLOATS])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32"), [vector])
+
+
+def _step(builder: Any, places: Any, numbers: Any) -> None:
+    """Step the rows of a vector that have a gradient; `numbers` as in `_update`."""
+    table_at, gradient_at, first_at, second_at = places
+    gradient = builder.load(gradient_at, align=4)
+    touched = _touched(builder, gradient)
+    bits = builder.bitcast(touched, ir.IntType(32 * LANES))
+    with builder.if_then(builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))):
+        rate, beta1, beta2, correction, eps, decay = (in_all_lanes(builder, number, FLOATS) for number in numbers)
+        one = floats(1.0)
+        table, first, second = (builder.load(place, align=4) for place in (table_at, first_at, second_at))
+        g = builder.fadd(gradient, builder.fmul(decay, table))
+        m = builder.fadd(builder.fmul(beta1, first), builder.fmul(builder.fsub(one, beta1), g))
+        square = builder.fmul(builder.fmul(builder.fsub(one, beta2), g), g)
+        v = builder.fadd(builder.fmul(beta2, second), square)
+        spread = builder.fadd(builder.fmul(_square_root(builder, v), correction), eps)
+        stepped = builder.fsub(table, builder.fdiv(builder.fmul(rate, m), spread))
+        rows = builder.icmp_signed("!=", touched, ints(0))
+        for place, new, old in ((first_at, m, first), (second_at, v, second), (table_at, stepped, table)):
+            builder.store(builder.select(rows, new, old), place, align=4)
+        builder.store(floats(0.0), gradient_at, align=4)
+
+
+@intrinsic
+def _step_vector(
+    typing_context: Any, table: Any, gradient: Any, first: Any, second: Any, at: Any, rate: Any, beta1: Any,
+    beta2: Any, correction: Any, eps: Any, decay: Any,
+) -> Any:  # fmt: skip
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        at = context.cast(builder, args[4], signature.args[4], types.intp)
+        arrays = [context.make_array(signature.args[i])(context, builder, args[i]).data for i in range(4)]
+        places = [builder.bitcast(builder.gep(array, [at]), FLOATS.as_pointer()) for array in arrays]
+        _step(builder, places, args[5:])
+        return context.get_dummy_value()
+
+    return types.none(table, gradient, first, second, at, rate, beta1, beta2, correction, eps, decay), generate
+
+
+# step_vector(table, gradient, first, second, at, rate, ...): a step of LANES numbers of flat arrays, from `at` on.
+step_vector: Any = _step_vector
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
@@ -26,29 +79,10 @@ def _update(
     table: Any, gradient: Any, first: Any, second: Any, rate: Any, beta1: Any, beta2: Any, correction: Any, eps: Any,
     decay: Any, threads: Any,
 ) -> None:  # fmt: skip
-    one, zero, rows = np.float32(1), np.float32(0), table.shape[0] // FEATURES
+    vectors = table.shape[0] // LANES
     for thread in numba.prange(threads):
-        places = np.empty(LOOK, np.int64)
-        last = (thread + 1) * rows // threads
-        for begin in range(thread * rows // threads, last, LOOK):
-            count = 0
-            for row in range(begin, min(begin + LOOK, last)):
-                at = row * FEATURES
-                a, b, c, d = gradient[at], gradient[at + 1], gradient[at + 2], gradient[at + 3]
-                places[count] = at
-                count += (a != zero) | (b != zero) | (c != zero) | (d != zero)  # a branch would be guessed wrongly
-            for i in range(count):
-                coming = places[min(i + AHEAD, count - 1)]
-                prefetch(first, coming)
-                prefetch(second, coming)
-                prefetch(table, coming)
-                for at in range(places[i], places[i] + FEATURES):
-                    g = gradient[at] + decay * table[at]
-                    m = beta1 * first[at] + (one - beta1) * g
-                    v = beta2 * second[at] + (one - beta2) * g * g
-                    first[at], second[at] = m, v
-                    table[at] -= rate * m / (np.sqrt(v) * correction + eps)
-                    gradient[at] = zero
+        for i in range(thread * vectors // threads, (thread + 1) * vectors // threads):
+            step_vector(table, gradient, first, second, i * LANES, rate, beta1, beta2, correction, eps, decay)
 
 
 def adam_rows(
@@ -68,4 +102,10 @@ def adam_rows(
     correction = (1 - betas[1] ** step) ** -0.5
     flat = [x.detach().view(-1).numpy() for x in (table, gradient, first, second)]
     numbers = [np.float32(x) for x in (scale, *betas, correction, eps, decay)]
-    _update(*(*flat, *numbers, use_threads()))
+    _update(*flat, *numbers, use_threads())
+    rest = len(flat[0]) % LANES
+    if rest:  # rows beyond the last whole vector, followed by rows without a gradient
+        padded = [np.pad(x[-rest:], (0, LANES - rest)) for x in flat]
+        _update(*padded, *numbers, 1)
+        for whole, part in zip(flat, padded, strict=True):
+            whole[-rest:] = part[:rest]
