@@ -102,10 +102,10 @@ def adam_rows(
     correction = (1 - betas[1] ** step) ** -0.5
     flat = [x.detach().view(-1).numpy() for x in (table, gradient, first, second)]
     numbers = [np.float32(x) for x in (scale, *betas, correction, eps, decay)]
-    _update(*flat, *numbers, use_threads())
+    _update(*(*flat, *numbers, use_threads()))
     rest = len(flat[0]) % LANES
     if rest:  # rows beyond the last whole vector, followed by rows without a gradient
         padded = [np.pad(x[-rest:], (0, LANES - rest)) for x in flat]
-        _update(*padded, *numbers, 1)
+        _update(*(*padded, *numbers, 1))
         for whole, part in zip(flat, padded, strict=True):
             whole[-rest:] = part[:rest]
