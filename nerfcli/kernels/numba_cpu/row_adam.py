@@ -1,7 +1,8 @@
 """Adam on the rows of a table that have a gradient, on CPU threads; the gradient is set to zero on the way.
 
 Same operation as `reference.adam_rows`. Four rows make a vector, which is stepped if any of them has a gradient; the
-others among them keep what they have. LLVM leaves the same loop of Numba scalar, which takes two to four times as long.
+others among them keep what they have. LLVM leaves such a loop of Numba scalar, which takes 1.3 times as long where a
+fifth of the rows has a gradient, and 3.8 times where all have.
 """
 
 from typing import Any
@@ -29,6 +30,7 @@ def _touched(builder: Any, gradient: Any) -> Any:
 
 
 def _square_root(builder: Any, vector: Any) -> Any:
+    """Return the square roots of a vector; LLVM's builder has none."""
     kind = ir.FunctionType(FLOATS, [FLOATS])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32"), [vector])
 
