@@ -173,7 +173,8 @@ GROUPS: tuple[Group, ...] = (
         (
             Mutant("occupied[z, y, x]", "occupied[x, y, z]"),
             Mutant("* ((starts + ends) / 2)[:, None]", "* ends[:, None]"),
-            Mutant("< along.max_optical_depth\n", "< 2 * along.max_optical_depth\n"),
+            Mutant("before < along.max_optical_depth", "before < 2 * along.max_optical_depth"),
+            Mutant("faint &= ~faint.all()", "pass"),
         ),
     ),
     Group(
@@ -423,7 +424,9 @@ GROUPS: tuple[Group, ...] = (
         (),
         (
             Mutant("(4.0 if contraction == 0 else 7.8)", "(40.0 if contraction == 0 else 78.0)"),
-            Mutant("if lane_depth[lane] < deepest:", "if lane_depth[lane] < 2 * deepest:"),
+            Mutant("if not before < deepest:", "if not before < 2 * deepest:"),
+            Mutant("own < least or own * np.exp(-before) < least", "own < least"),
+            Mutant("own < least or own * np.exp(-before) < least", "own < least or np.exp(-before) < least"),
             Mutant("near[max(z - 1, 0) : z + 2, ", "near[z : z + 1, "),
             Mutant("past = i + 1", "past = i"),
             Mutant("cones[ray] * t * _stretch", "cones[ray] * _stretch"),

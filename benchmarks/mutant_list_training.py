@@ -364,7 +364,7 @@ TRAINING: tuple[Group, ...] = (
             Mutant(".maximum(visits[visited])", ""),
             Mutant("visits[visited] = UNVISITED", "pass"),
             Mutant("ranks.keep_largest(self.visits)", "pass"),
-            Mutant("parts &= self.coarse", "parts & self.coarse"),
+            Mutant(".logical_and_(rows)", ".logical_and(rows)"),
             Mutant("self._occupancy.least(threshold)", "threshold"),
             Mutant("self.coarse &= self._covered", "pass"),
             Mutant('"fine_visits": self.visits, ', ""),

@@ -284,8 +284,8 @@ def test_ray_indices(samples, generator):
 @pytest.mark.parametrize("contraction", kernels.CONTRACTIONS)
 # Thin fog lets every ray through; at 8 the densities reach e^15, and some rays end in their first sample.
 @pytest.mark.parametrize("contrast", [0.0, 1.0, 8.0])
-@pytest.mark.parametrize("with_cones", [False, True])
-def test_visible_samples(rays, contraction, contrast, with_cones, generator):
+@pytest.mark.parametrize(("with_cones", "least"), [(False, 0.0), (True, 0.0), (False, 1e-2)])
+def test_visible_samples(rays, contraction, contrast, with_cones, least, generator):
     origins = torch.randn(rays, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
     edges = torch.rand(60, generator=generator).cumsum(0) * 0.2
@@ -295,7 +295,7 @@ def test_visible_samples(rays, contraction, contrast, with_cones, generator):
     table = torch.randn(8, 256, 4, generator=generator) * contrast
     grid = HashGrid(table, (4, 5, 6, 7, 9, 11, 13, 16), weights, antialias=with_cones)
     cones = torch.rand(rays, generator=generator) if with_cones else None
-    given = (Rays(origins, directions, jitter, cones), March(edges, occupied, contraction, 7.0), grid)
+    given = (Rays(origins, directions, jitter, cones), March(edges, occupied, contraction, 7.0, least), grid)
     fast, exact = numba_cpu.visible_samples(*given), reference.visible_samples(*given)
     # A middle that rounds into the neighbouring cell, or an optical depth that rounds across the limit, is kept by one
     # and not by the other; none is for these seeds.
@@ -306,6 +306,47 @@ def test_visible_samples(rays, contraction, contrast, with_cones, generator):
     if rays:
         depth = reference.optical_depth_before(fast[2], fast[1] - fast[0], fast[5])
         assert (depth < 7.0).all()
+
+
+@pytest.mark.parametrize("least", [0.0, 1e-4, 1e-3, 0.1])
+def test_visible_samples_leave_out_what_absorbs_little_light(least, generator):
+    # Law: the others are the same, and what is left out takes less than `least` of the light, each sample by itself.
+    rays, edges = 300, torch.rand(60, generator=generator).cumsum(0) * 0.2
+    origins = torch.randn(rays, 3, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
+    grid = HashGrid(
+        torch.randn(8, 256, 4, generator=generator) * 8.0, (4, 5, 6, 7, 9, 11, 13, 16),
+        tuple(torch.randn(shape, generator=generator) * 0.3 for shape in WEIGHTS),
+    )  # fmt: skip
+    march = March(edges, torch.ones(8, 8, 8, dtype=torch.bool), "l2", 7.0)
+    given = Rays(origins, directions, torch.rand(rays, generator=generator))
+    every = numba_cpu.visible_samples(given, march, grid)
+    kept = numba_cpu.visible_samples(given, march._replace(least_weight=least), grid)
+    lengths = (every.ends - every.starts).double()
+    weights, _ = reference.interval_weights(every.density.double(), lengths, every.offsets)
+    before = reference.optical_depth_before(every.density.double(), lengths, every.offsets)
+    bound = every.density * lengths * torch.exp(-before)
+    places = {tuple(place) for place in kept.coordinates.tolist()}
+    left_out = torch.tensor([tuple(place) not in places for place in every.coordinates.tolist()])
+    assert left_out.sum() == len(every.starts) - len(kept.starts)
+    assert bool(left_out.any()) == (least > 0.0)
+    assert (weights[left_out] < least).all()
+    assert (bound[~left_out] > 0.9999 * least).all()
+
+
+@pytest.mark.parametrize("backend", [reference, numba_cpu])
+def test_visible_samples_of_a_transparent_field_are_all_kept(backend, generator):
+    # Otherwise no gradient would ever bring back a field that has become transparent.
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator), dim=-1)
+    grid = HashGrid(
+        torch.ones(8, 256, 4), (4, 5, 6, 7, 9, 11, 13, 16), (torch.ones(WEIGHTS[0]), -torch.ones(WEIGHTS[1]))
+    )
+    march = March(torch.linspace(0.0, 2.0, 30), torch.ones(8, 8, 8, dtype=torch.bool), "l2", 7.0)
+    given = Rays(torch.zeros(50, 3), directions, torch.rand(50, generator=generator))
+    every = backend.visible_samples(given, march, grid)
+    assert 0.0 < every.density.max() < 1e-6
+    kept = backend.visible_samples(given, march._replace(least_weight=1e-3), grid)
+    assert torch.equal(kept.starts, every.starts)
 
 
 @pytest.mark.parametrize("side", [30, 64])

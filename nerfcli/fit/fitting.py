@@ -30,6 +30,9 @@ from nerfcli.runs.settings import TrainSettings
 MOST_RAYS = 2**14
 # Rays of the training end where less than a thousandth of the light is left.
 DEEPEST = 7.0
+# Samples that absorb less of their ray's light than this teach nothing: they are left out before their colours and
+# gradients are computed, and steps of as many samples have more rays.
+LEAST_WEIGHT = 1e-3
 # Weight of the light that ends before the sky where this is seen.
 SKY_WEIGHT = 0.1
 # Weight of the roughness of a learned background. Directions that no photo shows take the colours of their neighbours;
@@ -212,7 +215,7 @@ class Fitting:
         background = self.parts.behind(count, self.generator)[self.ranks.own].contiguous()
         seen = self.field.backend.render_rays(
             Rays(drawn.origins, drawn.directions, jitter, self._cones(drawn)),
-            self._march(edges, self.cells.at(self.step)),
+            self._march(edges, self.cells.at(self.step))._replace(least_weight=LEAST_WEIGHT),
             self.field.medium(self._detail),
             Targets(components.near, bool(components.distortion), drawn.distances),
             background=background,

@@ -98,8 +98,10 @@ class OpenCells:
             self.coarse &= self._covered
         if self.visits is not None:
             fine = self._depths > self._occupancy.least(threshold)
-            parts = fine.view(*(OCCUPANCY_SIDE, FINE_SIDE // OCCUPANCY_SIDE) * 3)
-            parts &= self.coarse[:, None, :, None, :, None]
+            parts = FINE_SIDE // OCCUPANCY_SIDE
+            # Only the two outer axes are spread out by strides: whole rows of fine cells are fast, pairs are not.
+            rows = self.coarse.repeat_interleave(parts, dim=2)[:, None, :, None]
+            fine.view(OCCUPANCY_SIDE, parts, OCCUPANCY_SIDE, parts, FINE_SIDE).logical_and_(rows)
             self._fine = fine
 
     def state(self) -> dict[str, Tensor]:

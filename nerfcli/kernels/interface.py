@@ -45,12 +45,14 @@ class March(NamedTuple):
         occupied: (G, G, G) bool over the unit cube of `grid_coordinates`, indexed [z, y, x].
         contraction: see `grid_coordinates`; outside the cube of a bounded scene nothing is occupied.
         max_optical_depth: > 0; each ray ends with the sample that brings its optical depth to this.
+        least_weight: >= 0; samples that absorb less of their ray's light than this may be left out, but never all.
     """
 
     edges: Tensor
     occupied: Tensor
     contraction: str
     max_optical_depth: float
+    least_weight: float = 0.0
 
 
 class HashGrid(NamedTuple):

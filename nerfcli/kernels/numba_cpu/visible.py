@@ -177,8 +177,8 @@ def fill_round(
 @numba.njit(nogil=True, error_model="numpy")
 def _follow(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, coming: Any, last_ray: Any,
-    counts: Any, owner: Any, record: Any, code: Any,
+    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any, coming: Any,
+    last_ray: Any, counts: Any, owner: Any, record: Any, code: Any,
 ) -> Any:  # fmt: skip
     """Samples of rays `coming` to `last_ray` in the order in which they are found, and how many they are.
 
@@ -206,7 +206,12 @@ def _follow(
         density_range(encoded, 0, filled, weights, x, h, geometry, density)
         for i in range(filled):
             lane = sample_lane[i]
-            if lane_depth[lane] < deepest:
+            before = lane_depth[lane]
+            if not before < deepest:
+                continue
+            own = np.float64(density[i]) * np.float64(sample_span[i, 1] - sample_span[i, 0])
+            lane_depth[lane] += own
+            if not (own < least or own * np.exp(-before) < least):  # most faint ones need no exponential
                 ray = lane_ray[lane]
                 counts[ray] += 1
                 owner[found] = ray
@@ -216,7 +221,6 @@ def _follow(
                 for feature in range(WIDTH):
                     code[found, feature] = encoded[i, feature]
                 found += 1
-                lane_depth[lane] += np.float64(density[i]) * np.float64(sample_span[i, 1] - sample_span[i, 0])
         for lane in range(LANES):
             if lane_ray[lane] >= 0 and (lane_depth[lane] >= deepest or lane_next[lane] >= intervals):
                 lane_ray[lane] = -1
@@ -225,14 +229,14 @@ def _follow(
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
 def _visible(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
-    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, cones: Any, borders: Any, counts: Any,
-    owner: Any, record: Any, code: Any, found: Any,
+    flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any, borders: Any,
+    counts: Any, owner: Any, record: Any, code: Any, found: Any,
 ) -> None:  # fmt: skip
     """`_follow`, by a thread for the rays from each border to the next."""
     for thread in numba.prange(len(borders) - 1):
         found[thread] = _follow(
             origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows,
-            resolutions, weights, deepest, cones, borders[thread], borders[thread + 1], counts, owner[thread],
+            resolutions, weights, deepest, least, cones, borders[thread], borders[thread + 1], counts, owner[thread],
             record[thread], code[thread],
         )  # fmt: skip
 
@@ -272,10 +276,12 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
         along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
         grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
         np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers[:2]), along.max_optical_depth,
-        cones.contiguous().numpy(), borders, counts, owner, record, code, found,
+        along.least_weight, cones.contiguous().numpy(), borders, counts, owner, record, code, found,
     )  # fmt: skip
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     samples = int(offsets[-1])
+    if samples == 0 and along.least_weight > 0.0:  # all are faint
+        return visible_samples(rays, along._replace(least_weight=0.0), grid)
     spans, coordinates, encoded = torch.empty(3, samples), torch.empty(samples, 3), torch.empty(samples, WIDTH)
     _sort(borders, offsets, owner, record, code, found, spans.numpy(), coordinates.numpy(), encoded.numpy())
     starts, ends, density = spans

@@ -74,7 +74,10 @@ def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
 def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
     """Return the samples of `march` in front of which the optical depth is below a limit, with their encoding.
 
-    What is left out takes at most exp(-max_optical_depth) of a ray's light. Without gradients.
+    Of an optical depth d of a sample behind an optical depth D, those with d exp(-D) < least_weight are left out: they
+    absorb less than this of the ray's light, and what is behind the limit at most exp(-max_optical_depth). A density
+    that is NaN is kept, and where all samples of all rays are so faint, none is left out: a field that has become
+    transparent can learn again. Without gradients.
     """
     starts, ends, coordinates, offsets = occupied_samples(rays, along)
     widths = None
@@ -90,6 +93,10 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
         )
     encoded = hash_encode(coordinates, grid.table, grid.resolutions, widths)
     thickness = density(encoded, grid.layers)
-    seen = optical_depth_before(thickness, ends - starts, offsets) < along.max_optical_depth
+    lengths = ends - starts
+    before = optical_depth_before(thickness, lengths, offsets)
+    faint = thickness * lengths * torch.exp(-before) < along.least_weight
+    faint &= ~faint.all()
+    seen = (before < along.max_optical_depth) & ~faint
     kept = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
     return Samples(starts[seen], ends[seen], thickness[seen], encoded[seen], coordinates[seen], kept)
