@@ -4,6 +4,7 @@ import fcntl
 import json
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 # Threads of two test processes on two cores must not spin while they wait; to be said before torch is imported.
@@ -24,6 +25,7 @@ from nerfcli.runs.config import RunConfig
 from nerfcli.runs.files import CONFIG, FIELD
 from nerfcli.runs.log import LogEntry, append_log
 from nerfcli.runs.settings import TrainSettings
+from nerfcli.train import held_out_pixels
 from nerfcli.train.loop import train
 
 # Relative tolerance of a chain of some dozen operations, per dtype. A looser one in a test carries its reason.
@@ -51,6 +53,14 @@ def _two_threads():
     torch.set_num_threads(2)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _few_held_out_pixels() -> Iterator[None]:
+    """Most trainings of the tests end in fog, where the 4096 pixels that users get would take longer than the steps."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(held_out_pixels, "PIXELS", 512)
+        yield
+
+
 @pytest.fixture(scope="session")
 def spheres() -> scene.Scene:
     return scene.load(SPHERES)
@@ -68,7 +78,9 @@ def spheres_run(spheres: scene.Scene, tmp_path_factory: pytest.TempPathFactory) 
     with (run.parent / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not run.exists():
-            train(spheres, run, training, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
+            with pytest.MonkeyPatch.context() as patched:
+                patched.setattr(held_out_pixels, "PIXELS", 4096)
+                train(spheres, run, training, resume=False, notify=lambda text: None, on_progress=lambda progress: None)
     return run
 
 

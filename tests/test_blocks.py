@@ -78,7 +78,7 @@ def test_blocks_of_one_field_render_what_it_renders_in_float64(kind):
     alone = replace(alone, field=alone.field.double())
     together = joined([alone] * 4, division())
     assert together.training_from_scene.scale == pytest.approx(0.5, rel=1e-14)
-    origins, directions = random_rays(200, torch.float64)
+    origins, directions = random_rays(50, torch.float64)
     background = torch.tensor(alone.background, dtype=torch.float64)
     expected, seen = (
         render_rays(model, origins, directions, background=background, shares=(0.05, 0.5, 0.9), tolerance=1e-13)
@@ -111,7 +111,7 @@ def test_blocks_of_other_fields_render_what_the_joined_field_gives_sample_by_sam
     models = [cloudy(Similarity(1.0 + n / 4, np.eye(3), np.full(3, n / 9)), seed=n) for n in range(4)]
     models = [replace(model, field=model.field.double()) for model in models]
     together = joined(models, division())
-    origins, directions = random_rays(200, torch.float64)
+    origins, directions = random_rays(50, torch.float64)
     rays = Rays(origins, directions, torch.zeros_like(origins[:, 0]))
     cuts = uniform_cuts(together.marching)
     march = March(torch.cat([cuts, cuts[-1:]]), together.occupied, "l2", deepest(1e-13))
@@ -130,7 +130,7 @@ def test_what_spans_leave_out_of_a_colour_is_within_its_bound(contrast):
         assert isinstance(model.field, HashField)
         with torch.no_grad():
             model.field.weights[1][0] *= contrast
-    together, rays, tolerance = joined(models, division()), random_rays(2000, torch.float32), 0.05
+    together, rays, tolerance = joined(models, division()), random_rays(400, torch.float32), 0.05
     exact, seen = (render_rays(together, *rays, background=torch.zeros(3), tolerance=t) for t in (1e-12, tolerance))
     apart = (seen.rgb - exact.rgb).abs().amax(1)
     assert (apart <= seen.truncation_error + 2e-6).all()

@@ -23,7 +23,7 @@ RAYS_AT_A_TIME = 512
 
 
 class HeldoutPixels:
-    """A fixed sample of a few thousand pixels of the held-out photos.
+    """A fixed sample of a few thousand different pixels of the held-out photos, or most of them where they have fewer.
 
     Args:
         photos: held out.
@@ -43,7 +43,8 @@ class HeldoutPixels:
     ):
         pool = PixelPool(photos, training_from_scene, device, colours=colours, storage=storage)
         generator = torch.Generator(device=device).manual_seed(SEED)
-        self.origins, self.directions, self.colours, numbers = pool.draw(PIXELS, generator)[:4]
+        numbers = pool.numbers(PIXELS, generator).unique()
+        self.origins, self.directions, self.colours = pool.rays_of(numbers)[:3]
         self.cones = pool.cones[pool.photo_of(numbers)]
         self.photos = pool.photo_of(numbers)
 

@@ -56,19 +56,16 @@ def best_turn(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]
         return None
     chosen = pairs[:: -(-len(pairs) // _MOST_PAIRS)]
     longest = max(max(sizes[photo]) for pair in chosen for photo in (pair.one, pair.other))
+    counts = np.array([min(pair.matches, _MOST_MATCHES) for pair in chosen])
+    one = _from_middle([(pair.pixels_one, sizes[pair.one]) for pair in chosen], counts)
+    other = _from_middle([(pair.pixels_other, sizes[pair.other]) for pair in chosen], counts)
 
     def left_over(values: Array) -> float:
         focal, distortion = float(np.exp(values[0])), float(values[1])
         if not _FOCAL_RANGE[0] < focal < _FOCAL_RANGE[1] or abs(distortion) > _MOST_DISTORTION:
             return 1e6
         focal *= longest
-        medians = [
-            _rest(
-                _rays(pair.pixels_one[:_MOST_MATCHES], sizes[pair.one], focal_px=focal, distortion=distortion),
-                _rays(pair.pixels_other[:_MOST_MATCHES], sizes[pair.other], focal_px=focal, distortion=distortion),
-            )
-            for pair in chosen
-        ]
+        medians = _rest(_rays(one / focal, distortion), _rays(other / focal, distortion), counts)
         return float(np.quantile(medians, _QUANTILE) * focal)
 
     start = min(np.log(_FOCAL_STARTS), key=lambda value: left_over(np.array([value, 0.0])))
@@ -78,24 +75,36 @@ def best_turn(pairs: Sequence[VerifiedPair], sizes: Mapping[int, tuple[int, int]
     return Turn(float(found.fun), float(np.exp(found.x[0]) * longest))
 
 
-def _rays(pixels: Array, size: tuple[int, int], *, focal_px: float, distortion: float) -> Array:
+def _from_middle(photos: Sequence[tuple[Array, tuple[int, int]]], counts: NDArray[np.int64]) -> Array:
+    """(P, M, 2) the first pixels of each photo, relative to its middle; zero past its count (P,)."""
+    places = np.zeros((len(photos), counts.max(), 2))
+    for place, count, (pixels, size) in zip(places, counts, photos, strict=True):
+        place[:count] = pixels[:count] - np.array(size) / 2
+    return places
+
+
+def _rays(distorted: Array, distortion: float) -> Array:
     """Unit rays of a pinhole with one radial term, its inverse by fixed-point iteration."""
-    distorted = (pixels - np.array(size) / 2) / focal_px
     straight = distorted
     for _ in range(5):
-        squared = np.minimum((straight**2).sum(axis=1, keepdims=True), 25.0)
+        squared = np.minimum((straight**2).sum(axis=-1, keepdims=True), 25.0)
         straight = distorted / np.maximum(1 + distortion * squared, 0.2)
-    rays = np.column_stack([straight, np.ones(len(straight))])
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = np.concatenate([straight, np.ones_like(straight[..., :1])], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def _rest(p: Array, q: Array) -> float:
-    """Median angle between q and p after the rotation that fits them best (Kabsch 1976, three times reweighted)."""
-    weights = np.ones(len(p))
-    distances = weights
+def _rest(p: Array, q: Array, counts: NDArray[np.int64]) -> Array:
+    """(P,) median angles between the first rays of q and p (P, M, 3), after the rotation of each pair that fits them
+    best (Kabsch 1976, three times reweighted).
+    """
+    there = np.arange(p.shape[1]) < counts[:, None]
+    weights = there.astype(np.float64)
+    median = np.zeros(len(p))
     for _ in range(3):
-        u, _, vt = np.linalg.svd((q * weights[:, None]).T @ p)
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        distances = np.linalg.norm(p @ rotation.T - q, axis=1)
-        weights = 1 / np.maximum(distances, np.median(distances) + 1e-9)
-    return float(np.median(distances))
+        u, _, vt = np.linalg.svd((q * weights[..., None]).swapaxes(1, 2) @ p)
+        u[..., 2] *= np.linalg.det(u @ vt)[:, None]
+        distances = np.where(there, np.linalg.norm(p @ (u @ vt).swapaxes(1, 2) - q, axis=-1), np.inf)
+        ordered, pairs = np.sort(distances, axis=1), np.arange(len(p))
+        median = (ordered[pairs, (counts - 1) // 2] + ordered[pairs, counts // 2]) / 2
+        weights = 1 / np.maximum(distances, median[:, None] + 1e-9)
+    return median
