@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +24,10 @@ from nerfcli.photos.undistorted import pinhole_of, undistorted
 from nerfcli.render.model import Model, save_model
 from nerfcli.runs.files import FIELD
 from nerfcli.runs.run import Run
+from nerfcli.surface import extent
 from nerfcli.surface.colmap_dense import read_map, write_map, write_photo, write_sparse, write_stereo
 from nerfcli.surface.colours import point_colours, surface_colours
+from nerfcli.surface.extent import scene_box
 from nerfcli.surface.fusion import Fused, fuse
 from nerfcli.surface.grid import Grid
 from nerfcli.surface.marching import mesh_of, surface_of, without_small_pieces
@@ -80,6 +83,20 @@ def fused(ball_views) -> Fused:
 
 
 # Depth maps to surfaces
+
+
+@pytest.mark.parametrize("looks_out", [False, True])
+def test_the_box_leaves_out_what_is_far_behind(looks_out, monkeypatch):
+    """Also where all that is seen lies beyond the unit ball, around the cameras of a narrow baseline."""
+    place = CENTRE - np.array([0.0, 3.0, 0.0])
+    near, far = ball_view(place), ball_view(place)
+    far = replace(far, depth=far.depth[::2, ::2] * 10, frame=replace(far.frame, camera=CAMERA.resized(60, 45)))
+    monkeypatch.setattr(extent, "depth_views", lambda *given, **named: [near, far])
+    middle = place if looks_out else CENTRE
+    model = fog(torch.ones(16, 16, 16, dtype=torch.bool), Similarity(1.0, np.eye(3), -middle))
+    low, high = np.array(scene_box(model, ())).reshape(2, 3)
+    np.testing.assert_allclose(low, CENTRE - [RADIUS, RADIUS, RADIUS], atol=0.15)
+    assert (high < CENTRE + RADIUS + 0.15).all()
 
 
 def test_normals_of_a_plane_are_its_own():

@@ -14,8 +14,15 @@ from nerfcli.cameras.camera import Camera
 from nerfcli.cameras.frame import Frame
 from nerfcli.cameras.rigid import Similarity, look_at, rotation_from_quaternion
 from nerfcli.errors import OUT_OF_MEMORY, UserError
+from nerfcli.fit.extent import choose_extent
 from nerfcli.fit.losses import colour_losses, over_background
-from nerfcli.fit.normalisation import box_frame, contracted_frame, object_frame
+from nerfcli.fit.normalisation import (
+    box_frame,
+    contracted_frame,
+    has_narrow_baseline,
+    narrow_frame,
+    object_frame,
+)
 from nerfcli.media.images import downscale, write_png
 from nerfcli.memory import default_memory_limit, resident_bytes
 from nerfcli.photos.loading import LoadedPhoto, downscaled_camera, load_photos
@@ -152,6 +159,58 @@ def test_depth_bounds_of_forward_facing_captures_set_the_focus():
     similarity, marching = contracted_frame(scene)
     np.testing.assert_allclose(similarity.inverse().apply(np.zeros(3)), [0, 0, 1.6], atol=1e-6)
     assert marching.near == pytest.approx(0.9 * similarity.scale, rel=1e-6)
+
+
+def side_by_side(*places: float, turned: Similarity | None = None) -> list[Frame]:
+    """Parallel cameras on a line, looking along +z."""
+    frames = []
+    for number, place in enumerate(places):
+        pose = np.eye(4)
+        pose[0, 3] = place
+        frames.append(Frame(f"{number}.png", CAMERA, pose if turned is None else turned.apply_pose(pose)))
+    return frames
+
+
+@pytest.mark.parametrize("spread", [0.3, 0.99, 1.01, 3.0])
+def test_a_narrow_baseline_is_one_below_half_of_the_nearest_depth(spread):
+    scene = replace(scene_of(side_by_side(-spread, 0.0, spread)), depth_bounds=np.tile([2.0, 8.0], (3, 1)))
+    assert has_narrow_baseline(scene) == (spread < 1.0)
+    extent = choose_extent(scene, TrainSettings(), fills_frame=True)
+    ball, marching = narrow_frame(scene)[:2] if spread < 1.0 else contracted_frame(scene)
+    assert extent.training_from_scene.scale == ball.scale
+    assert extent.marching == marching
+    assert not has_narrow_baseline(replace(scene, depth_bounds=None))
+    # Of an object on nothing, no depth is needed.
+    assert choose_extent(scene, TrainSettings(), fills_frame=False).contraction == "none"
+
+
+def test_narrow_captures_lie_in_contracted_space_behind_a_ball_around_the_cameras():
+    places = (0.0, 0.2, 0.7)
+    for turned in (None, MOVED):
+        unit = 1.0 if turned is None else turned.scale
+        frames = side_by_side(*places, turned=turned)
+        scene = replace(scene_of(frames), depth_bounds=unit * np.tile([2.0, 8.0], (3, 1)))
+        similarity, marching, background = narrow_frame(scene)
+        centres = training_centres(scene, similarity)
+        np.testing.assert_allclose(centres.mean(axis=0), 0, atol=1e-9)
+        assert np.linalg.norm(centres, axis=1).max() < 0.5
+        assert 1 / similarity.scale == pytest.approx(2.0 * unit, rel=1e-9)
+        assert marching.near == pytest.approx(0.9)  # of the nearest depth, which is 1 here
+        assert background == pytest.approx(2.5 * 3.2 / 2.0)  # the harmonic mean of the bounds is 3.2
+        extent = choose_extent(scene, TrainSettings(), fills_frame=True)
+        assert extent.before("sphere").marching.far == pytest.approx(background)
+        assert extent.before("black").marching == marching
+
+
+def test_points_tell_a_narrow_baseline_and_rays_begin_before_them():
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-0.3, -0.3, 4.0), (0.3, 0.3, 9.0), (3000, 3))
+    scene = scene_of(side_by_side(-0.5, 0.0, 0.5), points)
+    assert has_narrow_baseline(scene)
+    similarity, marching, _ = narrow_frame(scene)
+    assert 4.0 < 1 / similarity.scale < 4.4
+    assert marching.near / similarity.scale == pytest.approx(0.7 / similarity.scale)
+    assert marching.near / similarity.scale < 4.0
 
 
 @pytest.mark.parametrize("size", [(96, 64), (97, 71), (95, 66)])

@@ -6,7 +6,14 @@ from typing import Any
 import numpy as np
 
 from nerfcli.cameras.rigid import Similarity
-from nerfcli.fit.normalisation import block_frame, box_frame, contracted_frame, object_frame
+from nerfcli.fit.normalisation import (
+    block_frame,
+    box_frame,
+    contracted_frame,
+    has_narrow_baseline,
+    narrow_frame,
+    object_frame,
+)
 from nerfcli.render.model import Marching
 from nerfcli.runs.components import LEARNED_BACKGROUNDS
 from nerfcli.runs.settings import TrainSettings
@@ -93,6 +100,8 @@ def choose_extent(scene: Scene, settings: TrainSettings, *, fills_frame: bool) -
         return Extent(contraction, *object_frame(scene))
     if contraction == "none":
         return Extent(contraction, *box_frame(scene))
+    if not settings.block and has_narrow_baseline(scene):
+        return Extent(contraction, *narrow_frame(scene))
     similarity, marching = block_frame(scene) if settings.block else contracted_frame(scene)
     farthest = max(float(np.linalg.norm(similarity.apply(frame.centre))) for frame in scene.frames)
     return Extent(contraction, similarity, marching, farthest + BALLS_BEFORE_BACKGROUND)

@@ -27,6 +27,11 @@ MOST_NEAR = 0.5
 # The unit ball reaches at least as far as this share of the depth of a typical pixel. Around an object both are about
 # alike, and the cameras decide; a ball that held most points of a desk in a room cost 0.4 dB.
 BALL_PER_DEPTH = 0.75
+# Cameras that are closer to their middle than this share of the nearest depth see a scene from one side, or all around
+# from one place.
+NARROW_SPREAD = 0.5
+# Of the typical depth of such captures: behind it begins what is infinitely far.
+NARROW_BACKGROUND = 2.5
 # Fewer points do not tell where a scene ends.
 LEAST_POINTS = 50
 # A box holds all points but these per cent at either end, where wrong ones are, and reaches beyond by this share.
@@ -52,6 +57,33 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
     if depths is not None:
         radius = max(radius, BALL_PER_DEPTH * float(np.median(depths[:, 1])))
     return _ball(scene, centre, radius, depths)
+
+
+def has_narrow_baseline(scene: Scene) -> bool:
+    """Return whether the cameras are close together, measured by the nearest depth: see `narrow_frame`."""
+    depths = _typical_depths(scene)
+    if depths is None:
+        return False
+    return float(_distances(scene, _middle(scene)).max()) <= NARROW_SPREAD * float(depths[:, 0].min())
+
+
+def narrow_frame(scene: Scene) -> tuple[Similarity, Marching, float]:
+    """Return the same for forward-facing captures and panoramas, and the distance behind which a background begins.
+
+    The unit ball is centred between the cameras and reaches to the nearest depth. All that is seen lies in contracted
+    space, where a place is a direction and an inverse distance: cells are as deep as the small parallax of these
+    captures tells depths apart. NeRF has NDC for this, Mildenhall et al. 2020, appendix C.
+
+    Raises:
+        ValueError: the scene does not tell depths, see `has_narrow_baseline`.
+    """
+    depths = _typical_depths(scene)
+    if depths is None:
+        raise ValueError("the scene has no depths")
+    centre, radius = _middle(scene), float(depths[:, 0].min())
+    similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
+    background = NARROW_BACKGROUND * float(np.median(depths[:, 1])) / radius
+    return similarity, Marching(near=_near_part(scene), far=FARTHEST, shortest_step=1 / 256, growth=1 / 128), background
 
 
 def block_frame(scene: Scene) -> tuple[Similarity, Marching]:
@@ -102,8 +134,7 @@ def box_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
 def _ball(scene: Scene, centre: np.ndarray, radius: float, depths: np.ndarray | None) -> tuple[Similarity, Marching]:
     """Return the frame of a unit ball with contracted space around it, and its steps; `depths` of `_typical_depths`."""
-    part = NEAR_PER_POINT if scene.depth_bounds is None else NEAR_PER_BOUND
-    near = NEAREST * 5 if depths is None else part * float(depths[:, 0].min()) / radius
+    near = NEAREST * 5 if depths is None else _near_part(scene) * float(depths[:, 0].min()) / radius
     near = min(max(near, NEAREST), MOST_NEAR)
     similarity = Similarity(1.0 / radius, np.eye(3), -centre / radius)
     return similarity, Marching(near=near, far=FARTHEST, shortest_step=1 / 256, growth=1 / 128)
@@ -115,6 +146,16 @@ def _box(scene: Scene, percentile: float) -> tuple[np.ndarray, float]:
     """
     low, high = np.percentile(scene.points, (percentile, 100 - percentile), axis=0)
     return (low + high) / 2, max(float((high - low).max()) / 2 * (1 + BOX_MARGIN), 1e-12)
+
+
+def _near_part(scene: Scene) -> float:
+    """Return the part of the nearest depth at which rays begin."""
+    return NEAR_PER_POINT if scene.depth_bounds is None else NEAR_PER_BOUND
+
+
+def _middle(scene: Scene) -> np.ndarray:
+    """Return the mean of the camera centres."""
+    return np.mean([frame.centre for frame in scene.frames], axis=0)
 
 
 def _focus(scene: Scene, depths: np.ndarray | None) -> np.ndarray:
