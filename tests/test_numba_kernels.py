@@ -296,7 +296,10 @@ def test_visible_samples(rays, contraction, contrast, with_cones, least, generat
     grid = HashGrid(table, (4, 5, 6, 7, 9, 11, 13, 16), weights, antialias=with_cones)
     cones = torch.rand(rays, generator=generator) if with_cones else None
     given = (Rays(origins, directions, jitter, cones), March(edges, occupied, contraction, 7.0, least), grid)
-    fast, exact = numba_cpu.visible_samples(*given), reference.visible_samples(*given)
+    visits = torch.full((2, 8, 8, 8), -1.0)
+    fast = numba_cpu.visible_samples(*given, visits[0])
+    exact = reference.visible_samples(*given, visits[1])
+    torch.testing.assert_close(visits[0], visits[1], rtol=1e-4, atol=1e-12)  # exponentials of sums of up to 15
     # A middle that rounds into the neighbouring cell, or an optical depth that rounds across the limit, is kept by one
     # and not by the other; none is for these seeds.
     assert torch.equal(fast[5], exact[5])
@@ -320,8 +323,11 @@ def test_visible_samples_leave_out_what_absorbs_little_light(least, generator):
     )  # fmt: skip
     march = March(edges, torch.ones(8, 8, 8, dtype=torch.bool), "l2", 7.0)
     given = Rays(origins, directions, torch.rand(rays, generator=generator))
-    every = numba_cpu.visible_samples(given, march, grid)
-    kept = numba_cpu.visible_samples(given, march._replace(least_weight=least), grid)
+    visits = torch.full((2, 64, 64, 64), -1.0)
+    every = numba_cpu.visible_samples(given, march, grid, visits[0])
+    kept = numba_cpu.visible_samples(given, march._replace(least_weight=least), grid, visits[1])
+    # A cell in which all samples are faint is known to be empty, and not left open as if none had been there.
+    assert torch.equal(visits[0], visits[1])
     lengths = (every.ends - every.starts).double()
     weights, _ = reference.interval_weights(every.density.double(), lengths, every.offsets)
     before = reference.optical_depth_before(every.density.double(), lengths, every.offsets)

@@ -91,10 +91,8 @@ class ComposedBackend(abc.ABC):
         visits: Tensor | None = None,
         trace: Trace | None = None,
     ) -> RaySums:
-        samples = self._visible(rays.detached(), march, medium)
+        samples = self._visible(rays.detached(), march, medium, visits)
         starts, ends, offsets = samples.starts, samples.ends, samples.offsets
-        if visits is not None:
-            self.parts.keep_largest(visits, samples.coordinates, samples.density * (ends - starts))
         index = self.parts.ray_indices(offsets) if samples.rays is None else samples.rays
         if torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad):
             samples = samples._replace(coordinates=self._coordinates(rays, samples, march.contraction))
@@ -138,7 +136,7 @@ class ComposedBackend(abc.ABC):
         negligible: float = 0.0,
         keep_intervals: bool = True,
     ) -> RaysSeen:
-        samples = self._visible(rays.detached(), march, medium)
+        samples = self._visible(rays.detached(), march, medium, None)
         starts, ends, density, offsets = samples.starts, samples.ends, samples.density, samples.offsets
         lengths = ends - starts
         weights, _ = self.parts.interval_weights(density, lengths, offsets)
@@ -173,7 +171,7 @@ class ComposedBackend(abc.ABC):
     ) -> Tensor: ...
 
     @abc.abstractmethod
-    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
+    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
         """`reference.visible_samples`."""
 
     @abc.abstractmethod
@@ -223,14 +221,16 @@ class ComposedBackend(abc.ABC):
         encoded = self._encoded(samples, grid, widths=widths, sink=sink)
         return self._networks(encoded, directions, index, grid)
 
-    def _visible(self, rays: Rays, march: March, medium: HashGrid | Medium) -> Samples:
+    def _visible(self, rays: Rays, march: March, medium: HashGrid | Medium, visits: Tensor | None) -> Samples:
         if isinstance(medium, HashGrid):
-            return self._visible_in_grid(rays, march, medium)
+            return self._visible_in_grid(rays, march, medium, visits)
         with torch.no_grad():  # what stands behind surfaces is computed and left out
             starts, ends, coordinates, offsets = self.parts.occupied_samples(rays, march)
             density = torch.cat([medium.density(chunk) for chunk in coordinates.split(CHUNK)])
             lit = self.parts.optical_depth_before(density, ends - starts, offsets) < march.max_optical_depth
             kept = torch.nn.functional.pad(lit.cumsum(0), (1, 0))[offsets]
+            if visits is not None:
+                self.parts.keep_largest(visits, coordinates[lit], (density * (ends - starts))[lit])
             return Samples(starts[lit], ends[lit], density[lit], None, coordinates[lit], kept)
 
 

@@ -241,7 +241,8 @@ class Backend(Protocol):
             background: (R, 3) sRGB, without gradient.
             sink: of the table's shape; the gradient with respect to the table is added to it, and autograd gets none: a
                 buffer of megabytes need not be made, filled and added at every step.
-            visits: (C, C, C) over the unit cube; raised to the optical depth of the samples, see `keep_largest`.
+            visits: (C, C, C) over the unit cube; raised to the optical depth of the samples, those left out for their
+                weight among them, see `keep_largest`.
             trace: is shown the tensors on the way.
 
         Differentiable in origins, directions, the table and the layers.

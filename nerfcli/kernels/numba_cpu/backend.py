@@ -94,9 +94,9 @@ class NumbaBackend(ComposedBackend):
     def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
         return numba_cpu.denoise_total_variation(target, threshold, dual, iterations=iterations)
 
-    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
+    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
         module = numba_cpu if _fits(grid, grid.layers[:2]) else reference
-        return module.visible_samples(rays, march, grid)
+        return module.visible_samples(rays, march, grid, visits)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return numba_cpu.sample_coordinates(

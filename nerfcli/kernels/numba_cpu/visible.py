@@ -14,6 +14,7 @@ import torch
 from nerfcli.kernels.contraction import CONTRACTIONS
 from nerfcli.kernels.interface import HashGrid, March, Rays, Samples
 from nerfcli.kernels.numba_cpu.hash_grid import encode_range, new_scratch
+from nerfcli.kernels.numba_cpu.marching import keep_largest
 from nerfcli.kernels.numba_cpu.networks import OUT, TILE, WIDTH, density_range, flat_weights
 from nerfcli.kernels.numba_cpu.rays import CHUNK, cube, cut, look_ahead, padded
 from nerfcli.kernels.numba_cpu.threads import use_threads
@@ -178,11 +179,13 @@ def fill_round(
 def _follow(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
     flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any, coming: Any,
-    last_ray: Any, counts: Any, owner: Any, record: Any, code: Any,
+    last_ray: Any, counts: Any, owner: Any, record: Any, code: Any, left: Any,
 ) -> Any:  # fmt: skip
-    """Samples of rays `coming` to `last_ray` in the order in which they are found, and how many they are.
+    """Samples of rays `coming` to `last_ray` in the order in which they are found, how many they are, and how many are
+    left out for their weight.
 
-    A sample's ray goes to `owner`, its start, end, density and coordinates to `record`, its features to `code`.
+    A sample's ray goes to `owner`, its start, end, density and coordinates to `record`, its features to `code`; of one
+    that is left out, coordinates and optical depth go to `left`.
     """
     intervals = edges.shape[0] - 2 - CHUNK
     (lane_ray, lane_next, lane_depth), (places, cells), (sample_lane, sample_span, points) = new_round()
@@ -192,14 +195,14 @@ def _follow(
     scratch = new_scratch()
     x, h = np.empty(TILE * WIDTH, np.float32), np.empty(TILE * WIDTH, np.float32)
     geometry = np.empty(TILE * OUT, np.float32)
-    found = 0
+    found = missing = 0
     while True:
         filled, coming = fill_round(
             origins, directions, edges, jitter, occupied, blocks, side, contraction, cones, coming, last_ray, lane_ray,
             lane_next, lane_depth, places, cells, sample_lane, sample_span, points, widths,
         )  # fmt: skip
         if filled == 0:
-            return found
+            return found, missing
         encode_range(
             points.reshape(-1), ROUND, widths, 0, filled, flat, rows, resolutions, scratch, encoded.reshape(-1)
         )
@@ -221,6 +224,11 @@ def _follow(
                 for feature in range(WIDTH):
                     code[found, feature] = encoded[i, feature]
                 found += 1
+            else:
+                for axis in range(3):
+                    left[missing, axis] = points[axis, i]
+                left[missing, 3] = own
+                missing += 1
         for lane in range(LANES):
             if lane_ray[lane] >= 0 and (lane_depth[lane] >= deepest or lane_next[lane] >= intervals):
                 lane_ray[lane] = -1
@@ -230,14 +238,14 @@ def _follow(
 def _visible(
     origins: Any, directions: Any, edges: Any, jitter: Any, occupied: Any, blocks: Any, side: Any, contraction: Any,
     flat: Any, rows: Any, resolutions: Any, weights: Any, deepest: Any, least: Any, cones: Any, borders: Any,
-    counts: Any, owner: Any, record: Any, code: Any, found: Any,
+    counts: Any, owner: Any, record: Any, code: Any, left: Any, found: Any, missing: Any,
 ) -> None:  # fmt: skip
     """`_follow`, by a thread for the rays from each border to the next."""
     for thread in numba.prange(len(borders) - 1):
-        found[thread] = _follow(
+        found[thread], missing[thread] = _follow(
             origins, directions, edges, jitter, occupied, blocks, side, contraction, flat, rows,
             resolutions, weights, deepest, least, cones, borders[thread], borders[thread + 1], counts, owner[thread],
-            record[thread], code[thread],
+            record[thread], code[thread], left[thread],
         )  # fmt: skip
 
 
@@ -260,7 +268,7 @@ def _sort(
                 encoded[to, feature] = code[thread, i, feature]
 
 
-def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
+def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: torch.Tensor | None = None) -> Samples:
     """See `reference.visible_samples`; float32 on the CPU."""
     threads, count, intervals = use_threads(), len(rays.origins), len(along.edges) - 2
     cones = rays.cones if grid.antialias and rays.cones is not None else rays.origins.new_empty(0)
@@ -268,21 +276,25 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
     # Room for all samples of all rays: memory that nobody writes to is never really taken.
     room = (threads, -(-count // threads) * intervals)
     owner, record = np.empty(room, np.int64), np.empty((*room, 6), np.float32)
-    code = np.empty((*room, WIDTH), np.float32)
-    counts, found = np.zeros(count, np.int64), np.zeros(threads, np.int64)
+    code, left = np.empty((*room, WIDTH), np.float32), np.empty((*room, 4), np.float32)
+    counts, (found, missing) = np.zeros(count, np.int64), np.zeros((2, threads), np.int64)
     _visible(
         rays.origins.contiguous().numpy(), rays.directions.contiguous().numpy(), padded(along.edges),
         rays.jitter.numpy(), along.occupied.contiguous().view(-1).numpy(), occupied_blocks(along.occupied.numpy()),
         along.occupied.shape[0], CONTRACTIONS.index(along.contraction),
         grid.table.detach().contiguous().view(-1).numpy(), grid.table.shape[1],
         np.array(grid.resolutions, dtype=np.int32), flat_weights(grid.layers[:2]), along.max_optical_depth,
-        along.least_weight, cones.contiguous().numpy(), borders, counts, owner, record, code, found,
+        along.least_weight, cones.contiguous().numpy(), borders, counts, owner, record, code, left, found, missing,
     )  # fmt: skip
     offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(counts)])
     samples = int(offsets[-1])
     if samples == 0 and along.least_weight > 0.0:  # all are faint
-        return visible_samples(rays, along._replace(least_weight=0.0), grid)
+        return visible_samples(rays, along._replace(least_weight=0.0), grid, visits)
     spans, coordinates, encoded = torch.empty(3, samples), torch.empty(samples, 3), torch.empty(samples, WIDTH)
     _sort(borders, offsets, owner, record, code, found, spans.numpy(), coordinates.numpy(), encoded.numpy())
     starts, ends, density = spans
+    if visits is not None:
+        keep_largest(visits, coordinates, density * (ends - starts))
+        for faint, number in zip(torch.from_numpy(left), missing.tolist(), strict=True):
+            keep_largest(visits, faint[:number, :3], faint[:number, 3])
     return Samples(starts, ends, density, encoded, coordinates, torch.from_numpy(offsets))

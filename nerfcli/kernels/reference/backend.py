@@ -67,8 +67,8 @@ class ReferenceBackend(ComposedBackend):
     def denoise_total_variation(self, target: Tensor, threshold: Tensor, dual: Tensor, *, iterations: int) -> Tensor:
         return reference.denoise_total_variation(target, threshold, dual, iterations=iterations)
 
-    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
-        return reference.visible_samples(rays, march, grid)
+    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
+        return reference.visible_samples(rays, march, grid, visits)
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return reference.sample_coordinates(

@@ -71,13 +71,14 @@ def keep_largest(cells: Tensor, coordinates: Tensor, values: Tensor) -> None:
 
 
 @torch.no_grad()
-def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
+def visible_samples(rays: Rays, along: March, grid: HashGrid, visits: Tensor | None = None) -> Samples:
     """Return the samples of `march` in front of which the optical depth is below a limit, with their encoding.
 
     Of an optical depth d of a sample behind an optical depth D, those with d exp(-D) < least_weight are left out: they
     absorb less than this of the ray's light, and what is behind the limit at most exp(-max_optical_depth). A density
     that is NaN is kept, and where all samples of all rays are so faint, none is left out: a field that has become
-    transparent can learn again. Without gradients.
+    transparent can learn again. `visits` (C, C, C) are raised to the optical depths of all samples before the limit,
+    those left out for their weight among them, see `keep_largest`. Without gradients.
     """
     starts, ends, coordinates, offsets = occupied_samples(rays, along)
     widths = None
@@ -95,8 +96,11 @@ def visible_samples(rays: Rays, along: March, grid: HashGrid) -> Samples:
     thickness = density(encoded, grid.layers)
     lengths = ends - starts
     before = optical_depth_before(thickness, lengths, offsets)
+    reached = before < along.max_optical_depth
+    if visits is not None:
+        keep_largest(visits, coordinates[reached], (thickness * lengths)[reached])
     faint = thickness * lengths * torch.exp(-before) < along.least_weight
     faint &= ~faint.all()
-    seen = (before < along.max_optical_depth) & ~faint
+    seen = reached & ~faint
     kept = torch.nn.functional.pad(seen.cumsum(0), (1, 0))[offsets]
     return Samples(starts[seen], ends[seen], thickness[seen], encoded[seen], coordinates[seen], kept)

@@ -86,12 +86,15 @@ class TritonBackend(ReferenceBackend):
         code = hash_grid.encode(coordinates.contiguous(), table, medium.resolutions, widths=None, dtype=torch.float16)
         return networks.density(code, medium.layers)
 
-    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid) -> Samples:
+    def _visible_in_grid(self, rays: Rays, march: March, grid: HashGrid, visits: Tensor | None) -> Samples:
         if not _fits(grid):
-            return reference.visible_samples(rays, march, grid)
+            return reference.visible_samples(rays, march, grid, visits)
         with torch.no_grad():
             table = self._half.of(grid.table)
-            return marching.visible_samples(rays, march, grid, table=table, capacity=self._capacity)
+            samples = marching.visible_samples(rays, march, grid, table=table, capacity=self._capacity)
+            if visits is not None:
+                reference.keep_largest(visits, samples.coordinates, samples.density * (samples.ends - samples.starts))
+            return samples
 
     def _coordinates(self, rays: Rays, samples: Samples, contraction: str) -> Tensor:
         return sample_coordinates(
