@@ -180,6 +180,10 @@ def test_a_narrow_baseline_is_one_below_half_of_the_nearest_depth(spread):
     assert extent.training_from_scene.scale == ball.scale
     assert extent.marching == marching
     assert not has_narrow_baseline(replace(scene, depth_bounds=None))
+    # Bounds that begin at the cameras give no radius, not even to cameras that only turn.
+    assert not has_narrow_baseline(
+        replace(scene_of(side_by_side(0.0, 0.0)), depth_bounds=np.array([[0.0, 8.0], [0.0, 8.0]]))
+    )
     # Of an object on nothing, no depth is needed.
     assert choose_extent(scene, TrainSettings(), fills_frame=False).contraction == "none"
 

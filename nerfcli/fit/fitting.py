@@ -30,8 +30,8 @@ from nerfcli.runs.settings import TrainSettings
 MOST_RAYS = 2**14
 # Rays of the training end where less than a thousandth of the light is left.
 DEEPEST = 7.0
-# Samples that absorb less of their ray's light than this teach nothing: they are left out before their colours and
-# gradients are computed, and steps of as many samples have more rays.
+# Samples that absorb less of their ray's light than this have hardly any gradient: they are left out before their
+# colours are computed, and steps of as many samples have more rays.
 LEAST_WEIGHT = 1e-3
 # Weight of the light that ends before the sky where this is seen.
 SKY_WEIGHT = 0.1

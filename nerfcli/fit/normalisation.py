@@ -60,11 +60,13 @@ def contracted_frame(scene: Scene) -> tuple[Similarity, Marching]:
 
 
 def has_narrow_baseline(scene: Scene) -> bool:
-    """Return whether the cameras are close together, measured by the nearest depth: see `narrow_frame`."""
+    """Return whether the cameras are close together, measured by the nearest depth: see `narrow_frame`.
+
+    False where the scene does not tell depths, or only that something may touch a camera.
+    """
     depths = _typical_depths(scene)
-    if depths is None:
-        return False
-    return float(_distances(scene, _middle(scene)).max()) <= NARROW_SPREAD * float(depths[:, 0].min())
+    nearest = 0.0 if depths is None else float(depths[:, 0].min())
+    return nearest > 0.0 and float(_distances(scene, _middle(scene)).max()) <= NARROW_SPREAD * nearest
 
 
 def narrow_frame(scene: Scene) -> tuple[Similarity, Marching, float]:
@@ -181,7 +183,7 @@ def _typical_depths(scene: Scene) -> np.ndarray | None:
     if scene.depth_bounds is not None:
         near, far = scene.depth_bounds[:, 0], scene.depth_bounds[:, 1]
         # The harmonic mean is where LLFF puts its focus: half of the disparities lie on either side.
-        return np.stack([near, 2.0 / (1.0 / near + 1.0 / far)], axis=1)
+        return np.stack([near, 2.0 * near * far / (near + far)], axis=1)
     rows = []
     for frame in scene.frames:
         if len(scene.points) == 0:
