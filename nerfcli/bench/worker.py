@@ -23,6 +23,7 @@ from nerfcli.evaluate.protocol import HeldOutPhoto, as_exposed, over_white
 from nerfcli.evaluate.run_photos import held_out_photos
 from nerfcli.evaluate.sampled import SampledPixels, background_of
 from nerfcli.field.cost import field_bytes
+from nerfcli.memory import keep_freed_memory
 from nerfcli.render.model import Model
 from nerfcli.render.pictures import render_picture
 from nerfcli.runs.run import Run
@@ -37,6 +38,7 @@ _LONGEST_PX = 360
 
 def main(job_path: str) -> None:
     """Run one job and report its result."""
+    keep_freed_memory()
     send = take_stdout()
     job = json.loads(Path(job_path).read_text(encoding="utf-8"))
     try:

@@ -23,6 +23,7 @@ from nerfcli.cli import (
 )
 from nerfcli.cli.usage import Command
 from nerfcli.interrupts import install_handlers
+from nerfcli.memory import keep_freed_memory
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -89,5 +90,6 @@ def main() -> None:
     # the same cores then wait for each other's waiting: 58 training steps in 10 s, where there are 245 with this.
     # libgomp reads it when torch is loaded.
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    keep_freed_memory()
     install_handlers()
     app(prog_name="nerfcli")  # and not "python -m nerfcli", which no shell could complete

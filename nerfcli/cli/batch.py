@@ -8,6 +8,7 @@ import typer
 
 from nerfcli.cli.console import out_of_memory_explained, report_error
 from nerfcli.errors import UserError
+from nerfcli.memory import return_freed_memory
 
 STDIN = "-"
 # Commands that read scenes, and those that read runs; the others read captures.
@@ -40,6 +41,7 @@ def for_each_input(source: str, work: Callable[[Path, bool], None], *, command: 
         except UserError as error:
             report_error(error, about=str(path))
             first_failure = first_failure or error
+        return_freed_memory()
     if count == 0:
         raise no_paths(command)
     if first_failure is not None:
